@@ -72,6 +72,32 @@ def least(values: Floats) -> float:
 
 
 @jit
+def attitude_dex(
+    tangent: Floats,
+    sigma: Floats,
+    a: int,
+    b: int,
+    prior_volume: float,
+    focal_uncertainty: float,
+) -> float:
+    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
+
+        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
+
+    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
+    separation. s is the least sigma of all detections, taken as isotropic, which gives a lower bound of the
+    uncertainty. V is the prior volume of attitudes. An uncertain focal length, known to sqrt(2) s / D from the pair,
+    adds sqrt(2 pi) sqrt(2) s / D over the width of its range, twice `focal_uncertainty`.
+    """
+    smallest = least(sigma)
+    direction_sigma = sqrt(2.0) * smallest / separation(tangent, a, b)
+    dex = 1.5 * log10(2 * pi) + log10(smallest**2 / 2 * direction_sigma / prior_volume)
+    if focal_uncertainty > 0:
+        dex += log10(sqrt(2 * pi) * direction_sigma / (2 * focal_uncertainty))
+    return dex
+
+
+@jit
 def required_matches(
     sigma: Floats,
     field_area: float,

@@ -44,6 +44,7 @@ from estimator.identification.chance import (
     GATE_SIGMA,
     MIN_EVIDENCE_MATCHES,
     SHORT_PAIR,
+    attitude_dex,
     least,
     middle,
     required_matches,
@@ -472,38 +473,19 @@ def _required_matches(
     detections: LedDetections, dome: DomeIndex, a: int, b: int, min_dex: float
 ) -> int:
     """Number of matches, the pair included, without which the evidence cannot reach `min_dex`."""
-    attitude_dex = _attitude_dex(detections, dome, a, b)
+    pair_dex = attitude_dex(
+        detections.tangent,
+        detections.sigma,
+        a,
+        b,
+        dome.prior_volume,
+        detections.focal_uncertainty,
+    )
     # Greatest evidence that brightness can give: the peak of the LED's density over the least density of a light.
     light_dex = 0.0
     if len(detections.light_density) > 0:
         light_dex = -log10(least(detections.light_density) * sqrt(2 * pi) * dome.flux_sigma)
-    return required_matches(
-        detections.sigma, dome.field_area, attitude_dex, min_dex, light_dex
-    )
-
-
-@jit
-def _attitude_dex(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> float:
-    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
-
-        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
-
-    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
-    separation and s the least sigma of all detections. V is the prior volume. An uncertain focal length, known to
-    sqrt(2) s / D from the pair, contributes sqrt(2 pi) sqrt(2) s / D over the width of its range.
-    """
-    # Attitude.
-    sigma = least(detections.sigma)
-    length = separation(detections.tangent, a, b)
-    attitude_dex = (
-        1.5 * log10(2 * pi) - log10(dome.prior_volume) + log10(sigma**3 / sqrt(2.0) / length)
-    )
-    # Focal length: its posterior width over the width of its range.
-    if detections.focal_uncertainty > 0:
-        attitude_dex += log10(
-            sqrt(2 * pi) * sqrt(2.0) * sigma / length / (2 * detections.focal_uncertainty)
-        )
-    return attitude_dex
+    return required_matches(detections.sigma, dome.field_area, pair_dex, min_dex, light_dex)
 
 
 @jit

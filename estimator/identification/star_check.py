@@ -7,7 +7,7 @@ after another, at each attitude of the pair.
 
 from __future__ import annotations
 
-from math import log10, pi, sqrt
+from math import pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,12 @@ from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.identification.chance import (
     GATE_SIGMA,
-    least,
+    attitude_dex,
     middle,
     required_matches,
-    separation,
     squared_separation,
 )
 from estimator.identification.star_detections import Detections, field_area, ray
-from estimator.identification.star_evidence import prior_volume_dex
 
 
 @jit
@@ -54,7 +52,9 @@ def trial(
     """
     gates = pair_gates(detections, a, b)
     order = other_detections(len(detections.sigma), a, b, start)
-    pair_dex = attitude_dex(detections, a, b)
+    pair_dex = attitude_dex(
+        detections.tangent, detections.sigma, a, b, 8 * pi * pi, detections.focal_uncertainty
+    )
     required = required_matches(detections.sigma, field_area(detections), pair_dex, min_dex)
     return gates, order, required
 
@@ -86,29 +86,6 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
             detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
         )
     return out
-
-
-@jit
-def attitude_dex(detections: Detections, a: int, b: int) -> float:
-    """Contribution of a pair's attitude alone to the evidence, for `required_matches`.
-
-        log10( (2 pi)^(3/2) (s / sqrt(2))^2 (sqrt(2) s / D) / V )
-
-    The pair determines the two axes across the boresight to s / sqrt(2), and the roll to sqrt(2) s / D, D the
-    separation. s is the least sigma of all detections, taken as isotropic, which gives a lower bound of the
-    uncertainty. V is the prior volume. An uncertain focal length adds sqrt(2 pi) sqrt(2) s / D.
-    """
-    sigma = least(detections.sigma)
-    direction_sigma = sqrt(2.0) * sigma / separation(detections.tangent, a, b)
-    dex = (
-        1.5 * log10(2 * pi)
-        + log10(sigma**2 / 2 * direction_sigma)
-        - prior_volume_dex(detections)
-    )
-    # The pair determines an uncertain focal length with the same relative error as the roll.
-    if detections.focal_uncertainty > 0:
-        dex += log10(sqrt(2 * pi) * direction_sigma)
-    return dex
 
 
 @jit

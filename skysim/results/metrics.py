@@ -291,7 +291,7 @@ def quantile(values: Floats, probability: float) -> Summary:
     Too few values have no interval; `needs` is how many more it takes: 59 in all for the 95% quantile.
     """
     count = len(values)
-    value = float(np.quantile(values, probability))
+    value = float(np.quantile(values, probability)) if count else math.nan
     ranks = quantile_ranks(count, probability)
     if ranks is None:
         return Summary(

@@ -358,14 +358,11 @@ class Report:
         Raises
         ------
         InputError
-            For another suffix.
+            As `page_path`.
         """
         from skysim.core import files
 
-        path = Path(path)
-        if path.suffix not in SUFFIXES:
-            raise InputError(path, *unknown_name("file format", path.suffix, SUFFIXES))
-        files.make_folder(path.parent)
+        path = page_path(path)
         if path.suffix == ".html":
             files.write_text(path, self.html())
         elif path.suffix == ".json":
@@ -378,6 +375,25 @@ class Report:
                 files.write_bytes(file, figure.image)
             files.write_text(path, self.markdown(pictures))
         return path
+
+
+def page_path(path: str | Path) -> Path:
+    """The path of a page, whose folder is created: called before the work that the page reports.
+
+    Raises
+    ------
+    InputError
+        For a suffix that is not in SUFFIXES, for a folder, and if its folder cannot be created.
+    """
+    from skysim.core.files import make_folder
+
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise InputError(path, *unknown_name("file format", path.suffix, SUFFIXES))
+    make_folder(path.parent)
+    if path.is_dir():
+        raise InputError(path, "is a folder", "a file")
+    return path
 
 
 def plain(value: Any) -> Any:

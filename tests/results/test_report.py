@@ -202,6 +202,9 @@ def test_another_suffix_is_refused(tmp_path: Path) -> None:
         InputError, match=r"unknown file format '.pdf'; allowed: .html, .md, .json"
     ):
         of().save(tmp_path / "report.pdf")
+    (tmp_path / "page.md").mkdir()
+    with pytest.raises(InputError, match=r"page.md: is a folder; allowed: a file"):
+        of().save(tmp_path / "page.md")
 
 
 def test_the_terminal_ends_with_the_answer_and_shows_only_its_blocks(

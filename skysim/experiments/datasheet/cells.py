@@ -25,11 +25,14 @@ from skysim.core.types import Floats
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
-from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan
+from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan, resolve_point
 from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
+
+MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
+MODEL_FIELDS = 2 * MIN_FIELDS  # for an error model: each half of them tests that of the other
 
 # Step from one attitude of a field to the next: the same stars at other phases in the pixels.
 SCAN_PX = 3.37
@@ -130,6 +133,17 @@ def check_scene(scene: Scene) -> None:
         )
 
 
+def require_fields(fields: int, solved: int, least: int, problem: str) -> None:
+    """Raise InputError if fewer than `least` of the fields are solved, with a number of fields that is enough."""
+    if solved < least:
+        enough = (
+            least if solved == fields else math.ceil(1.5 * least * fields / max(solved, 1))
+        )
+        raise InputError(
+            "datasheet.fields", f"{fields}: {problem}, {least} needed", f"{enough} or more"
+        )
+
+
 def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that differ from unit to unit: chip, survey, LEDs."""
     chip = scene.camera.detector
@@ -192,9 +206,11 @@ class Designer:
     def in_turn(self, number: int) -> Draw:
         """The draw of a number: another attitude each, with the units and thermal states of the terms in turn.
 
-        The units must be those of the terms: the mean bias of a few other units would be another.
+        The units must be those of the terms: the mean bias of a few other units would be another. The first `states`
+        draws have all thermal states, and the first `states` times `units` all combinations.
         """
-        return Draw(number % self.units, number // self.units % self.states, 10 + number)
+        turns, state = divmod(number, self.states)
+        return Draw((turns + state) % self.units, state, 10 + number)
 
     def cells(self) -> Iterator[DatasheetCell]:
         """All cells, in the order in which they are run."""
@@ -213,7 +229,8 @@ class Designer:
         yield from self.tracked()
         yield from self.magnitudes()
         for name, change in self.causes().items():
-            yield from self.draws("cause", self.size.pairs, change, cause=name)
+            pairs = max(self.size.pairs, self.states)
+            yield from self.draws("cause", pairs, change, cause=name)
         for name, change in self.disturbances().items():
             yield from self.draws("disturbance", 1, change, disturbance=name)
 
@@ -491,6 +508,7 @@ def measure(
     *,
     quick: bool = False,
     fields: int | None = None,
+    least: int = MIN_FIELDS,
     workers: int | None = None,
     watch: Callable[[int], runner.Watch] | None = None,
 ) -> MeasuredFrames:
@@ -502,23 +520,33 @@ def measure(
         Smaller experiments
     fields
         Number of fields; None for the usual one
+    least
+        Number of fields that must be solved: MIN_FIELDS, or MODEL_FIELDS for an error model
     watch
         Called with the number of trials; returns the function that is called after every batch
 
     Raises
     ------
     InputError
-        For a scene without attitudes of single frames, and for a cell whose trials fail.
+        Before the first trial for a scene without attitudes of single frames, too few fields, and
+        a cell whose settings are not allowed; later for a cell whose trials fail.
     """
     check_scene(scene)
     size = QUICK if quick else FULL
-    size = replace(size, fields=fields or size.fields)
+    size = replace(size, fields=size.fields if fields is None else fields)
+    purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
+    require_fields(size.fields, size.fields, least, f"too few {purpose}")
     designer = Designer(scene, size)
     cells = list(designer.cells())
     tree = study_tree(scene_name, scene, overrides, size, cells)
     path = make_folder(folder) / STUDY
     write_text(path, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120))
     plan = make_plan(path, Study.model_validate(tree), tree["trial"], {})
+    for cell in cells:
+        try:
+            resolve_point(plan.spec, cell.settings)
+        except InputError as error:
+            raise error.within(cell.name) from None
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
     try:
         with store.writing(folder / store.STORE) as kept:

@@ -16,10 +16,11 @@ from skysim.experiments.datasheet.statement import (
     NAMES,
     Statement,
     StatementSection,
+    failed_checks,
     numbers,
     percent,
     sections,
-    size,
+    sizes,
 )
 from skysim.experiments.datasheet.variance_components import GROUPS, Components
 from skysim.results.plots import INK, png
@@ -208,22 +209,27 @@ def datasheet_report(statement: Statement, quick: bool) -> Report:
         Section(one.title, section_blocks(one, statement), on_terminal=n < PRINTED)
         for n, one in enumerate(sections(statement))
     ]
+    failed = [Verdict(line, "bad") for line in failed_checks(statement)]
     text = Text(f"{STANDARD} {sheet.columns['trial'].size} frames.", on_terminal=False)
     return Report(
         f"Datasheet: {sheet.scene.title}",
-        [verdict(statement), text, *shown],
+        [*failed, verdict(statement), text, *shown],
         command(sheet, quick),
     )
 
 
 def verdict(statement: Statement) -> Verdict:
     """How often an attitude is right, and its error."""
-    across, about = (size(table.squares["total"]) for table in statement.terms.values())
     right = percent(statement.counts.share("right"))
+    errors = [
+        f"{sizes(table, 'total')[0]}″ {name}" for name, table in statement.terms.items()
+    ]
+    size = f"; error of one axis at rest (1 σ) {', '.join(errors)} the boresight" * bool(
+        errors
+    )
     return Verdict(
         f"{right} % of frames lost in space have a right attitude, {statement.counts.false} of"
-        f" {statement.counts.frames} a false one; error of one axis (1 σ) {across}″ across the boresight,"
-        f" {about}″ about it.",
+        f" {statement.counts.frames} a false one{size}.",
         "bad" if statement.counts.false else "good",
     )
 

@@ -7,8 +7,9 @@ The errors about the camera's axes x, y (across the boresight) and z (about it) 
 with white noise n and m, and the axis u of the rate across the boresight (a streak's centroid errs more along the
 streak, and so the attitude errs more about the axis of the motion). f and p are Gauss-Markov processes of the angle
 that the boresight has turned, each with a correlation angle. s is the scale of the field: a lognormal process of that
-angle, since a field with few stars errs more. At rest f, p and s are constant. bias is the mean plus the draw of the
-unit. All are independent; the scale is common to the axes.
+angle, since a field with few stars errs more. At rest f, p and s are constant. bias is the mean plus the draws of
+the unit and of its thermal state, which stays. All are independent; the scale is common to the axes. The constants were
+measured from rest to the last of their rates, and a faster rate is refused.
 
     model = ErrorModel.read("tracker_error.json")
     errors_arcsec = model.draw(rate_deg_s, step_s, np.random.default_rng(1))     # (N, 3)
@@ -53,17 +54,18 @@ class ErrorModel:
     Attributes
     ----------
     constants
-        mean, unit, field, pixel (of x, y, roll: arcseconds, 1 sigma); scale (of x, y, roll:
-        standard deviation of the logarithm of the variance); field_deg, pixel_deg, scale_deg
-        (correlation angles); rates_deg_s, noise (for each rate: of x, y, roll in arcseconds)
-        and along (for each rate: what is added about its axis, arcseconds), both linear between
-        the rates and constant beyond the last
+        mean, unit, thermal, field, pixel (of x, y, roll: arcseconds, 1 sigma); scale (of x, y,
+        roll: standard deviation of the logarithm of the variance); field_deg, pixel_deg,
+        scale_deg (correlation angles); rates_deg_s, noise (for each rate: of x, y, roll in
+        arcseconds) and along (for each rate: what is added about its axis, arcseconds), both
+        linear between the rates
     """
 
     def __init__(self, constants: dict[str, Any]) -> None:
         self.constants = constants
         self.mean = np.array(constants["mean"], dtype=float)
         self.unit = np.array(constants["unit"], dtype=float)
+        self.thermal = np.array(constants["thermal"], dtype=float)
         self.field = np.array(constants["field"], dtype=float)
         self.pixel = np.array(constants["pixel"], dtype=float)
         self.scale = np.array(constants["scale"], dtype=float)
@@ -83,9 +85,10 @@ class ErrorModel:
         Parameters
         ----------
         unit
-            Whether its bias is drawn; otherwise it is the mean of all units
+            Whether its bias is drawn; otherwise it is the mean of all units and thermal states
         """
-        bias = self.mean + (self.unit * rng.standard_normal(3) if unit else 0.0)
+        scatter = np.hypot(self.unit, self.thermal)
+        bias = self.mean + (scatter * rng.standard_normal(3) if unit else 0.0)
         axis_rad = float(rng.uniform(0, 2 * math.pi))
         return State(
             rng.standard_normal(3),
@@ -94,6 +97,16 @@ class ErrorModel:
             bias,
             axis_rad,
         )
+
+    def measured_rates(self, rate_deg_s: Any) -> Any:
+        """(N,) magnitudes of rates in degrees per second. Raises ValueError for one beyond those that were measured."""
+        rates = np.atleast_1d(np.abs(np.asarray(rate_deg_s, dtype=float)))
+        unmeasured = rates[~(rates <= self.rates_deg_s[-1])]
+        if unmeasured.size:
+            raise ValueError(
+                f"rate_deg_s: {unmeasured[0]:g} deg/s; allowed: up to {self.rates_deg_s[-1]:g} deg/s, as measured"
+            )
+        return rates
 
     def noise_arcsec(self, rate_deg_s: Any) -> Any:
         """(N, 3) standard deviation of the noise at (N,) rates, without what is added about the rate's axis."""
@@ -134,7 +147,7 @@ class ErrorModel:
             Angle of the rate's axis from the camera's x toward y, or (N,) angles; that of the
             state if left out
         """
-        rate = np.abs(np.asarray(rate_deg_s, dtype=float))
+        rate = self.measured_rates(rate_deg_s)
         first = self.start(rng) if state is None else state
         if axis_rad is None:
             axis_rad = first.axis_rad
@@ -151,7 +164,8 @@ class ErrorModel:
         self, state: State, rate_deg_s: float, step_s: float, rng: Any
     ) -> tuple[State, Any]:
         """The state one step later, and its (3,) errors in arcseconds."""
-        turned = abs(rate_deg_s) * step_s
+        rate = self.measured_rates(rate_deg_s)
+        turned = float(rate[0]) * step_s
         new = []
         for name in ("field", "pixel", "scale"):
             left = math.exp(-turned / self.constants[f"{name}_deg"])
@@ -159,7 +173,7 @@ class ErrorModel:
             fresh = rng.standard_normal(np.shape(old))
             new.append(left * old + math.sqrt(1 - left * left) * fresh)
         later = state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
-        noise = self.drawn_noise(np.array([abs(rate_deg_s)]), state.axis_rad, rng)[0]
+        noise = self.drawn_noise(rate, state.axis_rad, rng)[0]
         slow = self.field * later.field + self.pixel * later.pixel
         return later, later.bias + self.scales(later.scale) * (slow + noise)
 
@@ -174,9 +188,10 @@ class ErrorModel:
             math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"])
             for name in ("field", "pixel", "scale")
         )
-        noise = self.noise_arcsec(np.array([abs(rate_deg_s)]))[0]
+        rate = self.measured_rates(rate_deg_s)
+        noise = self.noise_arcsec(rate)[0]
         shared = self.field**2 * field + self.pixel**2 * pixel
-        along = self.along_arcsec(abs(rate_deg_s)) ** 2 / 2 * np.array([1.0, 1.0, 0.0])
+        along = self.along_arcsec(rate) ** 2 / 2 * np.array([1.0, 1.0, 0.0])
         total = self.field**2 + self.pixel**2 + noise**2 + along
         return np.exp(-(self.scale**2) * (1 - scale) / 4) * shared / total
 

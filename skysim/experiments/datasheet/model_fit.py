@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import combinations
+from itertools import combinations, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,12 +16,12 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder, to_json, write_text
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.cells import MIN_FIELDS, MODEL_FIELDS, MeasuredFrames
 from skysim.experiments.datasheet.error_model import AXES, ErrorModel
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
-    components,
-    effects,
+    common_square,
+    contributions,
     mean_known,
     term_errors,
 )
@@ -34,11 +34,9 @@ LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be sep
 def constants(sheet: MeasuredFrames) -> dict[str, Any]:
     """The constants of `error_model.ErrorModel` for the scene of a datasheet."""
     errors, _ = term_errors(sheet)
-    found = [components(one) for one in errors]
-    field = np.sqrt(np.maximum([one.field for one in found], 0))
-    pixel = np.sqrt(np.maximum([one.pixel for one in found], 0))
-    bias = [bias_terms(one) for one in errors]
-    mean = [one[0] for one in bias]
+    terms = contributions(errors)
+    thermal, field, pixel, rest = (rms_of_term(one) for one in terms[1:])
+    mean = unit_mean(sheet)
     across, about = (log_scale(*field_variances(sheet, axes)) for axes in GROUPS.values())
     by_rate = errors_by_rate(sheet)
     squares = np.array([mean_known(one**2, (1, 2)) for one in by_rate.values()])
@@ -47,12 +45,12 @@ def constants(sheet: MeasuredFrames) -> dict[str, Any]:
     )
     slow = np.square(mean) + field**2 + pixel**2 + np.outer(along / 2, [1.0, 1.0, 0.0])
     noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
-    rest = np.sqrt([one.temporal for one in found])
     return {
         "scene": sheet.scene.name,
         "axes": list(AXES),
-        "mean": mean,
-        "unit": [one[1] for one in bias],
+        "mean": errors.mean(axis=(1, 2, 3, 4, 5)).tolist(),
+        "unit": unit_scatter(errors).tolist(),
+        "thermal": thermal.tolist(),
         "field": field.tolist(),
         "pixel": pixel.tolist(),
         "scale": [across, across, about],
@@ -65,12 +63,24 @@ def constants(sheet: MeasuredFrames) -> dict[str, Any]:
     }
 
 
-def bias_terms(errors: Floats) -> tuple[float, float]:
-    """Mean and standard deviation among units of the (fields, units, states, attitudes, frames) errors of one axis."""
-    means = errors.mean(axis=(3, 4))
-    present = [axis for axis in range(3) if means.shape[axis] > 1]
-    scatter = effects(means, present).get((1,), 0.0)
-    return float(errors.mean()), math.sqrt(max(scatter, 0.0))
+def rms_of_term(shares: Floats) -> Floats:
+    """(3,) root mean square of a term about x, y and roll from its (3, fields) shares; 0 where they are negative."""
+    return np.sqrt(np.maximum(shares.mean(axis=-1), 0))
+
+
+def unit_mean(sheet: MeasuredFrames) -> Floats:
+    """(3,) mean error of the first unit in the first thermal state, which the frames at rates have."""
+    return np.asarray(term_errors(sheet)[0][:, :, 0, 0].mean(axis=(1, 2, 3)))
+
+
+def unit_scatter(errors: Floats) -> Floats:
+    """(3,) standard deviation among units of the (3, fields, units, states, attitudes, frames) errors' means."""
+    means = errors.mean(axis=(3, 4, 5))
+    units = means.shape[2]
+    if units == 1:
+        return np.zeros(3)
+    apart = means - means.mean(axis=2, keepdims=True)
+    return rms_of_term(common_square(apart).sum(axis=2) / (units - 1))
 
 
 def log_scale(first: Floats, second: Floats) -> float:
@@ -99,17 +109,22 @@ def sequences(sheet: MeasuredFrames, rate_deg_s: float) -> tuple[list[int], Floa
 
 
 def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
-    """(3, frames, fields) errors by rate, rest first: of the sequences, and of the pairs of frames at faster rates."""
+    """(3, frames, fields) errors by rate, rest first: of the sequences, and of the pairs of frames at faster rates.
+
+    The last rate is the fastest one up to which at least MIN_FIELDS fields have a right attitude at every rate.
+    """
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
     found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
-    return found | {
-        rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster
-    }
+    found |= {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+    solved = takewhile(
+        lambda rate: np.isfinite(found[rate][0]).any(axis=0).sum() >= MIN_FIELDS, found
+    )
+    return {rate: found[rate] for rate in solved}
 
 
 def along_square(
-    sheet: MeasuredFrames, rate_deg_s: float, mean: list[float], errors: Floats
+    sheet: MeasuredFrames, rate_deg_s: float, mean: Floats, errors: Floats
 ) -> float:
     """Mean square of the errors about the rate's axis beyond that about the other axis across the boresight.
 
@@ -125,7 +140,7 @@ def along_square(
     if not rate_deg_s:
         return 0.0
     angle_rad = axes_rad(sheet, rate_deg_s)
-    x, y = errors[:2] - np.array(mean)[:2, None, None]
+    x, y = errors[:2] - mean[:2, None, None]
     about = x * np.cos(angle_rad) + y * np.sin(angle_rad)
     other = y * np.cos(angle_rad) - x * np.sin(angle_rad)
     return max(float(mean_known(about**2) - mean_known(other**2)), 0.0)
@@ -145,7 +160,7 @@ def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     return np.arctan2(y, x)
 
 
-def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Floats]:
+def lagged(sheet: MeasuredFrames, mean: Floats) -> tuple[Floats, Floats, Floats]:
     """Angles in degrees between frames of the sequences, the products of their errors, and the mean square at the rate.
 
     (M,) each. Products and squares are means over the fields and the axes across the boresight, in arcsec^2, after the
@@ -156,7 +171,7 @@ def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Fl
     squares = []
     for rate in sheet.levels("sequence", "rate_deg_s"):
         steps, errors = sequences(sheet, rate)
-        errors = errors[:2] - np.array(mean)[:2, None, None]
+        errors = errors[:2] - mean[:2, None, None]
         square = mean_known(errors**2)
         for first, second in combinations(range(len(steps)), 2):
             apart = steps[second] - steps[first]
@@ -167,7 +182,7 @@ def lagged(sheet: MeasuredFrames, mean: list[float]) -> tuple[Floats, Floats, Fl
 
 
 def field_angle_deg(
-    sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: list[float]
+    sheet: MeasuredFrames, field: Floats, pixel: Floats, mean: Floats
 ) -> float:
     """The correlation angle of the field term, from a least-squares fit to the lagged products.
 
@@ -223,31 +238,37 @@ class Agreement(NamedTuple):
     expected_correlation: float
 
 
-def some_fields(sheet: MeasuredFrames, fields: slice) -> MeasuredFrames:
-    """The part of a sheet with some of its fields."""
+def some_fields(sheet: MeasuredFrames, fields: Any) -> MeasuredFrames:
+    """The part of a sheet with the fields of these numbers."""
     columns = {name: values[:, fields] for name, values in sheet.columns.items()}
-    count = len(range(sheet.size.fields)[fields])
-    return replace(sheet, columns=columns, size=replace(sheet.size, fields=count))
+    return replace(sheet, columns=columns, size=replace(sheet.size, fields=len(fields)))
 
 
 def agreements(sheet: MeasuredFrames) -> list[Agreement]:
-    """The agreement of each half of the fields with the other, at the rates of the sequences, rest first."""
-    even = some_fields(sheet, slice(0, None, 2))
-    odd = some_fields(sheet, slice(1, None, 2))
-    rates = sheet.levels("sequence", "rate_deg_s")
+    """The agreement of each half of the fields with the other, at the rates of the sequences, rest first.
+
+    Raises
+    ------
+    InputError
+        If too few fields are solved for two halves.
+    """
+    _, solved = term_errors(sheet, MODEL_FIELDS)
+    # Every second of the solved fields, then of the others, so that both halves have terms.
+    order = np.argsort(~solved, kind="stable")
+    even, odd = (some_fields(sheet, order[first::2]) for first in range(2))
     return [
         agreement(of_one_unit(fitted), other, rate, name)
         for name, fitted, other in (("even", even, odd), ("odd", odd, even))
-        for rate in rates
+        for rate in sheet.levels("sequence", "rate_deg_s")
+        if rate <= max(errors_by_rate(fitted))
     ]
 
 
 def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
-    """The model of a sheet for the first of its units."""
-    unit_mean = term_errors(sheet)[0][:, :, 0].mean(axis=(1, 2, 3, 4))
-    return ErrorModel(
-        constants(sheet) | {"mean": unit_mean.tolist(), "unit": [0.0, 0.0, 0.0]}
-    )
+    """The model of a sheet for the first of its units in its first thermal state."""
+    none = [0.0, 0.0, 0.0]
+    mean = unit_mean(sheet).tolist()
+    return ErrorModel(constants(sheet) | {"mean": mean, "unit": none, "thermal": none})
 
 
 def agreement(
@@ -288,9 +309,12 @@ def turning(model: ErrorModel, rate_deg_s: float) -> Floats:
 
 
 def at_rest(model: ErrorModel) -> Floats:
-    """(DRAWN, 3) errors at rest, each in another field."""
-    rates = len(model.noise)
-    rest = {"noise": [model.noise[0].tolist()] * rates, "along": [model.along[0]] * rates}
+    """(DRAWN, 3) errors with the noise at rest, each in another field."""
+    rest = {
+        "rates_deg_s": [0.0, 1.0],
+        "noise": [model.noise[0].tolist()] * 2,
+        "along": [model.along[0]] * 2,
+    }
     return turning(ErrorModel(model.constants | rest), 1.0)
 
 

@@ -13,6 +13,7 @@ from skysim.core.types import Floats
 from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
+    Bounded,
     mean_known,
     mean_square_ratio,
     rms,
@@ -109,7 +110,7 @@ def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
         within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
-        "nees": metrics.mean_nees({"nees": nees, "solved": np.ones(nees.size)}),
+        "nees": mean_nees(sheet, rows),
         "within": within,
         "y_over_x": mean_square_ratio(y, x),
     }
@@ -130,7 +131,15 @@ def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:
             for name, axes in GROUPS.items()
         },
         **rms_by_group(sheet, rows),
+        "nees": mean_nees(sheet, rows),
     }
+
+
+def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
+    """The mean normalized error squared of right attitudes: 3 if their covariances are right."""
+    nees = np.where(sheet.right(rows), sheet.column("nees", rows), np.nan)
+    solved = np.isfinite(nees).sum(axis=0)
+    return Bounded(*metrics.mean_nees({"nees": mean_known(nees, 0), "solved": solved})[:3])
 
 
 def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
@@ -164,6 +173,7 @@ def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
         rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
         row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
+        row |= {"nees": mean_nees(sheet, rows)}
         found.append(row | rms_by_group(sheet, rows))
     return found
 

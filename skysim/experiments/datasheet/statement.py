@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from skysim.core.errors import InputError
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
 from skysim.experiments.datasheet.performance import Counts, Limit
@@ -24,6 +25,7 @@ NAMES = {
     "total": "sum",
 }
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
+ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
 
 
@@ -38,9 +40,13 @@ class StatementSection(NamedTuple):
 
 
 class Statement(NamedTuple):
-    """All numbers of a datasheet, and the measured frames that they are from."""
+    """All numbers of a datasheet, and the measured frames that they are from.
+
+    `refusal` is the reason if too few fields are solved for the error terms; then `terms` and `bias` are empty.
+    """
 
     sheet: MeasuredFrames
+    refusal: InputError | None
     terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
@@ -59,14 +65,23 @@ class Statement(NamedTuple):
 
 
 def state(sheet: MeasuredFrames) -> Statement:
-    """The statement of a measured sheet, with times on this machine. Raises InputError if too few frames are solved."""
-    _, solved = variance_components.term_errors(sheet)
+    """The statement of a measured sheet, with times on this machine."""
+    _, solved = variance_components.term_errors(sheet, least=0)
+    refusal = None
+    tables: dict[str, variance_components.TermTable] = {}
+    bias: list[Bounded] = []
+    try:
+        tables = variance_components.term_tables(sheet)
+        bias = variance_components.mean_errors(sheet)
+    except InputError as error:
+        refusal = error
     found = performance.counts(sheet, sheet.rows("sky"))
     return Statement(
         sheet,
-        variance_components.term_tables(sheet),
+        refusal,
+        tables,
         int(solved.sum()),
-        variance_components.mean_errors(sheet),
+        bias,
         variance_components.causes(sheet),
         found,
         performance.claims(found),
@@ -80,6 +95,25 @@ def state(sheet: MeasuredFrames) -> Statement:
         performance.disturbances(sheet),
         performance.solution_times_s(sheet).tolist(),
     )
+
+
+def failed_checks(statement: Statement) -> list[str]:
+    """Sentences on what the sheet's own checks contradict: missing terms, a sum unlike the total, a negative term."""
+    found = []
+    if statement.refusal:
+        found.append(f"The error terms are not stated. Fields {statement.refusal.fault}.")
+    for name, table in statement.terms.items():
+        if variance_components.sign(table.ratio, 1.0):
+            found.append(
+                f"The terms {name} the boresight do not add up: their sum over the mean square of other frames is"
+                f" {bounded(table.ratio)}, which does not hold 1."
+            )
+        found += [
+            f"The variance of {NAMES[term]} {name} the boresight is negative."
+            for term, sign in table.signs.items()
+            if sign < 0
+        ]
+    return found
 
 
 # As numbers.
@@ -100,13 +134,18 @@ def as_numbers(value: Any) -> Any:
 
 
 def numbers(statement: Statement) -> dict[str, Any]:
-    """The statement for JSON; squares in arcsec^2 of one axis."""
+    """The statement for JSON; squares in arcsec^2 of one axis.
+
+    Numbers outside `rates`, `accelerations` and those of tracking mode hold at `rate_deg_s`.
+    """
     sheet = statement.sheet
     head = {
         "scene": sheet.scene.name,
         "title": sheet.scene.title,
         "overrides": dict(sheet.overrides),
+        "failed_checks": failed_checks(statement),
         "seed": sheet.scene.seed,
+        "rate_deg_s": 0.0,
         "fields": sheet.size.fields,
         "units": sheet.designer.units,
         "states_c": sheet.designer.temperatures_c,
@@ -115,7 +154,7 @@ def numbers(statement: Statement) -> dict[str, Any]:
         "limits": limits(statement),
     }
     parts = statement._asdict()
-    del parts["sheet"], parts["fields"]
+    del parts["sheet"], parts["refusal"], parts["fields"]
     return head | as_numbers(parts)
 
 
@@ -142,17 +181,23 @@ def limits(statement: Statement) -> dict[str, Any]:
 # As sections.
 
 
-def size(square: Bounded) -> str:
-    """A root mean square with its interval; only its upper bound if the square is not shown to be above 0."""
-    if square.high <= 0:
-        return "not seen"
-    if square.low <= 0:
-        return f"< {math.sqrt(max(square.high, 0.0)):.3g}"
-    low, value, high = (math.sqrt(one) for one in (square.low, square.value, square.high))
-    return f"{value:.3g} ({low:.3g} to {high:.3g})"
+def sizes(table: variance_components.TermTable, name: str) -> list[str]:
+    """A term's root mean square and its percentage of the sum; its upper bounds if it is not shown to be above 0."""
+    low, high = (max(end, 0.0) for end in table.squares[name][1:])
+    total = table.squares["total"].value
+    if not table.signs[name]:
+        return [f"< {math.sqrt(high):.3g}", f"< {100 * high / total:.1f}"]
+    value = table.squares[name].value
+    if value < 0:
+        return ["negative", f"{100 * value / total:.1f}"]
+    text = f"{math.sqrt(value):.3g} ({math.sqrt(low):.3g} to {math.sqrt(high):.3g})"
+    return [text, f"{100 * value / total:.1f}"]
 
 
 def bounded(value: Bounded | Summary, digits: int = 3) -> str:
+    """A value with its interval, or that its frames are too few for one."""
+    if math.isnan(value.low):
+        return "too few to say"
     return f"{value.value:.{digits}g} ({value.low:.{digits}g} to {value.high:.{digits}g})"
 
 
@@ -167,8 +212,8 @@ def arcsec(value: float) -> str:
 
 def sections(statement: Statement) -> list[StatementSection]:
     """All sections, in order."""
-    made = [
-        term_section(statement),
+    made = [] if statement.refusal else [term_section(statement)]
+    made += [
         lowering_section(statement),
         probability_section(statement),
         quantile_section(statement),
@@ -200,20 +245,18 @@ def term_section(statement: Statement) -> StatementSection:
             continue
         row = [NAMES[name]]
         for table in tables.values():
-            share = table.squares[name].value / table.squares["total"].value
-            row += [size(table.squares[name]), f"{100 * share:.1f}"]
+            row += sizes(table, name)
         rows.append([*row, variance_components.TERMS.get(name, "of the terms of this scene")])
     ratios = ", ".join(f"{bounded(table.ratio)} {name}" for name, table in tables.items())
     x, y, roll = (bounded(one, 2) for one in statement.bias)
     texts = [
-        "Errors of one axis, 1 σ in arcseconds, with 95 % intervals over the fields: across the boresight the mean of x"
-        f" and y, about it the roll. Statistical interpretation: {ENSEMBLE}; temporal noise: {TEMPORAL}."
+        "Errors of one axis at rest, 1 σ in arcseconds, with 95 % intervals over the fields: across the boresight the"
+        f" mean of x and y, about it the roll. Statistical interpretation: {ENSEMBLE}; temporal noise: {TEMPORAL}."
         f" {statement.fields} fields, {sheet.designer.units} units, {sheet.designer.states} thermal states,"
         f" {sheet.size.attitudes} attitudes a few pixels apart, {sheet.size.frames} frames each.",
         f"Sum of the terms' variances over the mean square of {len(sheet.rows('total'))} frames in each of these"
-        f" fields, with other attitudes and other noise: {ratios}.",
-        "A term that is smaller than its error may come out negative, and the others then exceed 100 %; it is below the"
-        " bound at 97.5 % confidence.",
+        f" fields, with other attitudes and other noise: {ratios} (95 % for both together).",
+        "A term that is not shown to be above 0, at 95 % for all terms together, has its upper bound at 97.5 % alone.",
         f"Mean error about the camera's axes, arcseconds: x {x}, y {y}, roll {roll}.",
     ]
     if sheet.designer.units > 1:
@@ -248,8 +291,8 @@ def lowering_section(statement: Statement) -> StatementSection:
         for name, table in statement.terms.items()
     ]
     texts.append(
-        "Each change alone, on the same fields, units and noise as before: what is left of the error's mean square, in"
-        " percent, with 95 % intervals. Below 100 the change lowers the error."
+        "Each change alone, at rest, on the same fields, units and noise as before: what is left of the error's mean"
+        " square, in percent, with 95 % intervals. Below 100 the change lowers the error."
     )
     rows = [
         [
@@ -326,7 +369,7 @@ def probability_section(statement: Statement) -> StatementSection:
 def quantile_section(statement: Statement) -> StatementSection:
     """Quantiles of the errors."""
     texts = [
-        "Errors that a frame stays below with the probability at the left, over independent frames"
+        "Errors that a frame at rest stays below with the probability at the left, over independent frames"
         f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights.",
         consistency_text(statement.consistency),
     ]
@@ -373,15 +416,16 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
-    """Cells of a pair of frames: noise-equivalent angle and error."""
-    return [
+    """Cells of a pair of frames: noise-equivalent angle and error, and the normalized error squared."""
+    errors = [
         arcsec(row[f"{kind}_{name}"])
         for name in variance_components.GROUPS
         for kind in ("nea", "rms")
     ]
+    return [*errors, bounded(row["nees"])]
 
 
-PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″"]
+PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
 OUTCOME_HEADERS = ["right %", "refused", "false"]
 FIELD_HEADERS = ["both right %", "one refused", "one false"]
 
@@ -403,8 +447,11 @@ def rate_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle, error and acquisition by rate."""
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
-        f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ENSEMBLE})."
-        f" Shares are of attitudes that are right in both frames. {precision_text(statement.sheet)}",
+        f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ONE_UNIT})."
+        " NEES: normalized error squared of this unit; over all units 3 where the tracker's own covariance is right."
+        " Shares are of attitudes that are right in both frames."
+        f" {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known beyond"
+        f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
         bracket_text(
             "acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"
         ),
@@ -436,7 +483,7 @@ def acceleration_section(statement: Statement) -> StatementSection:
     """Error and acquisition by acceleration."""
     texts = [
         "Two frames of each attitude, with no rate at mid-exposure and a constant acceleration across the boresight"
-        f" ({ENSEMBLE}). Errors are relative to the mean attitude over the exposure, which is a T² / 24 from that at"
+        f" ({ONE_UNIT}). Errors are relative to the mean attitude over the exposure, which is a T² / 24 from that at"
         " mid-exposure.",
         bracket_text(
             "acquisition in acceleration",
@@ -449,6 +496,7 @@ def acceleration_section(statement: Statement) -> StatementSection:
             f"{row['acceleration_deg_s2']:g}",
             arcsec(row["rms_across"]),
             arcsec(row["rms_about"]),
+            bounded(row["nees"]),
             *outcome_cells(row),
         ]
         for row in statement.accelerations
@@ -457,6 +505,7 @@ def acceleration_section(statement: Statement) -> StatementSection:
         "acceleration °/s²",
         "rms across ″",
         "rms about ″",
+        "NEES",
         *FIELD_HEADERS,
     ]
     return StatementSection("By acceleration", texts, headers, rows)
@@ -497,7 +546,7 @@ def magnitude_section(statement: Statement) -> StatementSection:
     """Noise-equivalent angle by the limit of the catalog."""
     texts = [
         "The faintest stars of the tracker's catalog, at rest: two frames of each attitude that differ in their noise"
-        f" (NEA: {TEMPORAL}; rms: {ENSEMBLE})."
+        f" (NEA: {TEMPORAL}; rms: {ONE_UNIT})."
     ]
     own = statement.sheet.scene.tracker.limit_mag
     rows = [
@@ -520,9 +569,10 @@ def magnitude_section(statement: Statement) -> StatementSection:
 def disturbance_section(statement: Statement) -> StatementSection:
     """Outcomes and errors under disturbances."""
     texts = [
-        f"One frame in each field with a disturbance beyond what the scene has ({ENSEMBLE}); the Moon's frames have"
-        " attitudes of their own, with the Moon in the field. rms: of one axis, over the right attitudes alone, which"
-        " may be those of the fields with the brightest stars. False stars are added to centroids, not to frames."
+        f"One frame in each field at rest with a disturbance beyond what the scene has ({ONE_UNIT}); the Moon's"
+        " frames have attitudes of their own, with the Moon in the field. rms: of one axis, over the right attitudes"
+        " alone, which may be those of the fields with the brightest stars. False stars are added to centroids, not to"
+        " frames."
     ]
     rows = [
         [

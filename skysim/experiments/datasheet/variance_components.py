@@ -1,49 +1,36 @@
 """Variance components of an attitude error: which part of its mean square belongs to which cause.
 
 The error about one axis is measured in a crossed and nested design: fields x units x thermal states, in each of these
-combinations some attitudes a few pixels apart, at each of these some frames with new noise. The model is that of random
-effects (Searle, Casella & McCulloch 1992, Variance Components, chapter 4),
-
-    e = mu + sum over A of a_A + p + t,    A the subsets of {field, unit, state},
-
-with an attitude's effect p and the noise t. All are estimated without bias from mean squares, so their sum is the
-unbiased estimate of E[e^2], and a component may come out slightly negative where it is smaller than its error.
+combinations the same attitudes a few pixels apart, at each some frames with new noise. Fields, units, attitudes
+and noise are drawn, and their effects are random (Searle, Casella & McCulloch 1992, Variance Components, chapter 4).
+The thermal states are the whole history at equal steps, a fixed factor: its variance is the mean square over them.
+All terms are estimated without bias, and their sum is the mean square of the design's errors. A term may come out
+slightly negative where it is smaller than its error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
-from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.results.metrics import TAILS
+from skysim.experiments.datasheet.cells import MIN_FIELDS, MeasuredFrames, require_fields
+from skysim.results.metrics import CONFIDENCE
 
-FIELD, UNIT, STATE = range(3)
-Subset = tuple[int, ...]
-RESAMPLES = 400
+RESAMPLES = 2000
 
 
 class Components(NamedTuple):
-    """Mean square of each term of the error, in squared units of the error; see `components`."""
+    """Mean square of each term of the error, in squared units of the error; see `contributions`."""
 
-    bias: float
-    thermal: float
-    field: float
-    pixel: float
-    temporal: float
-
-    @property
-    def total(self) -> float:
-        """Sum of the terms."""
-        return float(sum(self))
+    bias: Any
+    thermal: Any
+    field: Any
+    pixel: Any
+    temporal: Any
 
 
 class Bounded(NamedTuple):
@@ -54,109 +41,76 @@ class Bounded(NamedTuple):
     high: float
 
 
-def subsets(present: list[int]) -> Iterator[Subset]:
-    """All subsets, the largest first."""
-    for size in range(len(present), -1, -1):
-        yield from combinations(present, size)
-
-
-def effects(means: Floats, present: list[int]) -> dict[Subset, float]:
-    """Variance of each crossed effect plus what is left in the means of nested ones, by subset of the factors.
-
-    The mean squares of the orthogonal decomposition (inclusion and exclusion of marginal means) have
-    E[MS_A] = sum over B containing A of var_B times the number of cells that share one level of B; they are solved from
-    the largest subset down. var_() is the square of the mean.
+def contributions(errors: Floats) -> Components:
+    """Each field's share in the error's terms, whose mean over the fields is the estimate.
 
     Parameters
     ----------
-    means
-        (fields, units, states)
-    present
-        Factors with more than one level
-    """
-    found: dict[Subset, float] = {}
-    counts = np.array(means.shape)
-    for subset in subsets(present):
-        effect = np.zeros_like(means)
-        for part in subsets(list(subset)):
-            others = tuple(axis for axis in range(means.ndim) if axis not in part)
-            sign = (-1) ** (len(subset) - len(part))
-            effect += sign * means.mean(axis=others, keepdims=True)
-        freedom = np.prod([counts[axis] - 1 for axis in subset])
-        square = float(np.sum(np.broadcast_to(effect, means.shape) ** 2) / freedom)
-        larger = [one for one in found if set(subset) < set(one)]
-        shared = sum(found[one] * float(np.prod(np.delete(counts, one))) for one in larger)
-        found[subset] = (square - shared) / float(np.prod(np.delete(counts, subset)))
-    return found
-
-
-def components(errors: Floats) -> Components:
-    """The error's terms from (fields, units, states, attitudes, frames) values, at least two fields, attitudes, frames.
+    errors
+        (..., fields, units, states, attitudes, frames), at least three fields, two attitudes and frames
 
     Returns
     -------
-    bias
-        Constant over fields, attitudes and time: the mean's square and the variance among units
-    thermal
-        All that changes with the thermal state
-    field
-        Changes from field to field, for one unit: catalog, distortion, map of the LEDs,
-        geometry of the stars
-    pixel
-        Changes over a few pixels: centroiding, fixed pattern
-    temporal
-        Changes from frame to frame
+    Components
+        (..., fields) each. bias: constant over fields, attitudes and time, mean's square and variance among units;
+        thermal: all that changes with the thermal state; field: changes from field to field, for one unit (catalog,
+        distortion, map of the LEDs, geometry of the stars); pixel: changes over a few pixels (centroiding, fixed
+        pattern); temporal: changes from frame to frame
     """
-    temporal = float(np.mean(np.var(errors, axis=-1, ddof=1)))
+    *_, attitudes, frames = errors.shape
+    temporal = np.var(errors, axis=-1, ddof=1).mean(axis=(-1, -2, -3))
     cells = errors.mean(axis=-1)
-    frames = errors.shape[-1]
-    attitudes = errors.shape[-2]
-    between = float(np.mean(np.var(cells, axis=-1, ddof=1)))
-    means = cells.mean(axis=-1)
-    present = [axis for axis in (FIELD, UNIT, STATE) if means.shape[axis] > 1]
-    found = effects(means, present)
-    # What attitudes and noise leave in a mean is in the smallest of the crossed effects.
-    found[tuple(present)] -= between / attitudes
-    bias = by_state = by_field = 0.0
-    for subset, value in found.items():
-        if STATE in subset:
-            by_state += value
-        elif FIELD in subset:
-            by_field += value
-        else:
-            bias += value
-    return Components(bias, by_state, by_field, between - temporal / frames, temporal)
+    between = np.var(cells, axis=-1, ddof=1).mean(axis=(-1, -2))
+    # The same attitudes are used in all states: this part of their variance is common to the states.
+    common = np.var(cells.mean(axis=-2), axis=-1, ddof=1).mean(axis=-1)
+    by_state = cells.mean(axis=-1)
+    # The states are all that there are, so their mean square is divided by their number.
+    thermal = np.var(by_state, axis=-1).mean(axis=-1) - (between - common) / attitudes
+    means = by_state.mean(axis=-1)
+    bias = common_square(means).mean(axis=-1)
+    field = np.mean(means**2, axis=-1) - common / attitudes - bias
+    return Components(bias, thermal, field, between - temporal / frames, temporal)
 
 
-def of_axes(errors: Floats) -> Components:
-    """The components of (axes, fields, ...) errors, the mean over the axes."""
-    return Components(*np.mean([components(one) for one in errors], axis=0).tolist())
+def common_square(means: Floats) -> Floats:
+    """Each field's share in the square of the (..., fields, units) means' expectation over the fields.
 
-
-def with_intervals(errors: Floats) -> dict[str, Bounded]:
-    """The components of (axes, fields, ...) errors and their total, each with its bootstrap interval over the fields.
-
-    Fields are the independent draws; units and states are those that were measured.
+    The square is the mean product of two different fields, which has no bias; shares are the jackknife's pseudo-values
+    (Efron & Stein 1981).
     """
-    drawn = [of_axes(errors[:, rows]) for rows in resamples(errors.shape[1])]
-    values = of_axes(errors)
-    found = {}
-    for name in (*Components._fields, "total"):
-        samples = np.array([getattr(one, name) for one in drawn])
-        found[name] = bounded(getattr(values, name), samples)
-    return found
+    fields = means.shape[-2]
+    total = means.sum(axis=-2, keepdims=True)
+    products = means * (total - means) / (fields - 1)
+    square = products.mean(axis=-2, keepdims=True)
+    return np.asarray(square + 2 * (fields - 1) / (fields - 2) * (products - square))
 
 
-def resamples(count: int) -> Iterator[NDArray[np.int64]]:
-    """Rows of each sample of the bootstrap over `count` fields."""
-    rng = random_stream(1)
-    return (rng.integers(count, size=count) for _ in range(RESAMPLES))
+def bounded(shares: Floats, verdicts: int = 1) -> Bounded:
+    """The mean of (fields,) shares with its bootstrap-t interval (Efron & Tibshirani 1993, section 12.5).
 
+    Fields are the independent draws; units and states are those that were measured. The Student statistic of resampled
+    fields has the skewness of the shares: fields with few stars err more. Shares without scatter have an interval of
+    zero width, and fewer than MIN_FIELDS none.
 
-def bounded(value: float, drawn: Floats) -> Bounded:
-    """A value with the percentile interval of its bootstrap samples."""
-    low, high = np.quantile(drawn, TAILS)
-    return Bounded(float(value), float(low), float(high))
+    Parameters
+    ----------
+    verdicts
+        Number of intervals that hold together at CONFIDENCE (Bonferroni)
+    """
+    count = len(shares)
+    value = mean_known(shares)
+    if count < MIN_FIELDS:
+        return Bounded(float(value), math.nan, math.nan)
+    drawn = shares[random_stream(1).integers(count, size=(RESAMPLES, count))]
+    deviation = drawn.std(axis=1)
+    # A sample of one field many times over tells nothing of the scatter.
+    varied = deviation > 1e-6 * shares.std()
+    if not varied.any():
+        return Bounded(*[float(value)] * 3)
+    student = (drawn[varied].mean(axis=1) - value) / deviation[varied]
+    tail = (1 - CONFIDENCE) / 2 / verdicts
+    above, below = np.quantile(student, [1 - tail, tail]) * shares.std()
+    return Bounded(float(value), float(value - above), float(value - below))
 
 
 def mean_known(values: Floats, axis: int | tuple[int, ...] | None = None) -> Any:
@@ -166,49 +120,29 @@ def mean_known(values: Floats, axis: int | tuple[int, ...] | None = None) -> Any
     return np.sum(np.where(known, values, 0.0), axis=axis) / np.where(count, count, np.nan)
 
 
-def sum_over_total(errors: Floats, at_once: Floats) -> Bounded:
-    """Ratio of the sum of the terms to the mean square error of independent frames of the same fields.
-
-    Parameters
-    ----------
-    errors
-        (axes, fields, ...) of the design
-    at_once
-        (axes, fields, draws), NaN where there is no attitude
-    """
-    squares = mean_known(at_once**2, (0, 2))
-    known = np.isfinite(squares)
-    errors = errors[:, known]
-    squares = squares[known]
-    drawn = []
-    for rows in resamples(len(squares)):
-        total = of_axes(errors[:, rows]).total
-        drawn.append(total / squares[rows].mean())
-    return bounded(of_axes(errors).total / float(squares.mean()), np.array(drawn))
-
-
-def mean_square_ratio(numerator: Floats, denominator: Floats) -> Bounded:
-    """Ratio of two mean squares that were measured in the same fields, with its bootstrap interval over the fields.
+def mean_square_ratio(numerator: Floats, denominator: Floats, verdicts: int = 1) -> Bounded:
+    """Ratio of two mean squares that were measured in the same fields, with the interval of its logarithm.
 
     Parameters
     ----------
     numerator, denominator
         (fields,) mean squares; fields without one of them are left out
+    verdicts
+        As for `bounded`
     """
     known = np.isfinite(numerator) & np.isfinite(denominator)
-    top = numerator[known]
-    bottom = denominator[known]
-    if not len(top):
+    if not known.any():
         return Bounded(math.nan, math.nan, math.nan)
-    drawn = [top[rows].mean() / bottom[rows].mean() for rows in resamples(len(top))]
-    return bounded(top.mean() / bottom.mean(), np.array(drawn))
+    top, bottom = (one[known] / one[known].mean() for one in (numerator, denominator))
+    ratio = float(numerator[known].mean() / denominator[known].mean())
+    ends = np.exp(bounded(top - bottom, verdicts))
+    return Bounded(*(ratio * ends).tolist())
 
 
 # The terms of a datasheet: their sizes, their sum against the total, and the effect of each cause.
 
 
 GROUPS = {"across": slice(0, 2), "about": slice(2, 3)}  # axes across and about the boresight
-MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 
 TERMS = {
     "bias": "mean over fields, attitudes and time, and its scatter among units",
@@ -226,11 +160,16 @@ class TermTable(NamedTuple):
     ----------
     squares
         Mean squares of terms and total, arcsec^2 of one axis, with intervals
+    signs
+        1 where a term is above 0, -1 where it is below, 0 where the fields do not tell: at
+        CONFIDENCE for all terms of both groups together
     ratio
-        Sum of the terms over the mean square of independent frames
+        Sum of the terms over the mean square of independent frames, whose intervals hold
+        together for both groups
     """
 
     squares: dict[str, Bounded]
+    signs: dict[str, int]
     ratio: Bounded
 
     @property
@@ -239,13 +178,13 @@ class TermTable(NamedTuple):
         return max(Components._fields, key=lambda name: self.squares[name].value)
 
 
-def term_errors(sheet: MeasuredFrames) -> tuple[Floats, np.ndarray]:
+def term_errors(sheet: MeasuredFrames, least: int = MIN_FIELDS) -> tuple[Floats, np.ndarray]:
     """(3, fields, units, states, attitudes, frames) errors of the fields in which all frames are solved, and which.
 
     Raises
     ------
     InputError
-        Where they are too few for a statement.
+        Where they are fewer than `least`.
     """
     rows = sheet.rows("terms")
     designer = sheet.designer
@@ -254,13 +193,12 @@ def term_errors(sheet: MeasuredFrames) -> tuple[Floats, np.ndarray]:
     shape = (3, designer.units, designer.states, size.attitudes, size.frames, size.fields)
     errors = np.moveaxis(errors.reshape(shape), -1, 1)
     solved = np.asarray(np.isfinite(errors).all(axis=(0, 2, 3, 4, 5)))
-    if solved.sum() < MIN_FIELDS:
-        share = max(float(solved.mean()), 1 / size.fields)
-        raise InputError(
-            "datasheet.fields",
-            f"{size.fields}: {solved.sum()} fields are solved in all {len(rows)} frames",
-            f"{MIN_FIELDS} of them or more, as with {math.ceil(1.5 * MIN_FIELDS / share)} fields",
-        )
+    require_fields(
+        size.fields,
+        int(solved.sum()),
+        least,
+        f"{solved.sum()} of them are solved in all {len(rows)} frames of the error terms",
+    )
     return errors[:, solved], solved
 
 
@@ -268,24 +206,31 @@ def term_tables(sheet: MeasuredFrames) -> dict[str, TermTable]:
     """The terms across and about the boresight."""
     errors, solved = term_errors(sheet)
     at_once = np.moveaxis(sheet.errors(sheet.rows("total")), 1, 2)[:, solved]
-    tables = {}
-    for name, axes in GROUPS.items():
-        ratio = sum_over_total(errors[axes], at_once[axes])
-        tables[name] = TermTable(with_intervals(errors[axes]), ratio)
-    return tables
+    return {name: term_table(errors[axes], at_once[axes]) for name, axes in GROUPS.items()}
+
+
+def term_table(errors: Floats, at_once: Floats) -> TermTable:
+    """The terms of (axes, fields, ...) errors beside (axes, fields, draws) of other frames, NaN where not solved."""
+    shares = {name: one.mean(axis=0) for name, one in contributions(errors)._asdict().items()}
+    shares["total"] = sum(shares.values())
+    verdicts = len(Components._fields) * len(GROUPS)
+    return TermTable(
+        {name: bounded(one) for name, one in shares.items()},
+        {name: sign(bounded(one, verdicts)) for name, one in shares.items()},
+        mean_square_ratio(shares["total"], mean_known(at_once**2, (0, 2)), len(GROUPS)),
+    )
+
+
+def sign(value: Bounded, zero: float = 0.0) -> int:
+    """1 where an interval is above `zero`, -1 where it is below, 0 where it holds it or is not known."""
+    return int(value.low > zero) - int(value.high < zero)
 
 
 def mean_errors(sheet: MeasuredFrames) -> list[Bounded]:
-    """The mean error about each axis of the camera, arcseconds, with its interval (Student's, over the fields)."""
-    from scipy.special import stdtrit
-
+    """The mean error about each axis of the camera, arcseconds, with its interval."""
     errors, _ = term_errors(sheet)
     means = errors.reshape(*errors.shape[:2], -1).mean(axis=2)
-    fields = means.shape[1]
-    mean = means.mean(axis=1)
-    half = stdtrit(fields - 1, TAILS[1]) * means.std(axis=1, ddof=1) / math.sqrt(fields)
-    ends = np.column_stack([mean, mean - half, mean + half])
-    return [Bounded(*one) for one in ends.tolist()]
+    return [bounded(one) for one in means]
 
 
 def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Floats:

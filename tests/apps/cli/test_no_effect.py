@@ -66,6 +66,16 @@ def test_an_option_without_effect_is_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["study.yaml"]
 
 
+@pytest.mark.parametrize("words", ["reproduce shefex-figs-4-5", "datasheet shefex2"])
+def test_a_page_that_cannot_be_written_is_refused_before_the_work(
+    command: Command, words: str, tmp_path: Path
+) -> None:
+    done = command(*words.split(), "--markdown", "page.pdf")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("skysim: page.pdf: unknown file format '.pdf'; allowed:")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.slow
 def test_a_program_named_by_a_study_s_level_has_an_effect(
     command: Command, tmp_path: Path

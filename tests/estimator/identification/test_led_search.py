@@ -337,6 +337,7 @@ def test_the_index_converts_errors_and_field_to_angles() -> None:
 # ---- steps of the search, by the interpreter
 
 PLAIN = interpreted("estimator.identification.led_search")
+CHANCE = interpreted("estimator.identification.chance")
 
 
 def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
@@ -494,13 +495,11 @@ def test_the_prior_of_a_pair_s_attitude_is_its_share_of_all_attitudes() -> None:
     apart = np.hypot(0.09, 0.01)
     covariance = np.diag([across, across, np.sqrt(2) * detections.sigma.min() / apart]) ** 2
     wanted = np.log10(np.sqrt(np.linalg.det(2 * np.pi * covariance)) / dome.prior_volume)
-    assert PLAIN._attitude_dex(detections, dome, 0, 1) == pytest.approx(wanted, abs=1e-9)
+    pair = (detections.tangent, detections.sigma, 0, 1, dome.prior_volume)
+    assert CHANCE.attitude_dex(*pair, 0.0) == pytest.approx(wanted, abs=1e-9)
     # A length errs relatively as a direction does; a uniform prior of the focal length over +-12 %.
     focal = np.log10(np.sqrt(2 * np.pi) * np.sqrt(covariance[2, 2]) / 0.24)
-    uncertain = detections._replace(focal_uncertainty=0.12)
-    assert PLAIN._attitude_dex(uncertain, dome, 0, 1) == pytest.approx(
-        wanted + focal, abs=1e-9
-    )
+    assert CHANCE.attitude_dex(*pair, 0.12) == pytest.approx(wanted + focal, abs=1e-9)
 
 
 # ---- a focal length that is known to a tenth

@@ -414,7 +414,10 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     wanted = np.log10(
         np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume
     )
-    assert CHECK.attitude_dex(detections, 0, 1) == pytest.approx(wanted, abs=1e-3)
+    found = CHECK.attitude_dex(
+        detections.tangent, detections.sigma, 0, 1, 8 * np.pi**2, detections.focal_uncertainty
+    )
+    assert found == pytest.approx(wanted, abs=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,13 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.experiments.datasheet.cells import (
     FULL,
+    MIN_FIELDS,
+    MODEL_FIELDS,
     QUICK,
+    DatasheetCell,
     Designer,
     check_scene,
+    measure,
     states_c,
     unit_seeds,
 )
@@ -66,6 +70,21 @@ def test_units_and_thermal_states_are_combined_equally_often():
     assert set(combined.values()) == {1}
 
 
+@pytest.mark.parametrize("experiment", ["cause", "total"])
+def test_every_thermal_state_is_used_equally_often(experiment):
+    """Also by the frames with a cause: of the first state alone they would tell the effect of one temperature."""
+    designer = Designer(load("thermal_drift", {}), QUICK)
+    cells = [cell for cell in designer.cells() if cell.experiment == experiment]
+    used = Counter(
+        (cell.levels.get("cause"), cell.settings["thermal.temperature"]["temperature_c"])
+        for cell in cells
+        if cell.levels.get("cause") != "the temperature held"
+    )
+    causes = {cause for cause, _ in used}
+    assert len(used) == len(causes) * designer.states
+    assert len(set(used.values())) == 1
+
+
 def test_only_a_tracker_with_a_tracking_mode_has_tracking_limits():
     rolling = {"camera.shutter": "{kind: rolling, row_time: 20 us}"}
     for scene, overrides, has in (
@@ -89,6 +108,34 @@ def test_thermal_states_match_the_scene():
     scene = load("thermal_drift", {})
     assert states_c(scene, 4) == pytest.approx([21, 24, 21, 18])
     assert states_c(load("shefex2", {}), 4) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "least", "message"),
+    [
+        (
+            9,
+            MIN_FIELDS,
+            "datasheet.fields: 9: too few for the error terms, 10 needed; allowed: 10 or more",
+        ),
+        (16, MODEL_FIELDS, "datasheet.fields: 16: .* allowed: 20 or more"),
+    ],
+)
+def test_too_few_fields_are_refused_before_the_first_trial(fields, least, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        measure(
+            "shefex2", load("shefex2", {}), {}, tmp_path / "x", fields=fields, least=least
+        )
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_cell_that_is_not_allowed_is_refused_before_the_first_trial(tmp_path, monkeypatch):
+    def refused(self):
+        yield DatasheetCell("cause", {"cause": "more"}, {"camera.f_number": -1})
+
+    monkeypatch.setattr(Designer, "cells", refused)
+    with pytest.raises(InputError, match=r"cause cause more: camera\.f_number"):
+        measure("shefex2", load("shefex2", {}), {}, tmp_path, fields=10, workers=1)
 
 
 @pytest.mark.parametrize(

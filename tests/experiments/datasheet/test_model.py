@@ -20,6 +20,7 @@ from skysim.scene.loader import load
 CONSTANTS: dict[str, Any] = {
     "mean": [0.3, -0.2, 1.0],
     "unit": [0.5, 0.5, 4.0],
+    "thermal": [0.4, 0.3, 2.0],
     "field": [1.0, 0.8, 5.0],
     "pixel": [0.6, 0.6, 3.0],
     "scale": [0.6, 0.6, 0.9],
@@ -83,6 +84,7 @@ def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     expected = (
         model.mean**2 + model.unit**2 + model.field**2 + model.pixel**2 + model.noise[1] ** 2
     )
+    expected += model.thermal**2
     expected += model.along[1] ** 2 / 2 * np.array([1, 1, 0])
     assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.08)
 
@@ -145,6 +147,21 @@ def test_correlations_match_those_of_simulated_draws(model, turned_deg):
     )
     found = np.mean(errors[0] * errors[1], axis=0) / np.mean(errors**2, axis=(0, 1))
     assert found == pytest.approx(model.correlation(turned_deg, rate_deg_s), abs=0.02)
+
+
+@pytest.mark.parametrize("rate_deg_s", [4.1, -50.0, np.nan])
+def test_a_rate_beyond_the_measured_ones_is_refused(model, rate_deg_s):
+    """Not the noise of the last one: by draws, steps and correlations; the last rate itself is allowed."""
+    rng = np.random.default_rng(1)
+    message = "rate_deg_s: .* deg/s; allowed: up to 4 deg/s, as measured"
+    model.draw([0.0, -4.0], 0.1, rng)
+    for call in (
+        lambda: model.draw([0.0, rate_deg_s], 0.1, rng),
+        lambda: model.step(model.start(rng), rate_deg_s, 0.1, rng),
+        lambda: model.correlation(1.0, rate_deg_s),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 def test_more_than_a_hundred_thousand_errors_a_second(model):

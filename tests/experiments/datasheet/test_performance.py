@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -131,3 +132,20 @@ def test_a_covariance_too_small_about_y_is_detected():
     assert found["nees"].value == pytest.approx(2 + 1.5**2, abs=0.2)
     assert found["within"][1]["share"].high < 0.954
     assert found["y_over_x"].value == pytest.approx(1.5**2, rel=0.1)
+
+
+def test_a_covariance_is_judged_at_each_rate():
+    """Errors twice as large as claimed have four times the NEES; with few fields it has no interval."""
+    sheet = sky_sheet((2, 2, 2))
+    sheet = replace(
+        sheet, cells=[DatasheetCell("rate", {"rate_deg_s": n // 2}, {}) for n in range(10)]
+    )
+    rows = performance.by_level(sheet, "rate", "rate_deg_s")
+    assert len(rows) == 5
+    for row in rows:
+        assert row["nees"].low < 12 < row["nees"].high
+        assert row["nees"].low > 9
+    sheet.columns["solved"][:2, 9:] = 0
+    few = performance.by_level(sheet, "rate", "rate_deg_s")[0]["nees"]
+    assert np.isfinite(few.value)
+    assert np.isnan(few.low)

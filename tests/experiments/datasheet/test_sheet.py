@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import cells, datasheet_report, performance
+from skysim.experiments.datasheet import cells, datasheet_report, model_fit, performance
 from skysim.experiments.datasheet.cells import Designer, Size
 from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
-from skysim.experiments.datasheet.variance_components import components
+from skysim.experiments.datasheet.variance_components import contributions
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.loader import load
@@ -94,12 +94,27 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
         )
 
 
-def test_too_few_fields_are_refused_with_their_number(small: None, tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError,
-        match=r"datasheet.fields: 4: . fields are solved .* allowed: 10 of them or more",
-    ):
-        state(measured(tmp_path, fields=4))
+@pytest.mark.parametrize("solved", [0, 6])
+def test_what_was_measured_is_written_without_the_terms(
+    small: None, tmp_path: Path, solved: int
+) -> None:
+    """With too few solved fields for the terms the page has all else, and says first what is missing."""
+    sheet = measured(tmp_path)
+    sheet.columns["solved"][:, solved:] = 0
+    statement = state(sheet)
+    assert statement.refusal
+    report = datasheet_report.datasheet_report(statement, True)
+    text = report.markdown()
+    missing = f"The error terms are not stated. Fields 12: {solved} of them are solved in all"
+    assert text.index(missing) < text.index("of frames lost in space have a right attitude")
+    assert "## By rate" in text
+    assert "## Error terms" not in text
+    paths = datasheet_report.write_all(tmp_path, statement, report)
+    written = json.loads(paths["json"].read_text())
+    assert missing in written["failed_checks"][0]
+    assert written["counts"]["right"] == 2 * solved
+    with pytest.raises(InputError, match=r"datasheet\.fields: 12: .* 20 needed"):
+        model_fit.agreements(sheet)
 
 
 def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
@@ -131,11 +146,11 @@ def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
     by_axis = np.moveaxis(np.array(errors).reshape(shape), (4, 5), (1, 0))
     for axis, slope in enumerate(per_k):
         effects = slope * (temperatures_c - 20)
-        found = components(by_axis[axis])
-        expected = float(np.var(effects, ddof=1))
-        assert found.thermal == pytest.approx(
+        found = contributions(by_axis[axis])
+        expected = np.var(effects)
+        assert found.thermal.mean() == pytest.approx(
             expected, rel=0.05, abs=1.0 if axis < 2 else 20.0
         )
-        # The mean's square, less what the three states' scatter gives to it.
-        unbiased = float(np.mean(effects) ** 2 - expected / 3)
-        assert found.bias == pytest.approx(unbiased, rel=0.05, abs=2.0 if axis < 2 else 20.0)
+        assert found.bias.mean() == pytest.approx(
+            np.mean(effects) ** 2, rel=0.05, abs=2.0 if axis < 2 else 20.0
+        )

@@ -11,7 +11,7 @@ import typer
 from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
-from skysim.results.report import print_table, print_wrapped
+from skysim.results.report import page_path, print_table, print_wrapped
 from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ Quick = Annotated[
 FieldCount = Annotated[
     int | None,
     typer.Option(
-        min=2,
-        help="Number of fields (attitudes) of each experiment; more narrow the intervals.",
+        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.",
     ),
 ]
 Processes = Annotated[
@@ -77,6 +76,10 @@ def datasheet(
         raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
     if fmu:
         model_fit.require_fmu_builder()
+    if markdown:
+        page_path(markdown)
+    if model:
+        files.make_folder(model)
     loaded = load(scene, None, seed, set_)
     overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
     folder = out or Path("out") / f"{loaded.name}_datasheet"
@@ -89,6 +92,7 @@ def datasheet(
             folder,
             quick=quick,
             fields=fields,
+            least=cells.MODEL_FIELDS if model else cells.MIN_FIELDS,
             workers=workers,
             watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )
@@ -96,17 +100,19 @@ def datasheet(
     report = datasheet_report.datasheet_report(statement, quick)
     paths = datasheet_report.write_all(folder, statement, report)
     if markdown:
-        files.make_folder(markdown.parent)
         files.write_text(markdown, report.markdown())
     if json:
         print_json(numbers(statement))
     else:
         report.print()
         print(f"report: {paths['report']}")
-    if model:
-        write_model(model, sheet, fmu, json)
     if open_:
         typer.launch(str(paths["report"]))
+    # What was measured is written; an error says what is missing.
+    if statement.refusal:
+        raise statement.refusal
+    if model:
+        write_model(model, sheet, fmu, json)
 
 
 def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> None:
@@ -149,9 +155,15 @@ def print_agreements(agreements: list[Agreement]) -> None:
         "of the model",
     ]
     table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
+    p_values = [p for one in agreements for p in one.p_values]
+    if len(p_values) * min(p_values) < 0.05:
+        print_wrapped(
+            f"The model does not agree with other fields: p = {min(p_values):.2g} is too small for one of"
+            f" {len(p_values)} tests of a right model."
+        )
     print_table(
         table,
-        "The model, fitted to half of the fields (even or odd numbers), beside the other half",
+        "The model, fitted to half of the fields (every second one: even or odd), beside the other half",
     )
     print_wrapped(
         "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"

@@ -10,7 +10,7 @@ import typer
 from skysim.apps.cli.options import Json, OpenReport
 from skysim.apps.cli.terminal import print_json, print_list, progress_callback
 from skysim.core.errors import InputError
-from skysim.results.report import print_blocks
+from skysim.results.report import page_path, print_blocks
 
 
 def reproduce(
@@ -46,6 +46,9 @@ def reproduce(
         ]
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
+    page = out / "report.html"
+    chosen = [*([page] if report else []), *([markdown] if markdown else [])]
+    paths = [page_path(path) for path in chosen]
     from skysim.experiments.papers import reproduction
     from skysim.experiments.papers.papers_report import papers_report, section, verdict
 
@@ -56,8 +59,6 @@ def reproduce(
             reproductions.append(reproduction.reproduce(id, options))
         if not json:
             print_blocks([section(reproductions[-1])])
-    page = out / "report.html"
-    paths = [*([page] if report else []), *([markdown] if markdown else [])]
     if paths:
         made = papers_report(reproductions, ids, quick, seed)
         for path in paths:
