@@ -109,6 +109,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         else np.array(assumed_m) - lab.camera.mount.camera_body_m
     )
     # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average.
+    rest = (config, faintest_mag, epoch_jyear, dome)
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
@@ -121,10 +122,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
             np.zeros(3),
             0.0,
             mapped.focal_sigma_px / mapped.focal_px,
-            config,
-            faintest_mag,
-            epoch_jyear,
-            dome,
+            *rest,
         )
     # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
@@ -143,10 +141,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         lever_error_m,
         0.0 if survey.focal_length_sigma_m else focal_error,
         survey.focal_length_sigma_m / scene.camera.focal_length_m,
-        config,
-        faintest_mag,
-        epoch_jyear,
-        dome,
+        *rest,
     )
 
 
