@@ -279,6 +279,7 @@ def _fit(
         If the lever or the lens is undetermined.
     """
     covariances = None
+    common = None
     scale = 1.0
     try:
         # 1. Wrong identifications
@@ -304,15 +305,16 @@ def _fit(
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
+        if _has_prior_gauge(subset.bundle, gauge):
+            common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     except LinAlgError:
-        pass  # a singular matrix raises the same ValueError below as a nearly singular one
+        covariances = (
+            None  # a singular matrix raises the same ValueError as a nearly singular one
+        )
     if covariances is None or not _determined(subset.bundle, covariances.shared):
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
-    common = None
-    if _has_prior_gauge(subset.bundle, gauge):
-        common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     return _Fit(subset, keep, converged, covariances, misfit, scale, common)
 
 

@@ -496,6 +496,7 @@ def test_a_lens_that_is_not_modeled_is_named() -> None:
     for index, attitude in enumerate(attitudes(rng, 40)):
         xy_px = pixels(true, dome.leds.position_m, attitude)
         xy_px = xy_px[bent.contains(xy_px)]
+        xy_px = xy_px + rng.normal(0, NOISE_PX, xy_px.shape)
         lights = Centroids(xy_px, np.full(len(xy_px), NOISE_PX), np.ones(len(xy_px)))
         frames.append(SurveyFrame(lights, attitude, index))
     with pytest.raises(InputError, match=r"the lens has k1 = -0\.(1|09).* the model 0"):
@@ -647,3 +648,41 @@ def test_an_impossible_survey_is_refused_in_one_line(
 ) -> None:
     assert says in complaint(*words, "--out", tmp_path / "out")
     assert not (tmp_path / "out" / "leds.ecsv").exists()
+
+
+# --- claims ---------------------------------------------------------------------------------------------
+
+
+def surveyed_nees(lab: Lab, folder: Path, surveys: int) -> list[float]:
+    """Mean NEES of the tracker at four attitudes, for each of some surveys with rendered frames."""
+    stops = survey_procedure.plan_survey(lab.scene, UNCERTAINTY, 30, 18.0)[2].lab_from_body
+    checks = survey_frames.stop_attitudes(lab.scene, "checks", 4, 15.0)
+    means = []
+    for n in range(surveys):
+        again = survey_procedure.in_survey(lab, n)
+        frames = list(survey_procedure.simulated_frames(again, UNCERTAINTY, stops))
+        run = adjust.run_survey(frames, survey_prior.calibration_prior(again), UNCERTAINTY)
+        path = folder / f"leds_{n}.ecsv"
+        dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, UNCERTAINTY))
+        tracker = factory.build_tracker(
+            survey_prior.with_map(again.scene, str(path)),
+            again.camera.mount,
+            again.camera.sources,
+        )
+        each = []
+        for frame, truth in survey_frames.render_stops(again, checks, len(stops)):
+            answer = factory.solve_frame(tracker, frame).attitude
+            assert answer.cam_from_ref is not None
+            error_rad = (truth.cam_from_lab * answer.cam_from_ref.inv()).as_rotvec()
+            each.append(error_rad @ np.linalg.solve(answer.covariance_rad2, error_rad))
+        means.append(float(np.mean(each)))
+    return means
+
+
+@pytest.mark.long
+def test_claims_after_surveys_from_images_are_true(lab: Lab, tmp_path: Path) -> None:
+    """100 surveys with lists, levers and focal lengths of their own: the 95 % interval of the mean NEES contains 3."""
+    nees = surveyed_nees(lab, tmp_path, 100)
+    half_width = 1.96 * np.std(nees) / 10
+    assert half_width < 0.9
+    assert abs(np.mean(nees) - 3) < half_width
