@@ -41,6 +41,10 @@ class LedMap:
     common_m
         (M, N, 3) displacement of each LED by one standard deviation of each of the M errors that
         all LEDs share (surface, position and orientation of the instrument); None without any
+    common_camera
+        (M, 11) change of the lever in body axes, m, and of `Camera.lens` that each common error
+        brings with it, in a survey by the camera itself; None if lever and lens have errors of
+        their own
     flux_s
         (N,) flux of each LED, in image units per second of exposure; None if all are alike
     flux_sigma
@@ -55,6 +59,7 @@ class LedMap:
     sigma_m: float = 0.0
     covariance_m2: Floats | None = None
     common_m: Floats | None = None
+    common_camera: Floats | None = None
     flux_s: Floats | None = None
     flux_sigma: float = 0.15
 
@@ -134,6 +139,25 @@ def project(
     return camera.pixels(lever.cam_from_body.apply(in_body))
 
 
+def common_shifts_m(leds: LedMap, star: Ints, lever: Lever, cam_from_lab: Rotation) -> Floats:
+    """Return the (M, K, 3) shifts of K LEDs from the pupil by one standard deviation of each common error.
+
+    They are in camera axes. The map must have common errors.
+    """
+    assert leds.common_m is not None
+    shift_m = leds.common_m[:, star] @ cam_from_lab.as_matrix().T
+    if leds.common_camera is not None:
+        shift_m -= lever.cam_from_body.apply(leds.common_camera[:, :3])[:, None]
+    return np.asarray(shift_m)
+
+
+def common_images_px(leds: LedMap, camera: Camera, rays_cam: Floats) -> Floats:
+    """Return the (M, K, 2) pixels of K rays with the lens of each common error; of the camera's if it has none."""
+    changes = np.zeros((1, 11)) if leds.common_camera is None else leds.common_camera
+    lenses = camera.lens + changes[:, 3:]
+    return np.array([camera.with_lens(lens).pixels(rays_cam) for lens in lenses])
+
+
 def check_map(leds: object) -> None:
     """Raise ImageError unless a map's arrays have matching shapes and usable numbers."""
     checks.of_type("leds", leds, LedMap)
@@ -153,7 +177,9 @@ def check_map(leds: object) -> None:
     if leds.covariance_m2 is not None:
         checks.floats("leds: covariance_m2", leds.covariance_m2, (count, 3, 3))
     if leds.common_m is not None:
-        checks.floats("leds: common_m", leds.common_m, (None, count, 3))
+        errors = len(checks.floats("leds: common_m", leds.common_m, (None, count, 3)))
+        if leds.common_camera is not None:
+            checks.floats("leds: common_camera", leds.common_camera, (errors, 11))
     checks.number("leds: flux_sigma", leds.flux_sigma, 1e-3, 10.0, "0.001 to 10")
     if leds.flux_s is not None:
         flux_s = checks.floats("leds: flux_s", leds.flux_s, (count,))

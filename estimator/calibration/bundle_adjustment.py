@@ -71,6 +71,11 @@ class Sightings:
         )
 
 
+def free_lens(fit_distortion: bool) -> int:
+    """Return the number of lens elements that a survey fits: focal length and center; with k1, k2, p1, p2 if asked."""
+    return 7 if fit_distortion else 3
+
+
 class Assumed(NamedTuple):
     """Lever and focal length as they are known without the frames; they enter the adjustment as measurements.
 

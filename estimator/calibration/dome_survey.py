@@ -125,6 +125,9 @@ class DomeSurvey:
         sqrt(chi-square / redundancy), near 1 if sigma_px is correct
     noise_scale
         Factor by which sigma_px was multiplied; 1 unless the noise is fitted
+    common_m, common_camera
+        The part of the covariances that all lights, lever and lens share, as of `LedMap`: (M, N, 3)
+        and (M, 11); None without the start map as a measurement
     """
 
     status: str
@@ -142,6 +145,8 @@ class DomeSurvey:
     rms_px: float
     misfit: float
     noise_scale: float = 1.0
+    common_m: Floats | None = None
+    common_camera: Floats | None = None
 
     @property
     def focal_sigma_px(self) -> float:
@@ -150,12 +155,22 @@ class DomeSurvey:
 
     @property
     def surveyed_leds(self) -> LedMap:
-        """The map of the surveyed lights only."""
+        """The map of the surveyed lights only, with its covariance: of each light's own error, and common errors."""
         leds = self.leds
-        board = None if leds.board is None else leds.board[self.surveyed]
-        position_m = leds.position_m[self.surveyed]
+        row = self.surveyed
+        total_m2 = self.led_covariance_m2[row]
+        common_m = None if self.common_m is None else self.common_m[:, row]
+        shared_m2 = 0.0 if common_m is None else np.einsum("mni,mnj->nij", common_m, common_m)
         return LedMap(
-            leds.id[self.surveyed], position_m, leds.center_m, leds.semi_axes_m, board
+            leds.id[row],
+            leds.position_m[row],
+            leds.center_m,
+            leds.semi_axes_m,
+            None if leds.board is None else leds.board[row],
+            float(np.sqrt(np.einsum("nii->", total_m2) / (3 * len(total_m2)))),
+            total_m2 - shared_m2,
+            common_m,
+            self.common_camera,
         )
 
 
@@ -210,7 +225,7 @@ def survey(
     check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
-    free_lens = 7 if fit_distortion else 3  # focal length, center; k1, k2, p1, p2
+    free_lens = ba.free_lens(fit_distortion)
     start = _start_bundle(frames, leds_start, lever_start, camera_start, free_lens)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
@@ -242,7 +257,7 @@ def _check_options(
 
 
 class _Fit(NamedTuple):
-    """A fitted subset, the (M,) mask of sightings kept, and the quality of the fit."""
+    """A fitted subset, the (M,) mask of sightings kept, the quality of the fit, and its common errors if any."""
 
     subset: Subset
     keep: np.ndarray
@@ -250,6 +265,7 @@ class _Fit(NamedTuple):
     covariances: Covariances
     misfit: float
     noise_scale: float
+    common: tuple[Floats, Floats] | None
 
 
 def _fit(
@@ -263,6 +279,7 @@ def _fit(
         If the lever or the lens is undetermined.
     """
     covariances = None
+    common = None
     scale = 1.0
     try:
         # 1. Wrong identifications
@@ -288,13 +305,17 @@ def _fit(
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
+        if _has_prior_gauge(subset.bundle, gauge):
+            common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     except LinAlgError:
-        pass  # a singular matrix raises the same ValueError below as a nearly singular one
+        covariances = (
+            None  # a singular matrix raises the same ValueError as a nearly singular one
+        )
     if covariances is None or not _determined(subset.bundle, covariances.shared):
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
-    return _Fit(subset, keep, converged, covariances, misfit, scale)
+    return _Fit(subset, keep, converged, covariances, misfit, scale, common)
 
 
 def _has_prior_gauge(bundle: Bundle, gauge: Gauge) -> bool:
@@ -302,10 +323,15 @@ def _has_prior_gauge(bundle: Bundle, gauge: Gauge) -> bool:
     return gauge.is_map and bool(np.isfinite(bundle.map_sigma_m))
 
 
+def _terms(subset: Subset) -> ba.NormalEquations:
+    """Return the normal equations of a fitted subset."""
+    return ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
+
+
 def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
     """Return the covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to it."""
     bundle = subset.bundle
-    terms = ba.normal_equations(bundle, subset.sightings, np.ones(len(subset.index)))
+    terms = _terms(subset)
     if _has_prior_gauge(bundle, gauge):
         return bundle_covariance.covariance(terms, bundle)
     fixed = gauge.constraints(bundle, subset)
@@ -385,7 +411,7 @@ def _start_bundle(
         attitudes.as_matrix(),
         np.array(lever.camera_body_m),
         lever.cam_from_body.as_matrix(),
-        np.array([camera.focal_px, *camera.center_px, *camera.distortion]),
+        camera.lens,
         free_lens,
         leds.position_m,
     )
@@ -467,18 +493,17 @@ def _report(
     by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
     residual = ba.residuals(subset.bundle, subset.sightings)
     residual_px = residual * subset.sightings.sigma_px[:, None]
-    focal_px, center_x, center_y, k1, k2, p1, p2, k3 = (float(value) for value in full.lens)
+    common_m = common_camera = None
+    if fit.common:
+        common_m = np.zeros((len(fit.common[0]), lights, 3))
+        common_m[:, subset.led], by_camera = fit.common
+        common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
     return DomeSurvey(
         status,
         replace(leds, position_m=full.position_m),
         surveyed,
         Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),
-        replace(
-            camera,
-            focal_px=focal_px,
-            center_px=(center_x, center_y),
-            distortion=(k1, k2, p1, p2, k3),
-        ),
+        camera.with_lens(full.lens),
         Rotation.from_matrix(full.R_body_from_lab),
         tied,
         outliers,
@@ -489,4 +514,6 @@ def _report(
         rms_px=float(np.sqrt(np.mean(residual_px**2))),
         misfit=fit.misfit,
         noise_scale=fit.noise_scale,
+        common_m=common_m,
+        common_camera=common_camera,
     )

@@ -361,7 +361,7 @@ def _start_problem(
     sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int
 ) -> _Problem:
     """Return the start values: the start camera, and each frame's robust attitude with it."""
-    lens = np.array([camera.focal_px, *camera.center_px, *camera.distortion])
+    lens = camera.lens
     rays = camera.rays(sightings.xy_px)
     R_cam_from_ref = np.tile(np.eye(3), (count, 1, 1))
     for k in range(count):
@@ -550,9 +550,7 @@ def _report(
         misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
         magnitude=_magnitude(frames, keep),
     )
-    focal, x, y, k1, k2, p1, p2, k3 = (float(value) for value in problem.bundle.lens)
-    lens = replace(camera, focal_px=focal, center_px=(x, y), distortion=(k1, k2, p1, p2, k3))
-    return Calibration(lens, covariance, report)
+    return Calibration(camera.with_lens(problem.bundle.lens), covariance, report)
 
 
 def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero | None:

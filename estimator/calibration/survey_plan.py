@@ -49,6 +49,8 @@ class SurveyModel:
     lever_sigma_m, focal_sigma_px
         Standard deviations of the lever along each axis and of the focal length; inf if nothing
         is known
+    fit_distortion
+        Whether the survey fits k1, k2, p1, p2 too
     """
 
     camera: Camera
@@ -58,6 +60,7 @@ class SurveyModel:
     leds_sigma_m: float
     lever_sigma_m: float = np.inf
     focal_sigma_px: float = np.inf
+    fit_distortion: bool = False
 
     def __post_init__(self) -> None:
         check_map(self.leds)
@@ -111,9 +114,7 @@ class SurveyAccuracy:
         return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
 
 
-def predict(
-    model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int = 3
-) -> SurveyAccuracy:
+def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy:
     """Return the errors that a survey will leave, from the Fisher information of its sightings.
 
     Parameters
@@ -122,15 +123,13 @@ def predict(
         F attitudes
     seen
         (F, N) whether each LED is seen at each attitude
-    free_lens
-        Number of lens elements that the survey fits: 3, or 7 with the distortion
 
     Raises
     ------
     ValueError
         If the attitudes do not determine the unknowns.
     """
-    bundle, sightings = _bundle(model, body_from_lab, seen, free_lens)
+    bundle, sightings = _bundle(model, body_from_lab, seen)
     subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
     terms = ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
     try:
@@ -149,7 +148,7 @@ def predict(
 
 
 def _bundle(
-    model: SurveyModel, body_from_lab: Rotation, seen: Mask, free_lens: int
+    model: SurveyModel, body_from_lab: Rotation, seen: Mask
 ) -> tuple[Bundle, Sightings]:
     """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
     camera = model.camera
@@ -160,8 +159,8 @@ def _bundle(
         body_from_lab.as_matrix().reshape(-1, 3, 3),
         arm_m,
         model.lever.cam_from_body.as_matrix(),
-        np.array([camera.focal_px, *camera.center_px, *camera.distortion]),
-        free_lens,
+        camera.lens,
+        ba.free_lens(model.fit_distortion),
         model.leds.position_m,
         model.leds_sigma_m,
         assumed,
@@ -336,7 +335,7 @@ class _Row(NamedTuple):
 
 def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Mask) -> list[_Row]:
     """Return the derivatives of each attitude's pixels."""
-    bundle, sightings = _bundle(model, body_from_lab, shown, 3)
+    bundle, sightings = _bundle(model, body_from_lab, shown)
     terms = ba.linearize(bundle, sightings)
     # The sightings are in the order of the attitudes.
     ends = np.cumsum(np.sum(shown, axis=1))[:-1]

@@ -187,6 +187,18 @@ class Camera:
         """Return a copy with the focal length multiplied by `factor`."""
         return replace(self, focal_px=self.focal_px * factor)
 
+    @property
+    def lens(self) -> Floats:
+        """(8,) focal_px, center x and y in px, k1, k2, p1, p2, k3."""
+        return np.array([self.focal_px, *self.center_px, *self.distortion])
+
+    def with_lens(self, lens: Floats) -> Camera:
+        """Return a copy with these numbers of `lens`."""
+        focal_px, x, y, *distortion = lens.tolist()
+        return replace(
+            self, focal_px=focal_px, center_px=(x, y), distortion=tuple(distortion)
+        )
+
     def rays(self, xy_px: Floats) -> Floats:
         """Convert (N, 2) pixels to (N, 3) unit vectors in camera axes."""
         tangent = self.tangents(xy_px)

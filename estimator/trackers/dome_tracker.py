@@ -25,6 +25,8 @@ from estimator.attitude.dome_map import (
     Lever,
     check_lever,
     check_map,
+    common_images_px,
+    common_shifts_m,
     on_sphere,
     on_surface,
     project,
@@ -505,16 +507,18 @@ class DomeTracker:
         """Return the geometry of K LEDs, and the (M, K, 2) change of their tangents by the errors that all share.
 
         Each change is by one standard deviation: of the focal length first, unless it is fitted, then of the map's
-        common errors.
+        common errors, of which those of a survey by the camera contain lever and lens.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
-        view = systematic.geometry(
-            place_cam, place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m)
-        )
+        ray_cam = place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        view = systematic.geometry(place_cam, ray_cam)
         common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:
-            by_place = view.gradient @ cam_from_lab.as_matrix()
-            moved = np.einsum("kij,mkj->mki", by_place, self.leds.common_m[:, star])
+            shift_m = common_shifts_m(self.leds, star, self.lever, cam_from_lab)
+            images_px = common_images_px(self.leds, self.camera, ray_cam)
+            tangent = self.camera.tangents(images_px.reshape(-1, 2))
+            moved = np.einsum("kij,mkj->mki", view.gradient, shift_m)
+            moved += tangent.reshape(-1, *view.tangent.shape) - view.tangent
             common_rad = np.concatenate([common_rad, moved])
         return view, common_rad
 
@@ -583,8 +587,10 @@ class DomeTracker:
 
         A shift of the pupil has the same effect on a light at p from the bearing as a rotation by p x shift / |p|^2.
         For lights about the mean position p, and the shift's variance sigma^2 along each axis, the covariance is
-        (sigma / |p|)^2 (I - u u^T), u = p / |p|.
+        (sigma / |p|)^2 (I - u u^T), u = p / |p|. It is 0 if the map's common errors contain the lever.
         """
+        if self.leds.common_camera is not None:
+            return np.zeros((3, 3))
         mean_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
         direction = mean_m / np.linalg.norm(mean_m)
         sigma_rad = self.lever.sigma_m / np.linalg.norm(mean_m)

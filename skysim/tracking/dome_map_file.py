@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.files import header_numbers, write_table
+from skysim.core.files import header_numbers, read_table, write_table
 from skysim.core.types import Floats
 
 
@@ -34,6 +34,9 @@ class DomeMap:
         Focal length, principal point and k1, k2, p1, p2, k3
     focal_sigma_px, center_sigma_px, distortion_sigma
         Standard deviations of these numbers; 0 for a number that the survey held fixed
+    own_m2, common_m, common_camera
+        Covariance of the errors: `covariance_m2`, `common_m` and `common_camera` of
+        `estimator.attitude.dome_map.LedMap`; None if all errors are independent
     """
 
     id: NDArray[np.int64]
@@ -48,6 +51,9 @@ class DomeMap:
     center_sigma_px: tuple[float, float]
     distortion: tuple[float, float, float, float, float]
     distortion_sigma: tuple[float, float, float, float, float]
+    own_m2: Floats | None = None
+    common_m: Floats | None = None
+    common_camera: Floats | None = None
 
 
 MAP_COLUMNS = ("id", "x_m", "y_m", "z_m", "sigma_m")
@@ -67,30 +73,26 @@ MAP_META = {
 
 
 def write_dome_map(path: Path, dome: DomeMap) -> None:
-    """Write a surveyed dome as ECSV: one row for each LED, the camera in the header."""
+    """Write a surveyed dome as ECSV: one row for each LED, the camera in the header.
+
+    A row has the LED's own covariance (3, 3) and its shift by each common error (M, 3); 4 bytes a number suffice.
+    """
     from astropy.table import Table
 
     table = Table(
         dict(zip(MAP_COLUMNS, (dome.id, *dome.position_m.T, dome.sigma_m), strict=True))
     )
     table.meta = {key: np.array(getattr(dome, key)).tolist() for key in MAP_META}
+    if dome.own_m2 is not None and dome.common_m is not None:
+        table["own_m2"] = dome.own_m2.astype(np.float32)
+        table["common_m"] = dome.common_m.swapaxes(0, 1).astype(np.float32)
+        table.meta["common_camera"] = np.array(dome.common_camera).tolist()
     write_table(path, table)
 
 
 def read_dome_map(path: Path) -> DomeMap:
     """The dome map in a file that `write_dome_map` wrote. Raises InputError for any other file."""
-    import warnings
-
-    from astropy.table import Table
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # astropy's parsers raise many types of error
-        raise InputError(
-            path, f"not an ECSV table: {' '.join(str(error).split())[:120]}"
-        ) from None
+    table = read_table(path)
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
         fault = f"no column {missing[0]}" if missing else "no LED"
@@ -121,9 +123,35 @@ def read_dome_map(path: Path) -> DomeMap:
     }
     fields["size_px"] = tuple(round(side) for side in meta["size_px"])
     fields["camera_body_m"] = np.array(meta["camera_body_m"])
+    fields |= read_covariance(path, table)
     return DomeMap(
         id=numbers[:, 0].astype(np.int64),
         position_m=numbers[:, 1:4],
         sigma_m=numbers[:, 4],
         **fields,
     )
+
+
+def read_covariance(path: Path, table: Any) -> dict[str, Floats]:
+    """The covariance of a map's errors by the names of `DomeMap`; empty if it has none. Raises InputError."""
+    if "common_camera" not in table.meta:
+        return {}
+    try:
+        found = {
+            "own_m2": np.array(table["own_m2"], dtype=float),
+            "common_m": np.array(table["common_m"], dtype=float).swapaxes(0, 1),
+            "common_camera": np.array(table.meta["common_camera"], dtype=float),
+        }
+    except (KeyError, TypeError, ValueError):
+        found = {}
+    errors = len(found.get("common_camera", ()))
+    shapes = ((len(table), 3, 3), (errors, len(table), 3), (errors, 11))
+    if tuple(array.shape for array in found.values()) != shapes or not all(
+        np.isfinite(array).all() for array in found.values()
+    ):
+        raise InputError(
+            path,
+            "its covariance is incomplete",
+            "own_m2 (3, 3) and common_m (M, 3) of each LED, common_camera (M, 11) in the header",
+        )
+    return found

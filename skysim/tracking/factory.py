@@ -45,12 +45,10 @@ from skysim.tracking.onboard_model import (
     assumed_air,
     assumed_camera,
     assumed_code,
-    assumed_dome,
-    assumed_lever,
     assumed_observer,
     assumed_orbit,
     onboard_catalog,
-    surveyed_dome,
+    onboard_dome,
     with_brightness,
     zero_point_mag,
 )
@@ -174,11 +172,7 @@ def build_dome_tracker(
 ) -> DomeTracker | CodedTracker | ExternalTracker:
     """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
     settings = assumed_settings(scene)
-    camera = assumed_camera(scene)
-    leds = assumed_dome(scene, dome, sources)
-    lever = assumed_lever(scene, mount)
-    if scene.tracker.map:
-        camera, leds, lever = surveyed_dome(scene, scene.tracker.map, leds, lever)
+    camera, leds, lever = onboard_dome(scene, dome, mount, sources)
     leds = with_brightness(scene, dome, leds, lever)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(

@@ -138,12 +138,24 @@ def assumed_lever(scene: Scene, mount: Mount) -> Lever:
     return Lever(np.array(lever_m), mount.cam_from_body, float(survey.lever_sigma_m))
 
 
+def onboard_dome(
+    scene: Scene, light: DomeConfig, mount: Mount, sources: Sources
+) -> tuple[Camera, LedMap, Lever]:
+    """Camera, LED map and lever arm that the tracker assumes, from the survey or a map's file. Raises InputError."""
+    leds = assumed_dome(scene, light, sources)
+    lever = assumed_lever(scene, mount)
+    if scene.tracker.map:
+        return surveyed_dome(scene, scene.tracker.map, leds, lever)
+    return assumed_camera(scene), leds, lever
+
+
 def surveyed_dome(
     scene: Scene, path: str, leds: LedMap, lever: Lever
 ) -> tuple[Camera, LedMap, Lever]:
     """Camera, LED map and lever arm from the file of a survey; surface and boards stay those of the given map.
 
-    The single sigma of the map is the median of the file's. Raises InputError for a file of another dome or camera.
+    The single sigma of the map is the median of the file's, and no greater than that of the final match (see
+    `assumed_dome`). Raises InputError for a file of another dome or camera.
     """
     # 1. The file is of this camera and of LEDs of this dome.
     dome_map = dome_map_file.read_dome_map(Path(path))
@@ -167,14 +179,20 @@ def surveyed_dome(
         )
     # 2. The surveyed values.
     board = None if leds.board is None else leds.board[row]
+    own_m2 = dome_map.own_m2
+    sigma_m = float(np.median(dome_map.sigma_m))
+    if own_m2 is not None:
+        across_m = survey_errors.across_sigma_m(dome_map.position_m, own_m2)
+        sigma_m = min(sigma_m, float(across_m.max()))
     surveyed = replace(
         leds,
         id=dome_map.id,
         position_m=dome_map.position_m,
         board=board,
-        sigma_m=float(np.median(dome_map.sigma_m)),
-        covariance_m2=None,
-        common_m=None,
+        sigma_m=sigma_m,
+        covariance_m2=own_m2,
+        common_m=dome_map.common_m,
+        common_camera=dome_map.common_camera,
     )
     camera = replace(
         calibration(scene.camera),

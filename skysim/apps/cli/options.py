@@ -63,7 +63,10 @@ SceneArg = Annotated[
 ]
 Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
 Seed = Annotated[
-    int | None, typer.Option(help="Seed of all random streams; default: the scene's.")
+    int | None,
+    typer.Option(
+        help="Seed of all noise, and of a survey's list, lever and focal length; default: the scene's."
+    ),
 ]
 Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
 Overrides = Annotated[

@@ -64,6 +64,8 @@ MIN_OF_MEDIAN = 0.8
 # deviation of the assumed one.
 PLAUSIBLE = 6.0
 LEAST_SHARE = 0.1
+# Factor by which residuals may exceed the noise of the centroids before the lens is doubted.
+MAX_NOISE_SCALE = 3.0
 MAX_DISPLACEMENT_M = 0.1  # greatest distance of an LED from its place in the list
 
 
@@ -71,25 +73,65 @@ def run_survey(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
-    fit_distortion: bool = False,
     watch: Callable[[float, float], None] | None = None,
 ) -> SurveyRun:
     """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
 
     Parameters
     ----------
-    fit_distortion
-        Fit k1, k2, p1, p2 as well. A narrow field hardly determines them, and they correlate
-        with the focal length: on the AFIT dome its sigma grows from 10 to 80 px, while the
-        attitude does not change
     watch
         Called with the rounds done and the number of rounds after each round
 
     Raises
     ------
     InputError
-        If the frames do not determine the unknowns, or the result contradicts the prior.
+        If the frames do not determine the unknowns, the result contradicts the prior, or the lens has a distortion that
+        the prior lacks.
     """
+    refusal = None
+    try:
+        run = survey_in_rounds(frames, prior, uncertainty, watch)
+    except InputError as error:
+        refusal = error
+    if refusal or run.survey.noise_scale > MAX_NOISE_SCALE:
+        check_lens(frames, prior, uncertainty)
+    if refusal:
+        raise refusal
+    return run
+
+
+def check_lens(
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
+) -> None:
+    """Raise InputError if the frames are those of a lens whose distortion the survey does not model.
+
+    More frames would not help: a survey that fits the distortion succeeds, and finds another one than assumed.
+    """
+    if uncertainty.fit_distortion:
+        return
+    try:
+        fitted = replace(uncertainty, fit_distortion=True)
+        survey = survey_in_rounds(frames, prior, fitted).survey
+    except InputError:
+        return
+    sigma = lens_sigma(survey)[3:7]
+    change = (survey.camera.lens - prior.camera.lens)[3:7]
+    if (np.abs(change) > PLAUSIBLE * sigma).any():
+        raise InputError(
+            "survey",
+            f"the lens has k1 = {survey.camera.distortion[0]:.3g} ± {sigma[0]:.2g}, the model"
+            f" {prior.camera.distortion[0]:.3g}",
+            "a camera with its distortion, or a fit of the distortion",
+        )
+
+
+def survey_in_rounds(
+    frames: Sequence[SurveyFrame],
+    prior: CalibrationPrior,
+    uncertainty: SurveyUncertainty,
+    watch: Callable[[float, float], None] | None = None,
+) -> SurveyRun:
+    """As `run_survey`, with the lens model as it is."""
 
     def adjusted(
         rows: list[int], matches: list[Correspondences], prior: CalibrationPrior
@@ -98,7 +140,7 @@ def run_survey(
             (replace(frames[row], body_from_lab=start[row]), match)
             for row, match in zip(rows, matches, strict=True)
         ]
-        selected, survey = adjust_connected(pairs, prior, uncertainty, before, fit_distortion)
+        selected, survey = adjust_connected(pairs, prior, uncertainty, before)
         rows = [rows[k] for k in selected]
         matches = [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
@@ -255,10 +297,19 @@ def with_names(run: SurveyRun) -> SurveyRun:
     position_m[new] = survey.leds.position_m[old]
     covariance_m2[name] = survey.led_covariance_m2
     surveyed[name] = survey.surveyed
+    common_m = survey.common_m
+    if common_m is not None:
+        common_m = common_m[:, np.argsort(name)]
     leds = replace(survey.leds, position_m=position_m)
     return replace(
         run,
-        survey=replace(survey, leds=leds, led_covariance_m2=covariance_m2, surveyed=surveyed),
+        survey=replace(
+            survey,
+            leds=leds,
+            led_covariance_m2=covariance_m2,
+            surveyed=surveyed,
+            common_m=common_m,
+        ),
         matches=[Correspondences(match.light, name[match.led]) for match in run.matches],
     )
 
@@ -301,7 +352,6 @@ def adjust_connected(
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
     before: Assumed,
-    fit_distortion: bool,
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
 
@@ -318,7 +368,7 @@ def adjust_connected(
                 prior.leds,
                 prior.lever,
                 prior.camera,
-                fit_distortion=fit_distortion,
+                fit_distortion=uncertainty.fit_distortion,
                 loss="cauchy",
                 leds_sigma_m=uncertainty.led_sigma_m,
                 fit_noise=True,
@@ -396,12 +446,12 @@ def lens_sigma(survey: DomeSurvey) -> Floats:
 
 def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
     """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
-    surveyed = survey.surveyed
+    leds = survey.surveyed_leds
     focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(survey).tolist()
     return DomeMap(
-        id=survey.leds.id[surveyed],
-        position_m=survey.leds.position_m[surveyed],
-        sigma_m=led_sigma_m(survey, uncertainty)[surveyed],
+        id=leds.id,
+        position_m=leds.position_m,
+        sigma_m=led_sigma_m(survey, uncertainty)[survey.surveyed],
         camera_body_m=survey.lever.camera_body_m,
         lever_sigma_m=math.sqrt(np.trace(survey.lever_covariance_m2) / 3),
         size_px=(survey.camera.width_px, survey.camera.height_px),
@@ -411,6 +461,9 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
         center_sigma_px=(x_sigma_px, y_sigma_px),
         distortion=survey.camera.distortion,
         distortion_sigma=tuple(k_sigma),
+        own_m2=leds.covariance_m2,
+        common_m=leds.common_m,
+        common_camera=leds.common_camera,
     )
 
 

@@ -293,6 +293,9 @@ class DomeFaults:
         LED and its distance from the list's place, m
     list_sigma_m
         Error of the other places along each axis
+    tested, tested_m
+        Number of LEDs tested for displacement, and the displacement that is found (95 %) in half of
+        them; None without any
     exchanged
         LED with another one at its place, that other one, and other LEDs that fit as well
     found_m
@@ -307,6 +310,8 @@ class DomeFaults:
     dark: list[int]
     displaced: dict[int, float]
     list_sigma_m: float
+    tested: int
+    tested_m: float | None
     exchanged: list[tuple[int, int, list[int]]]
     found_m: dict[int, list[float]]
     unlisted: list[list[float]]
@@ -326,6 +331,7 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     rows, sigma_m = survey_faults.displaced(
         leds.position_m, survey.leds.position_m, survey.led_covariance_m2
     )
+    size_m = survey_faults.found_displacements_m(survey.led_covariance_m2, sigma_m)
     off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
     # The time of a code that runs freely is unknown, so the expected light of each LED is unknown.
     code = run.prior.code
@@ -335,6 +341,8 @@ def find_faults(run: SurveyRun) -> DomeFaults:
         leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
         {int(leds.id[row]): float(off_m[row]) for row in rows},
         sigma_m,
+        len(size_m),
+        float(np.median(size_m)) if len(size_m) else None,
         [
             (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
             for x in exchanges
@@ -368,9 +376,13 @@ def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
         )
     elif share > 0:
         observable = f"{100 * share:.0f} % of exchanges would be found"
+    tested = f" of {faults['tested']} tested"
+    if faults["tested"]:
+        tested += f" (half of them show {1e3 * faults['tested_m']:.2g} mm or more)"
     yield (
-        f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced, {len(faults['exchanged'])} exchanged; the"
-        f" other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis; {observable}"
+        f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced{tested}, {len(faults['exchanged'])}"
+        f" exchanged; the other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis;"
+        f" {observable}"
     )
 
 

@@ -165,9 +165,13 @@ def lost_in_space(
     model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
 ) -> DomeTracker:
     """A tracker with the uncertainty of the model. Raises InputError for LEDs that it cannot use."""
-    camera = replace(model.camera, focal_sigma=abs(uncertainty.focal_error))
+    camera = replace(model.camera, focal_sigma=uncertainty.focal_error)
     leds: LedMap = replace(
-        model.leds, sigma_m=uncertainty.led_sigma_m, covariance_m2=None, common_m=None
+        model.leds,
+        sigma_m=uncertainty.led_sigma_m,
+        covariance_m2=None,
+        common_m=None,
+        common_camera=None,
     )
     lever = Lever(
         model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m

@@ -146,7 +146,6 @@ def survey_images(
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
     settings: Settings,
-    fit_distortion: bool = False,
     watch: Callable[[float, float], None] | None = None,
 ) -> SurveyRun:
     """Survey from images. `frames` are those with an attitude; the others are identified with the LEDs so far.
@@ -162,7 +161,7 @@ def survey_images(
             f"{len(frames)} of {len(pictures)} images identified",
             f"2 or more: give their attitudes in {ATTITUDES}",
         )
-    run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
+    run = run_survey(frames, prior, uncertainty, watch)
     while len(frames) < len(pictures):
         found = run.survey
         model = replace(
@@ -181,7 +180,7 @@ def survey_images(
         if len(more) == len(frames):
             break
         frames = more
-        run = run_survey(frames, prior, uncertainty, fit_distortion, watch)
+        run = run_survey(frames, prior, uncertainty, watch)
     return run
 
 

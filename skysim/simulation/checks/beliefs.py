@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
+from estimator.core.camera import Camera
 from skysim.core.types import Floats, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
@@ -23,7 +25,6 @@ from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
 from skysim.sources.dome import display
-from skysim.sources.dome.survey_errors import led_covariance_m2
 from skysim.tracking import dome_map_file
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import (
@@ -31,6 +32,7 @@ from skysim.tracking.onboard_model import (
     assumed_observer,
     assumed_orbit,
     onboard_catalog,
+    onboard_dome,
 )
 
 REACH_PX = 7.0  # greatest distance of a neighbor that displaces a centroid
@@ -64,6 +66,8 @@ class Beliefs:
         Magnitude of the faintest star that it knows; infinite under a dome
     epoch_jyear
         Epoch of its star catalog; NaN under a dome
+    dome
+        Camera, map and lever of the tracker, with the LEDs in the order of `lights`; None under other lights
     """
 
     lights: Sources
@@ -78,6 +82,12 @@ class Beliefs:
     camera: CameraConfig
     faintest_mag: float
     epoch_jyear: float
+    dome: tuple[Camera, LedMap, Lever] | None = None
+
+    @property
+    def has_common_camera(self) -> bool:
+        """Whether the errors of lever and lens are part of the map's common errors."""
+        return self.dome is not None and self.dome[1].common_camera is not None
 
 
 def of(lab: Lab, camera: CameraModel) -> Beliefs:
@@ -86,7 +96,10 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     scene = lab.scene
     tracker = scene.tracker
     believed = assumed_camera(scene)
-    lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera)
+    dome = None
+    if isinstance(scene.light, DomeConfig):
+        dome = onboard_dome(scene, scene.light, lab.camera.mount, lab.camera.sources)
+    lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera, dome)
     config = scene.camera.model_copy(update={"distortion": believed.distortion})
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
@@ -96,6 +109,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         else np.array(assumed_m) - lab.camera.mount.camera_body_m
     )
     # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average.
+    rest = (config, faintest_mag, epoch_jyear, dome)
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
@@ -108,15 +122,13 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
             np.zeros(3),
             0.0,
             mapped.focal_sigma_px / mapped.focal_px,
-            config,
-            faintest_mag,
-            epoch_jyear,
+            *rest,
         )
     # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
     surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
     led_sigma_m = survey.led_sigma_m
-    own_m2 = led_covariance_m2(lights.place[:, :3], survey)
+    own_m2 = dome[1].covariance_m2 if dome else None
     if own_m2 is not None:
         led_sigma_m = float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3))
     return Beliefs(
@@ -129,22 +141,19 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         lever_error_m,
         0.0 if survey.focal_length_sigma_m else focal_error,
         survey.focal_length_sigma_m / scene.camera.focal_length_m,
-        config,
-        faintest_mag,
-        epoch_jyear,
+        *rest,
     )
 
 
-def known_lights(lab: Lab, camera: CameraModel) -> tuple[Sources, Floats, float, float]:
+def known_lights(
+    lab: Lab, camera: CameraModel, dome: tuple[Camera, LedMap, Lever] | None
+) -> tuple[Sources, Floats, float, float]:
     """The N sources that the tracker knows, their direction errors (N, 3), the faintest magnitude, the epoch."""
-    scene = lab.scene
-    sources = lab.camera.sources
-    if isinstance(scene.light, DomeConfig):
-        if scene.tracker.map:
-            known = np.isin(
-                sources.id, dome_map_file.read_dome_map(Path(scene.tracker.map)).id
-            )
-            sources = sources.take(known)
+    if dome:
+        sources = lab.camera.sources
+        order = np.argsort(sources.id)
+        row = np.searchsorted(sources.id, dome[1].id, sorter=order)
+        sources = sources.take(order[row])
         return sources, np.zeros((len(sources), 3)), math.inf, math.nan
     stars = believed_stars(lab)
     lights, error = known_stars(lab, stars, camera)

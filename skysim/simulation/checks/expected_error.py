@@ -18,6 +18,7 @@ axes and R the rotation from lab to camera axes:
     centroid noise : S_i of `centroid_variance`
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
+    common survey  : E_i = G_i dP_i + change by the lens, dP_i of LED i from the pupil; with it no lever, focal length
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row, minus the delay that the tracker assumes
 
@@ -41,11 +42,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.dome_map import LedMap, Lever, common_images_px, common_shifts_m
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.star_search import WRONG_FOCAL
-from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
+from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
@@ -99,11 +100,11 @@ def mean_root(variance_rad2: Floats) -> float:
 
 def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
     """Errors of the surveyed LED positions, S_i = sigma^2 G_i G_i', or G_i C_i G_i' if an instrument gives C_i."""
-    place_m = context.beliefs.lights.place[view.row, :3]
-    own_m2 = survey_errors.led_covariance_m2(place_m, context.lab.scene.tracker.survey)
-    if own_m2 is not None:
+    dome = context.beliefs.dome
+    if dome and dome[1].covariance_m2 is not None:
         # Derivative of the image by a position in lab axes.
         gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()
+        own_m2 = dome[1].covariance_m2[view.row]
         return Independent(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
     sigma_m = context.beliefs.led_sigma_m
     if not sigma_m:
@@ -125,10 +126,24 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common
     return Common(np.concatenate(parts, axis=2)) if parts else None
 
 
+def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Errors that LEDs, lever and lens of a survey by the camera share: E_i = G_i dP_i + the change by the lens."""
+    dome = context.beliefs.dome
+    if dome is None or not context.beliefs.has_common_camera:
+        return None
+    camera, leds, lever = dome
+    shift_m = common_shifts_m(leds, view.row, lever, lab_from_cam.inv())
+    moved_px = np.einsum("nij,mnj->nim", view.gradient, shift_m)
+    by_lens_px = common_images_px(leds, camera, view.offset_m) - camera.pixels(view.offset_m)
+    return Common(moved_px + np.moveaxis(by_lens_px, 0, 2))
+
+
 def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     """Error of the surveyed lever (camera's position), E_i = -sigma G_i."""
     sigma_m = context.beliefs.lever_sigma_m
-    return Common(-sigma_m * view.gradient) if sigma_m else None
+    if not sigma_m or context.beliefs.has_common_camera:
+        return None
+    return Common(-sigma_m * view.gradient)
 
 
 def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
@@ -162,7 +177,9 @@ def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Commo
 def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     """Relative error of the focal length, E_i = error (x_i - center)."""
     error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
-    return Common(error * from_center_px(view, context)) if error else None
+    if not error or context.beliefs.has_common_camera:
+        return None
+    return Common(error * from_center_px(view, context))
 
 
 def from_center_px(view: View, context: Context) -> Floats:
@@ -207,6 +224,7 @@ def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Commo
 
 CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
     "LED survey": led_survey,
+    "common survey": common_survey,
     "survey set-up": survey_setup,
     "lever survey": lever_survey,
     "surface survey": surface_survey,
@@ -219,7 +237,7 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
 }
 UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
-OUTSIDE_OF_GATE = ("survey set-up", "surface survey")
+OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
 # Two more causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
 SOLVER = "solver"
@@ -268,17 +286,14 @@ def covariance(gain: Floats, errors: Independent | Common) -> Floats:
 
 
 def believed_sigma_px(view: View, noise: Independent, context: Context) -> Floats:
-    """(n,) standard deviation of each image position that the tracker believes: centroid, floor and LED survey.
-
-    The tracker takes the LED survey's part at the nearest LED for all.
-    """
+    """(n,) standard deviation of each image position that the tracker believes: centroid, floor and LED survey."""
     settings = context.settings
     beliefs = context.beliefs
     own2 = np.trace(noise.covariance_px2, axis1=1, axis2=2) / 2
-    survey_px = 0.0
-    if beliefs.led_sigma_m:
-        focal_px = context.camera.optics.camera.focal_px
-        survey_px = focal_px * beliefs.led_sigma_m / float(view.distance_m.min())
+    survey_px = np.zeros(len(view))
+    if beliefs.dome:
+        camera, leds, lever = beliefs.dome
+        survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
     return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
 
 

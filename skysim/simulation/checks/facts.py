@@ -482,7 +482,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
 
 
 # Causes of the expected error that are drawn with the survey.
-SURVEYED = ("LED survey", "survey set-up", "lever survey", "surface survey")
+SURVEYED = ("LED survey", "survey set-up", "common survey", "lever survey", "surface survey")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:

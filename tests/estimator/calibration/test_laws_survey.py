@@ -223,6 +223,38 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     assert dome_survey.redundancy(alone, covariances) == 2 * rows - (len(pixels) - 4)
 
 
+@law(bundle_covariance.common_errors, Camera.with_lens, ba.free_lens)
+@given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), fits=some.booleans())
+def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_share(
+    rng: np.random.Generator, list_m: float, fits: bool
+) -> None:
+    """They hold all of lever and lens, and what lights share with these, of the inverse of the whole normal matrix."""
+    true, seen = dome(rng)
+    known = replace(
+        true,
+        map_sigma_m=list_m,
+        free_lens=ba.free_lens(fits),
+        assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0),
+    )
+    np.testing.assert_array_equal(CAMERA.with_lens(2 * CAMERA.lens).lens, 2 * LENS)
+    terms = ba.normal_equations(known, seen, np.ones(len(seen.led)))
+    whole = whole_matrix(terms)
+    scale = np.sqrt(np.diag(whole))
+    inverse = np.linalg.inv(whole / np.outer(scale, scale)) / np.outer(scale, scale)
+    position_m, camera = bundle_covariance.common_errors(terms, known)
+    light_m = position_m.reshape(len(position_m), -1)
+    first = 3 * (LIGHTS + FRAMES)
+    sigma = np.sqrt(np.diag(inverse))
+    for found, block in (
+        (camera.T @ camera, (slice(first, None), slice(first, None))),
+        (light_m.T @ camera, (slice(3 * LIGHTS), slice(first, None))),
+    ):
+        size = np.outer(sigma[block[0]], sigma[block[1]])
+        np.testing.assert_allclose(found / size, inverse[block] / size, rtol=0, atol=1e-4)
+    own = inverse[: 3 * LIGHTS, : 3 * LIGHTS] - light_m.T @ light_m
+    assert np.linalg.eigvalsh(own).min() > -1e-6 * np.trace(own)
+
+
 @law(ba.adjust, ba.fit_attitudes, bundle_covariance.covariance_in_gauge)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
 def test_an_adjustment_converges_to_the_observed_pixels(

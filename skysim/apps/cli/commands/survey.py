@@ -87,7 +87,7 @@ LedSigma = Annotated[
 LeverSigma = Annotated[
     str, typer.Option(help="Standard error of the camera's assumed position.")
 ]
-FocalError = Annotated[str, typer.Option(help="Error of the assumed focal length.")]
+FocalError = Annotated[str, typer.Option(help="Standard error of the assumed focal length.")]
 Distortion = Annotated[
     bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
 ]
@@ -130,19 +130,22 @@ def survey(
     """
     from skysim.apps.cli.commands import survey_modes
     from skysim.experiments.dome_survey.survey_prior import survey_uncertainty
+    from skysim.experiments.tracker_comparison import with_config
 
     given = dict(zip(LIMITED, (frames, attitudes, next_, frames_to, checks), strict=True))
     chosen = {name for name, value in given.items() if value is not None}
     check_mode(plan, images, camera, watch, repeat, chosen)
     loaded = load(scene, None, seed, set_)
+    if seed is not None:
+        # The list, the lever and the focal length before a survey are drawn by the command, not by the scene.
+        loaded = with_config(loaded, "tracker.survey", seed=seed)
     request = survey_modes.Request(
         loaded,
-        survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error),
+        survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error, distortion),
         output_folder(out, loaded.name),
         tilt,
         (attitudes or Attitudes.PLAN).value,
         frames or FRAMES,
-        distortion,
         next_ or NEXT,
         json,
     )

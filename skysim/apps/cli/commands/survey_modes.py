@@ -44,7 +44,6 @@ class Request:
     tilt_deg: float
     attitudes: str
     frames: int
-    distortion: bool
     next_stops: int
     quiet: bool  # print the result alone
 
@@ -119,7 +118,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         progress_callback("adjusting") as update,
         coverage_shown(request, observations, before, plan.model.sigma_px),
     ):
-        run = adjust.run_survey(observations, before, uncertainty, request.distortion, update)
+        run = adjust.run_survey(observations, before, uncertainty, update)
     statistics = write_results(request, run, before, lab)
     tracker = factory.build_tracker(
         survey_prior.with_map(lab.scene, statistics["map"]),
@@ -165,7 +164,7 @@ def from_images(
         coverage_shown(request, found, before, None),
     ):
         run = survey_procedure.survey_images(
-            pictures, found, before, request.uncertainty, stages, request.distortion, update
+            pictures, found, before, request.uncertainty, stages, update
         )
     return write_report(
         request, run, write_results(request, run, before, None) | {"frames": len(pictures)}
