@@ -135,7 +135,7 @@ def test_a_covariance_too_small_about_y_is_detected():
 
 
 def test_a_covariance_is_judged_at_each_rate():
-    """Errors twice as large as claimed have four times the NEES; with few fields it has no interval."""
+    """Errors twice as large as claimed have four times the NEES; few fields know it less."""
     sheet = sky_sheet((2, 2, 2))
     sheet = replace(
         sheet, cells=[DatasheetCell("rate", {"rate_deg_s": n // 2}, {}) for n in range(10)]
@@ -147,5 +147,5 @@ def test_a_covariance_is_judged_at_each_rate():
         assert row["nees"].low > 9
     sheet.columns["solved"][:2, 9:] = 0
     few = performance.by_level(sheet, "rate", "rate_deg_s")[0]["nees"]
-    assert np.isfinite(few.value)
-    assert np.isnan(few.low)
+    assert few.low < 12 < few.high
+    assert few.high / few.low > 1.5 * rows[0]["nees"].high / rows[0]["nees"].low
