@@ -83,6 +83,10 @@ class FlightComputer:
         Number of controls of the MuJoCo model
     control_torque_nm
         (3,) control torque of the last period in body axes; zeros without a controller
+    achieved_nm
+        (3,) torque in body axes that actuators and fans give in the last period
+    loads
+        Command, or speed, of each actuator in the last period, relative to its limit, by name
     momentum_dump
         Momentum dumping; None if it is off
     """
@@ -99,12 +103,15 @@ class FlightComputer:
         self.actuator_sets = build_actuators(scene.vehicle, vehicle.model)
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
+        self.achieved_nm = np.zeros(3)
+        self.loads: dict[str, float] = {}
         self.momentum_dump: MomentumDump | None = None
         self.actuator: Actuators = ideal_torque(vehicle)
         if self.config is None:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
+        self.loads = self.actuator.loads(np.zeros(self.nu), np.zeros(vehicle.model.nv))
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(
@@ -186,13 +193,14 @@ class FlightComputer:
         else:
             self.control_torque_nm = torque_nm
         # 2. The actuators hold the body against the fans, which takes momentum out of them.
-        actuator_torque_nm = self.control_torque_nm
+        dump_nm = np.zeros(3)
         if self.momentum_dump:
-            actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(
-                control, momentum_nms, inputs
-            )
+            dump_nm = self.momentum_dump.allocate(control, momentum_nms, inputs)
+        actuator_torque_nm = self.control_torque_nm - dump_nm
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
+        self.achieved_nm = achieved_nm + dump_nm
+        self.loads = self.actuator.loads(control, inputs.speeds_rad_s)
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

@@ -202,7 +202,8 @@ def fact(context: Context, samples: CheckedSamples) -> Fact | None:
     if math.isnan(nees):
         return None
     floor_px = context.settings.centroid_sigma_px
-    text = f"NEES {nees:.2g} over the sky (3 if true), with a least centroid error of {short(floor_px)} px"
+    rates = attitudes.rates_text(samples.reach.attitudes)
+    text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
 
