@@ -15,6 +15,7 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
+    STILL_PX,
     Context,
     centroid_variance,
     full_scale_e,
@@ -389,17 +390,19 @@ def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
 def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
     """V of a star of the Sun's color that is detected in about half of the cases, at the slowest frame.
 
-    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
-    `detection.detected_area_px`.
+    An image of deviation s on a path L has the least area A = pi r^2 + 2 r L above the threshold T if its peak is
+    T exp(r^2 / (2 s^2)), see `detection.detected_area_px`.
     """
     camera = context.camera
+    streak_px = least_streak_px(samples)
+    length_px = float(np.hypot(*streak_px))
     blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
-    peak_e = threshold_e(context) * math.exp(
-        context.settings.min_area_px / (2 * math.pi * blur2_px2)
-    )
+    half_px = length_px / math.pi
+    radius_px = math.sqrt(half_px**2 + context.settings.min_area_px / math.pi) - half_px
+    peak_e = threshold_e(context, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
     share = peak_share(
-        np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)])
+        np.array([blur2_px2]), none, none, np.array([length_px])
     )[0]
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
@@ -419,7 +422,7 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     """
     camera = context.camera
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
-    area_px = width_px * math.hypot(width_px, least_streak_px(samples))
+    area_px = width_px * math.hypot(width_px, *least_streak_px(samples))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
@@ -427,9 +430,7 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     )
 
 
-def least_streak_px(samples: CheckedSamples) -> float:
-    """Length of the images' path at the slowest frame."""
-    lengths_px = [
-        np.median(view.streak_length_px) for view in samples.frames.known if len(view)
-    ]
-    return float(min(lengths_px, default=0.0))
+def least_streak_px(samples: CheckedSamples) -> Floats:
+    """(2,) path of the images at the slowest frame."""
+    paths_px = [np.median(view.streak_px, axis=0) for view in samples.frames.known if len(view)]
+    return min(paths_px, key=np.linalg.norm, default=STILL_PX)
