@@ -29,6 +29,7 @@ from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
 from skysim.dynamics.multibody.actuators import IdealTorque, build_actuators
 from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
+from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
@@ -85,8 +86,8 @@ class FlightComputer:
         (3,) control torque of the last period in body axes; zeros without a controller
     achieved_nm
         (3,) torque in body axes that actuators and fans give in the last period
-    loads
-        Command, or speed, of each actuator in the last period, relative to its limit, by name
+    names, loads
+        Names of the n commanded motors, and their commands, or speeds, in the last period relative to their limits (n,)
     momentum_dump
         Momentum dumping; None if it is off
     """
@@ -104,14 +105,22 @@ class FlightComputer:
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
         self.achieved_nm = np.zeros(3)
-        self.loads: dict[str, float] = {}
+        self.names: list[str] = []
+        self.loads = np.empty(0)
         self.momentum_dump: MomentumDump | None = None
         self.actuator: Actuators = ideal_torque(vehicle)
         if self.config is None:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
-        self.loads = self.actuator.loads(np.zeros(self.nu), np.zeros(vehicle.model.nv))
+        motors = {
+            "wheels": vehicle.wheels.motor,
+            "cmgs": vehicle.gimbals.motor,
+            "fans": vehicle.fans.motor,
+        }
+        self.motors = motors.get(self.config.actuators, vehicle.torques)
+        self.names = [vehicle.model.actuator(number).name for number in self.motors]
+        self.limit = self.actuator.command_map()[1]
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(
@@ -200,7 +209,11 @@ class FlightComputer:
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         self.achieved_nm = achieved_nm + dump_nm
-        self.loads = self.actuator.loads(control, inputs.speeds_rad_s)
+        self.loads = np.abs(control[self.motors]) / self.limit
+        if isinstance(self.actuator, WheelActuator):
+            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
+            speed_loads = np.abs(speeds) / self.actuator.model.speed_limit_rad_s
+            self.loads = np.maximum(self.loads, speed_loads)
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,88 +149,78 @@ def check_torque(
 # Actuators at their limits: forecast, and in words.
 
 FORECAST_S = 0.02  # period of the forecast, at least
-FORECAST_PERIODS = 3000  # greatest number of periods
-MISSING = 0.01  # share of a torque that may be missing
+FORECAST_PERIODS = 2000  # greatest number of periods
+MISSING = 0.01  # share of the greatest torque that may be missing
 LEAST_SHORT_S = 0.2  # shorter shortfalls give no warning
-AT_LIMIT = 0.999  # load from which an actuator counts as saturated: friction keeps a wheel just below its limit
+AT_LIMIT = 0.999  # load from which an actuator is saturated: friction keeps a wheel just below its limit
 
 
-class Effort(NamedTuple):
-    """Forecast of the actuators in K periods: torque needed and given (K, 3) in body axes, and loads as in telemetry."""
+def shortfall(lab: Lab) -> str:
+    """A warning if the actuators cannot give the torque that the maneuver needs; empty if they can.
 
-    t_s: Floats
-    needed_nm: Floats
-    given_nm: Floats
-    loads: dict[str, Floats]
+    The vehicle is put on the reference in each period. Then
 
-
-def effort(lab: Lab) -> Effort:
-    """What the actuators do if the vehicle follows the reference exactly. In each period
-
-    1. the torque is that of MuJoCo's inverse dynamics for the mean acceleration over the period, less the disturbances,
-       plus what the actuators still owe;
+    1. the torque needed is that of MuJoCo's inverse dynamics for the mean acceleration over the period, less the
+       disturbances, plus what the actuators still owe;
     2. the flight computer allocates it, and wheels and gimbals respond.
 
     A jump of the rate is a torque over one period. Jumps of the attitude and knocks are left out.
     """
     scene = lab.scene
     control = scene.motion.control
-    assert control is not None
+    if control is None or scene.motion.is_prescribed:
+        return ""
     # The torque is given, so the control law does not matter.
     pid = control.model_copy(update={"law": "pid"})
     motion = scene.motion.model_copy(update={"control": pid})
     reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-    computer = FlightComputer(
-        scene.model_copy(update={"motion": motion}), lab.vehicle, reference
-    )
-    period_s = max(computer.period_s, FORECAST_S, lab.duration_s / FORECAST_PERIODS)
-    disturbances = build_disturbances(lab, (), period_s)
-    vehicle = multibody.Simulation(lab.vehicle, Rotation.identity(), np.zeros(3), period_s)
-    angles = vehicle.angles_rad.copy()
-    speeds = vehicle.speeds_rad_s.copy()
+    period_s = max(FORECAST_S, lab.duration_s / FORECAST_PERIODS)
+    vehicle = lab.vehicle
+    start = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), period_s)
+    angles = start.angles_rad.copy()
+    speeds = start.speeds_rad_s.copy()
     t_s = np.arange(0.0, lab.duration_s, period_s)
-    torque = np.zeros((2, len(t_s), 3))
-    loads = np.zeros((len(t_s), len(computer.loads)))
-    owed = np.zeros(3)
+    computer = FlightComputer(
+        scene.model_copy(update={"motion": motion}), vehicle, reference
+    )
+    disturbances = build_disturbances(lab, (), period_s)
+    needed = np.zeros((len(t_s), 3))
+    given = np.zeros((len(t_s), 3))
+    loads = np.zeros((len(t_s), len(computer.names)))
     following = reference.state_at(0.0)
     for k, t in enumerate(t_s.tolist()):
         # 1. Torque.
-        angles[:4], speeds[:3], _ = state = following
+        attitude, rate, _ = following
         following = reference.state_at(t + period_s)
-        mean = (following[1] - state[1]) / period_s
+        angles[:4] = attitude
+        speeds[:3] = rate
         momentum = computer.momentum_nms(angles, speeds)
         ends_s = np.array([t, t + period_s])
-        disturbance = disturbances.torque_nm(ends_s, *state[:2], momentum)[0]
-        torque[0, k] = vehicle.required_torque_nm(angles, speeds, mean) - disturbance
+        mean = (following[1] - rate) / period_s
+        needed[k] = start.required_torque_nm(angles, speeds, mean)
+        needed[k] -= disturbances.torque_nm(ends_s, attitude, rate, momentum)[0]
         # 2. Allocation and response.
-        inputs = ControlInput(t, period_s, state[1], angles, speeds)
-        controls = computer.compute_controls(inputs, state[0], momentum, torque[0, k] + owed)
-        torque[1, k] = computer.achieved_nm
-        owed += torque[0, k] - computer.achieved_nm
-        loads[k] = list(computer.loads.values())
-        computer.actuator.respond(controls, angles, speeds, period_s)
-    return Effort(t_s, *torque, dict(zip(computer.loads, loads.T, strict=True)))
-
-
-def shortfall(lab: Lab) -> str:
-    """A warning if the actuators cannot give the torque that the maneuver needs (`effort`); empty if they can."""
-    motion = lab.scene.motion
-    if motion.control is None or motion.is_prescribed:
+        inputs = ControlInput(t, period_s, rate, angles, speeds)
+        owed = (needed - given).sum(axis=0)
+        controls = computer.compute_controls(inputs, attitude, momentum, owed)
+        given[k] = computer.achieved_nm
+        loads[k] = computer.loads
+        angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
+        for spun in (vehicle.wheels, vehicle.rotors):
+            torque = np.where(spun.motor < 0, 0.0, controls[spun.motor])
+            speeds[spun.dof] += period_s * torque / spun.inertia_kg_m2
+    missing = np.linalg.norm(needed - given, axis=1)
+    if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
-    t_s, needed, given, loads = effort(lab)
-    size = np.linalg.norm(needed, axis=1)
-    missing = np.linalg.norm(needed - given, axis=1) > MISSING * size.max()
-    if missing.sum() * (t_s[1] - t_s[0]) < LEAST_SHORT_S:
-        return ""
-    n = int((missing * size).argmax())
+    n = int(missing.argmax())
     wanted, possible = (
         ", ".join(f"{component:.2g}" for component in torque[n]) for torque in (needed, given)
     )
-    text = saturation_text(t_s, loads)
+    text = saturation_text(t_s, dict(zip(computer.names, loads.T, strict=True)))
     return (
         f"motion.maneuver: needs a torque of ({wanted}) N m at {t_s[n]:.1f} s, of which the actuators"
-        f" {motion.control.actuators} give ({possible}){f': {text}' if text else ''}; change it to a slower or smaller"
-        " one, balance the vehicle, or take stronger actuators"
+        f" {control.actuators} give ({possible}){text and ': '}{text}; change it to a slower or smaller one, balance"
+        " the vehicle, or take stronger actuators"
     )
 
 
@@ -281,7 +270,7 @@ class TelemetryRecorder:
         self.imu_wxyz = np.zeros((rows, 4))
         self.filter_wxyz = np.zeros((rows, 4))
         self.saturated = np.zeros(rows, dtype=bool)
-        self.loads = np.zeros((rows, len(flight_computer.loads)))
+        self.loads = np.zeros((rows, len(flight_computer.names)))
         self.bias_rad_s = np.zeros((rows, 3))
         # Of the filter: sigma of the attitude, bias, and sigma of the bias.
         self.filter_estimates = np.zeros((rows, 3, 3))
@@ -303,7 +292,7 @@ class TelemetryRecorder:
         self.recorded[k] = True
         self.torque_nm[k] = self.flight_computer.control_torque_nm
         self.momentum_nms[k] = momentum_nms
-        self.loads[k] = list(self.flight_computer.loads.values())
+        self.loads[k] = self.flight_computer.loads
         if self.navigation:
             self.record_estimates(k, self.navigation)
 
@@ -370,7 +359,7 @@ class TelemetryRecorder:
             self.filter_estimates[rows, 1] if has_filter else None,
             self.filter_estimates[rows, 2] if has_filter else None,
             self.mountings_by_camera(t_s, cameras),
-            dict(zip(self.flight_computer.loads, self.loads[rows].T, strict=True)),
+            dict(zip(self.flight_computer.names, self.loads[rows].T, strict=True)),
         )
 
     def mountings_by_camera(

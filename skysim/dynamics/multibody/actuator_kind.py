@@ -54,23 +54,6 @@ class Actuators(Protocol):
         """(n, 3) commands per unit of torque on the body, with every gimbal at zero, and the limit of a command."""
         ...
 
-    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, float]:
-        """Command of each member relative to its limit, by name; of a wheel its speed if that is nearer to its limit."""
-        ...
-
-    def respond(
-        self, control: Floats, angles_rad: Floats, speeds_rad_s: Floats, period_s: float
-    ) -> None:
-        """Change the angles and speeds of the members' joints, in place, as their motors do within a period."""
-        ...
-
-
-def relative_loads(
-    names: Sequence[str], command: Floats, limit: float | Floats
-) -> dict[str, float]:
-    """Sizes of commands (n,) relative to their limits, by name of the member."""
-    return dict(zip(names, (np.abs(command) / limit).tolist(), strict=True))
-
 
 def nothing(*_: Any) -> None:
     """Do nothing: the default of functions that a kind does not need."""

@@ -22,8 +22,6 @@ from skysim.dynamics.multibody.actuator_kind import (
     ControlInput,
     add_motor,
     joints,
-    nothing,
-    relative_loads,
     sites,
 )
 from skysim.dynamics.multibody.cmgs import CMGS
@@ -82,11 +80,6 @@ class IdealTorque:
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
-
-    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, float]:
-        return relative_loads(TORQUES, control[self.motor], self.limit_nm)
-
-    respond = nothing
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:

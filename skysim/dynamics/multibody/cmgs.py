@@ -35,7 +35,6 @@ from skysim.dynamics.multibody.actuator_kind import (
     joints,
     member_values,
     positive_values,
-    relative_loads,
     scale_to_limit,
     unit_columns,
 )
@@ -332,18 +331,6 @@ class CmgActuator:
         return self.model.momentum(
             angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof]
         )
-
-    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, float]:
-        rate = control[self.gimbals.motor]
-        return relative_loads(self.gimbals.names, rate, self.model.gimbal_rate_limit_rad_s)
-
-    def respond(
-        self, control: Floats, angles_rad: Floats, speeds_rad_s: Floats, period_s: float
-    ) -> None:
-        angles_rad[self.gimbals.qpos] += period_s * control[self.gimbals.motor]
-        if self.model.rotor_torque_limit_nm is not None:
-            change = control[self.rotors.motor] / self.model.rotor_inertia_kg_m2
-            speeds_rad_s[self.rotors.dof] += period_s * change
 
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:

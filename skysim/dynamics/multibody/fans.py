@@ -19,8 +19,6 @@ from skysim.dynamics.multibody.actuator_kind import (
     ControlInput,
     add_motor,
     all_names,
-    nothing,
-    relative_loads,
     scale_to_limit,
     sites,
     unit_columns,
@@ -130,7 +128,6 @@ class FanActuator:
     def __init__(self, model: Any, config: FansConfig) -> None:
         fans = Fans.from_model(model)
         self.motor = fans.motor
-        self.names = fans.names
         self.lag_s = config.time_constant_s
         self.model = FanSet(fans.axes, fans.positions_m, config.thrust_limit_n)
 
@@ -144,11 +141,6 @@ class FanActuator:
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return np.zeros(3)
-
-    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, float]:
-        return relative_loads(self.names, control[self.motor], self.model.thrust_limit_n)
-
-    respond = nothing
 
 
 @dataclass(slots=True)

@@ -28,7 +28,6 @@ from skysim.dynamics.multibody.actuator_kind import (
     joints,
     member_values,
     positive_values,
-    relative_loads,
     scale_to_limit,
     unit_columns,
 )
@@ -120,17 +119,6 @@ class WheelActuator:
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(speeds_rad_s[self.joints.dof])
-
-    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, float]:
-        torque = np.abs(control[self.joints.motor]) / self.model.torque_limit_nm
-        speed = np.abs(speeds_rad_s[self.joints.dof]) / self.model.speed_limit_rad_s
-        return relative_loads(self.joints.names, np.maximum(torque, speed), 1.0)
-
-    def respond(
-        self, control: Floats, angles_rad: Floats, speeds_rad_s: Floats, period_s: float
-    ) -> None:
-        change = control[self.joints.motor] / self.model.inertia_kg_m2
-        speeds_rad_s[self.joints.dof] += period_s * change
 
 
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:

@@ -305,8 +305,10 @@ def image_shape(length_key: int, radius_key: int) -> tuple[Floats, ...]:
     length = max(math.expm1(length_key / SHAPES), 1e-3)
     radius = math.expm1(radius_key / SHAPES)
     k = np.arange(DISK_POINTS if radius else 1)
-    at = radius * np.sqrt((k + 0.5) / len(k)) * np.stack(
-        [np.cos(GOLDEN_ANGLE_RAD * k), np.sin(GOLDEN_ANGLE_RAD * k)]
+    at = (
+        radius
+        * np.sqrt((k + 0.5) / len(k))
+        * np.stack([np.cos(GOLDEN_ANGLE_RAD * k), np.sin(GOLDEN_ANGLE_RAD * k)])
     )
     end = MARGIN + radius
     counts = (math.ceil(half / STEP) for half in (end + length / 2, end))

@@ -401,9 +401,7 @@ def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
     radius_px = math.sqrt(half_px**2 + context.settings.min_area_px / math.pi) - half_px
     peak_e = threshold_e(context, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
-    share = peak_share(
-        np.array([blur2_px2]), none, none, np.array([length_px])
-    )[0]
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
         reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
@@ -432,5 +430,7 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
 
 def least_streak_px(samples: CheckedSamples) -> Floats:
     """(2,) path of the images at the slowest frame."""
-    paths_px = [np.median(view.streak_px, axis=0) for view in samples.frames.known if len(view)]
+    paths_px = [
+        np.median(view.streak_px, axis=0) for view in samples.frames.known if len(view)
+    ]
     return min(paths_px, key=np.linalg.norm, default=STILL_PX)
