@@ -180,9 +180,7 @@ def shortfall(lab: Lab) -> str:
     angles = start.angles_rad.copy()
     speeds = start.speeds_rad_s.copy()
     t_s = np.arange(0.0, lab.duration_s, period_s)
-    computer = FlightComputer(
-        scene.model_copy(update={"motion": motion}), vehicle, reference
-    )
+    computer = FlightComputer(scene.model_copy(update={"motion": motion}), vehicle, reference)
     disturbances = build_disturbances(lab, (), period_s)
     needed = np.zeros((len(t_s), 3))
     given = np.zeros((len(t_s), 3))
@@ -231,7 +229,7 @@ def at_limit(loads: Mapping[str, Floats]) -> dict[str, NDArray[np.bool_]]:
 
 
 def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
-    """The actuators at their limits, with the times (K,) of the first and the last one, and the share of it if not all."""
+    """The actuators at their limits, with the first and the last of the times (K,), and their share of the time."""
     parts = []
     for name, full in at_limit(loads).items():
         first, last = np.flatnonzero(full)[[0, -1]]

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.detection.detect import DETECTORS
-
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results import metrics
@@ -62,6 +61,11 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
     )
 
 
+def px2(sigma_px: Floats) -> Floats:
+    """(n, 2, 2) covariances of equal standard deviations along both axes."""
+    return sigma_px[:, None, None] ** 2 * np.eye(2)
+
+
 def around(radius: float, height: float, count: int = LEDS) -> Floats:
     """(count, 3) points on a ring about the boresight."""
     angle = 2 * np.pi * np.arange(count) / count
@@ -87,7 +91,7 @@ def test_expected_errors_of_stars_on_a_ring_match_the_textbook(stars: Lab) -> No
     places = around(tangent, 1.0)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     circle = ring(places, places, stars)
-    gain = gains(circle, np.full(LEDS, 0.3))  # equal weights: their size does not matter
+    gain = gains(circle, px2(np.full(LEDS, 0.3)))  # equal weights: their size does not matter
     variance = np.diag(
         covariance(gain, Independent(np.tile(sigma_px**2 * np.eye(2), (LEDS, 1, 1))))
     )
@@ -105,7 +109,7 @@ def test_weights_favor_the_accurate_lights(stars: Lab) -> None:
     focal_px = stars.scene.camera.focal_px
     places = np.array([[tangent, 0, 1], [-tangent, 0, 1], [0, tangent, 1], [0, -tangent, 1]])
     sigma_px = np.array([0.1, 0.1, 0.4, 0.4])
-    gain = gains(ring(places, places, stars), sigma_px)
+    gain = gains(ring(places, places, stars), px2(sigma_px))
     variance = np.diag(
         covariance(gain, Independent(sigma_px[:, None, None] ** 2 * np.eye(2)))
     )
@@ -123,7 +127,7 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     """Of a narrow ring: LEDs sigma / (R sqrt n) across each axis and sigma / (ring sqrt n) in roll; lever sigma / R."""
     circle = under_ring(leds)
     sigma_m = 1e-4
-    gain = gains(circle, np.ones(LEDS))
+    gain = gains(circle, px2(np.ones(LEDS)))
     places = np.diag(
         covariance(
             gain,
@@ -144,7 +148,7 @@ def test_a_rotated_survey_rotates_the_solution_equally(leds: Lab) -> None:
     circle = under_ring(leds)
     turn_rad = np.array([2e-4, -1e-4, 3e-4])
     shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, circle.arm_m))
-    matrix = covariance(gains(circle, np.ones(LEDS)), Common(shift_px[:, :, None]))
+    matrix = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))
     np.testing.assert_allclose(matrix, np.outer(turn_rad, turn_rad), rtol=1e-6, atol=1e-16)
 
 
@@ -154,7 +158,7 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
         places = around(0.02, 1.0) + np.array([aside, 0, 0])
         circle = ring(places, places, stars)
         shift_px = 1e-3 * (circle.xy_px - np.array(stars.scene.camera.center_px))
-        cross = covariance(gains(circle, np.ones(LEDS)), Common(shift_px[:, :, None]))[
+        cross = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))[
             :2, :2
         ].trace()
         assert np.sqrt(cross) == pytest.approx(1e-3 * aside, rel=0.02, abs=1e-9)
@@ -163,8 +167,8 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
 def test_a_fitted_place_absorbs_the_lever(leds: Lab) -> None:
     """`pnp`: the lever's error does nothing, and noise does far more across the boresight."""
     circle = under_ring(leds)
-    exact = gains(circle, np.ones(LEDS))
-    free = gains(circle, np.ones(LEDS), circle.gradient)
+    exact = gains(circle, px2(np.ones(LEDS)))
+    free = gains(circle, px2(np.ones(LEDS)), circle.gradient)
     lever = Common(circle.gradient)
     noise = Independent(np.tile(np.eye(2), (LEDS, 1, 1)))
     assert covariance(free, lever).trace() < 1e-6 * covariance(exact, lever).trace()

@@ -108,8 +108,8 @@ def within_reach(
 ) -> CheckedAttitudes:
     """A sample of the attitudes in reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
-    They have the rates and accelerations of the frames in turn. Directions are evenly spread on a Fibonacci spiral. The rotations about them are multiples of the golden ratio,
-    which spreads them evenly too.
+    They have the rates and accelerations of the frames in turn. Directions are evenly spread on a Fibonacci spiral. The
+    rotations about them are multiples of the golden ratio, which spreads them evenly too.
 
     Parameters
     ----------

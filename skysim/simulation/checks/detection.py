@@ -236,8 +236,8 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     )
 
 
-# Weights of the pixels in centroiders: functions of the distance from the center along an axis, of that from the center,
-# of the image, of its derivative, and of the variance of the pixels. Lengths are in standard deviations of the blur.
+# Weights of the pixels in centroiders: functions of the distance from the center along an axis, of that from the
+# center, of the image, of its derivative, and of the variance of the pixels. Lengths are in deviations of the blur.
 Weight = Callable[[Floats, Floats, Floats, Floats, Floats], Floats]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from skysim.simulation.checks.detection import (
 )
 from skysim.simulation.checks.expected_error import (
     Independent,
+    believed_px2,
     covariance,
     gains,
     star_places,
@@ -161,20 +163,21 @@ LARGEST_FLOOR_PX = 1.0
 def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     """Median of the expected NEES over some attitudes; NaN without lights.
 
-    The tracker claims the covariance M^-1, the inverse Fisher information for the standard deviations s_i that it
+    The tracker claims the covariance M^-1, the inverse Fisher information for the covariances C_i that it
     believes: those of photon and read-out noise, and the least centroid error floor_px (`tracker.centroid_sigma_px`)
     in quadrature. The errors of the centroids have a covariance C of noise, the pixels' sensitivity and star places.
     The mean of the NEES, e' M e, is trace(M C): 3 if the claim is true.
     """
     found = []
+    settings = replace(context.settings, centroid_sigma_px=floor_px)
+    claiming = context._replace(settings=settings)
     cam_from_body = context.lab.camera.mount.cam_from_body
     for view, lab_from_body in zip(
         sampled.used, sampled.attitudes.lab_from_body, strict=True
     ):
-        own = centroid_variance(view, context, prnu=0.0)
-        sigma_px = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2 + floor_px**2)
+        believed = believed_px2(view, claiming, prnu=0.0)
         try:
-            gain = gains(view, sigma_px) if len(view) > 2 else None
+            gain = gains(view, believed) if len(view) > 2 else None
         except np.linalg.LinAlgError:
             gain = None
         if gain is None:
@@ -183,9 +186,8 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         places = star_places(view, lab_from_body * cam_from_body.inv(), context)
         errors = covariance(gain, Independent(centroid_variance(view, context)))
         errors = errors if places is None else errors + covariance(gain, places)
-        information = np.einsum(
-            "nij,nik,n->jk", view.jacobian, view.jacobian, 1 / sigma_px**2
-        )
+        weighted = np.linalg.solve(believed, view.jacobian)
+        information = np.einsum("nij,nik->jk", view.jacobian, weighted)
         found.append(float(np.trace(information @ errors)))
     return float(np.median(found)) if found else math.nan
 
