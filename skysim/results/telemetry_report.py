@@ -49,7 +49,8 @@ def summary(log: Telemetry) -> dict[str, float]:
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
-        statistics["saturated_s"] = saturated_s(log)
+        if log.loads:
+            statistics["saturated_s"] = saturated_s(log)
         # A prescribed motion, without a reference, leaves wheels and gimbals as they were.
         if log.wheel_rad_s.size or log.gimbal_rad.size:
             statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()

@@ -167,9 +167,9 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
 
 def ends(levels: list[Level]) -> list[Level]:
     """The levels with the least and the greatest number; the first and the last one of levels without numbers."""
-    numbers = [NUMBER.match(str(value)) for value, _ in levels]
-    if all(numbers):
-        levels = sorted(levels, key=lambda level: float(NUMBER.match(str(level[0]))[0]))
+    numbers = [float(found[0]) for value, _ in levels if (found := NUMBER.match(str(value)))]
+    if len(numbers) == len(levels):
+        levels = [levels[n] for n in np.argsort(numbers)]
     return [levels[0], levels[-1]] if len(levels) > 1 else levels
 
 
