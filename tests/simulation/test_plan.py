@@ -120,7 +120,7 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
     [
         (
             {"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"},
-            "motion.start: tilt of 40.0 deg",
+            "motion.start: tilt of 40",
         ),
         ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
     ],
