@@ -407,7 +407,7 @@ def test_the_corners_of_a_design_are_checked(tmp_path: Path) -> None:
         "exposure": {"key": "exposure.time", "values": ["20 ms", "2 ms", "100 ms"]},
         "rate": {"key": "trial.rate_deg_s", "values": [0.1, 4, 1]},
     }
-    keys: dict[str, Any] = {"scene": "shefex2", "trial": {"kind": "frames"}}
+    keys: dict[str, Any] = {"scene": "shefex2", "set": {}, "trial": {"kind": "frames"}}
     plan = loaded(tmp_path, factors=factors, **keys)
     names = [name for name, _ in overview.checked_points(plan)]
     assert names[:2] == ["first levels", "exposure = 100 ms, rate = 4"]
