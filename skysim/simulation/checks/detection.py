@@ -218,7 +218,8 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     else:
         along, across = weighted_variance(view, n_e, noise_e2, WEIGHTS.get(centroider, fit))
         if centroider == "weighted" and len(view):
-            floor += sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
+            curve_px2 = sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
+            floor += np.where(length_px < 1, curve_px2, 0.0)[:, None]  # a path averages it
     # 2. Sensitivity of the pixels, between that of a Gaussian and that of a disk.
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
     varies = lab.scene.camera.detector.prnu if prnu is None else prnu
