@@ -192,6 +192,8 @@ class Telemetry:
     mountings
         Mounting states of the filter by name of the camera: "main" relative to the axes of the gyros, the others
         relative to "main"
+    loads
+        (K,) command, or speed, of each actuator of the controller relative to its limit, by name
     """
 
     t_s: Floats
@@ -214,6 +216,7 @@ class Telemetry:
     assumed_bias_rad_s: Floats | None = None
     sigma_bias_rad_s: Floats | None = None
     mountings: dict[str, Mounting] = field(default_factory=dict)
+    loads: dict[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
 from skysim.dynamics.multibody.actuators import IdealTorque, build_actuators
 from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
+from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
@@ -83,6 +84,10 @@ class FlightComputer:
         Number of controls of the MuJoCo model
     control_torque_nm
         (3,) control torque of the last period in body axes; zeros without a controller
+    achieved_nm
+        (3,) torque in body axes that actuators and fans give in the last period
+    names, loads
+        Names of the n commanded motors, and their commands, or speeds, in the last period relative to their limits (n,)
     momentum_dump
         Momentum dumping; None if it is off
     """
@@ -99,12 +104,23 @@ class FlightComputer:
         self.actuator_sets = build_actuators(scene.vehicle, vehicle.model)
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
+        self.achieved_nm = np.zeros(3)
+        self.names: list[str] = []
+        self.loads = np.empty(0)
         self.momentum_dump: MomentumDump | None = None
         self.actuator: Actuators = ideal_torque(vehicle)
         if self.config is None:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
+        motors = {
+            "wheels": vehicle.wheels.motor,
+            "cmgs": vehicle.gimbals.motor,
+            "fans": vehicle.fans.motor,
+        }
+        self.motors = motors.get(self.config.actuators, vehicle.torques)
+        self.names = [vehicle.model.actuator(number).name for number in self.motors]
+        self.limit = self.actuator.command_map()[1]
         self.law = self.build_law(scene, vehicle, reference, source)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(
@@ -186,13 +202,18 @@ class FlightComputer:
         else:
             self.control_torque_nm = torque_nm
         # 2. The actuators hold the body against the fans, which takes momentum out of them.
-        actuator_torque_nm = self.control_torque_nm
+        dump_nm = np.zeros(3)
         if self.momentum_dump:
-            actuator_torque_nm = actuator_torque_nm - self.momentum_dump.allocate(
-                control, momentum_nms, inputs
-            )
+            dump_nm = self.momentum_dump.allocate(control, momentum_nms, inputs)
+        actuator_torque_nm = self.control_torque_nm - dump_nm
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
+        self.achieved_nm = achieved_nm + dump_nm
+        self.loads = np.abs(control[self.motors]) / self.limit
+        if isinstance(self.actuator, WheelActuator):
+            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
+            speed_loads = np.abs(speeds) / self.actuator.model.speed_limit_rad_s
+            self.loads = np.maximum(self.loads, speed_loads)
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

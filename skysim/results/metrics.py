@@ -398,6 +398,7 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
             "drift_arcsec",
             "pointing_arcsec",
             "pointing_worst_arcsec",
+            "saturated_s",
             "angles_compared",
             "exposure_ms",
             "time_ms",

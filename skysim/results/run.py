@@ -122,6 +122,7 @@ class Recorder:
             (fact.name, fact.lines) for fact in plan.facts
         ]
         motion = telemetry_report.summary(log)
+        flown = telemetry_report.findings(log)
         report = run_report.run_report(
             scene.title,
             command,
@@ -132,6 +133,7 @@ class Recorder:
             annotated=annotated,
             motion=motion,
             motion_figure=flight,
+            motion_findings=flown,
             views=pictures,
             facts=facts,
             findings=plan.findings,
@@ -145,6 +147,7 @@ class Recorder:
             "pictures": [str(path) for path in pictures],
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
             "findings": plan.findings,
+            "flight_findings": flown,
         }
         return statistics, report
 

@@ -61,6 +61,7 @@ def run_report(
     annotated: NDArray[np.uint8],
     motion: Mapping[str, float],
     motion_figure: bytes,
+    motion_findings: Sequence[str] = (),
     views: Sequence[Path],
     facts: Sequence[tuple[str, Sequence[str]]],
     findings: Sequence[str],
@@ -83,6 +84,8 @@ def run_report(
         Statistics of the telemetry
     motion_figure
         Its plot, PNG, or empty
+    motion_findings
+        Warnings after the flight
     views
         Image files of the laboratory in 3-D
     facts, findings
@@ -103,7 +106,10 @@ def run_report(
         Section("The last solved frame", [frame]),
         Section("The laboratory", laboratory),
         Section("Errors", errors),
-        Section("Motion", [*moved, Items(motion_lines(motion))]),
+        Section(
+            "Motion",
+            [*moved, Items(motion_lines(motion)), Items(motion_findings, tone="warning")],
+        ),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
         Section("Frames", [frame_table(angles, rows), Items(refusals(rows)), *last]),

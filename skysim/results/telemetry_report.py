@@ -12,7 +12,11 @@ from skysim.core.constants import ARCSEC_DEG, ARCSEC_RAD, RPM_RAD_S
 from skysim.core.types import Floats, Telemetry
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
+from skysim.simulation.motion import at_limit, saturation_text
 
+# A vehicle that is farther from its commanded attitude for longer is warned of; after a step or a knock it returns.
+MAX_OFF_DEG = 2.0
+MAX_OFF_S = 5.0
 AXES = ("x", "y", "z")
 EULER = ("roll", "pitch", "yaw")
 
@@ -45,6 +49,8 @@ def summary(log: Telemetry) -> dict[str, float]:
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
+        if log.loads:
+            statistics["saturated_s"] = saturated_s(log)
         # A prescribed motion, without a reference, leaves wheels and gimbals as they were.
         if log.wheel_rad_s.size or log.gimbal_rad.size:
             statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
@@ -68,6 +74,24 @@ def summary(log: Telemetry) -> dict[str, float]:
         error_rad = mounting.estimate_rad[-1] - mounting.true_rad[-1]
         statistics[f"mounting_{name}_arcsec_end"] = np.linalg.norm(error_rad) / ARCSEC_RAD
     return {name: float(value) for name, value in statistics.items()}
+
+
+def saturated_s(log: Telemetry, since_s: float = 0.0) -> float:
+    """Time during which any actuator of the controller was at its limit, from a time on."""
+    full = np.array([*at_limit(log.loads).values(), np.zeros(len(log.t_s), dtype=bool)])
+    return float(full[:, log.t_s >= since_s].any(axis=0).sum() * log.period_s)
+
+
+def findings(log: Telemetry) -> list[str]:
+    """Warnings after a flight: actuators at their limits, and a vehicle that was far from its commanded attitude."""
+    found = [saturation_text(log.t_s, log.loads)]
+    pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
+    if pointing is not None and (pointing > MAX_OFF_DEG).sum() * log.period_s > MAX_OFF_S:
+        n = int(pointing.argmax())
+        found.append(
+            f"the vehicle was up to {pointing[n]:.3g}° from its commanded attitude, at {log.t_s[n]:.1f} s"
+        )
+    return list(filter(None, found))
 
 
 def table(log: Telemetry) -> Any:
@@ -102,6 +126,7 @@ def table(log: Telemetry) -> Any:
     add("momentum", log.momentum_nms, AXES, "nms")
     add_numbered("wheel", log.wheel_rad_s / RPM_RAD_S, "rpm")
     add_numbered("gimbal", np.degrees(log.gimbal_rad), "deg")
+    columns |= {f"load_{name}": load for name, load in log.loads.items()}
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability
     if log.saturated is not None:

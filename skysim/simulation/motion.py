@@ -1,6 +1,7 @@
 """The vehicle in motion: flight computer, dynamics, disturbances, vibration and IMU, one control period at a time.
 
-`check_reference` refuses a maneuver that exceeds the vehicle's limits. `Motion.advance` simulates a control period:
+`check_reference` refuses a maneuver that exceeds the vehicle's limits, `shortfall` forecasts what the actuators cannot
+give. `Motion.advance` simulates a control period:
 
 1. The controller reads the attitude and the rate, true or estimated.
 2. The flight computer sets the actuators.
@@ -13,9 +14,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
@@ -58,9 +60,10 @@ def check_reference(
     """
     motion = scene.motion
     vehicle = scene.vehicle
+    # Without a controller the vehicle may reach the stop later.
+    check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    check_tilt(reference, vehicle, duration_s)
     actuators = build_actuators(scene.vehicle, model.model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
@@ -79,15 +82,19 @@ def check_reference(
 def check_tilt(
     reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float
 ) -> None:
-    """Raise InputError for a tilt beyond the stop of the air bearing."""
+    """Raise InputError for a tilt beyond the stop of the air bearing, up to the end of the motion.
+
+    An endless motion is checked up to the end of the maneuvers.
+    """
     if vehicle.mount != "air_bearing":
         return
-    t_s = np.arange(0, min(reference.duration_s, duration_s) + TILT_CHECK_S, TILT_CHECK_S)
+    end_s = duration_s if math.isfinite(duration_s) else reference.duration_s
+    t_s = np.arange(0, end_s + TILT_CHECK_S, TILT_CHECK_S)
     tilt_deg = multibody.tilt_deg(reference.attitudes(t_s))
     beyond = np.flatnonzero(tilt_deg > vehicle.tilt_stop_deg)
     if len(beyond):
         raise InputError(
-            "motion.maneuver",
+            "motion.maneuver" if beyond[0] else "motion.start",
             f"tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s",
             f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}",
         )
@@ -139,6 +146,99 @@ def check_torque(
         )
 
 
+# Actuators at their limits: forecast, and in words.
+
+FORECAST_S = 0.02  # period of the forecast, at least
+FORECAST_PERIODS = 2000  # greatest number of periods
+MISSING = 0.01  # share of the greatest torque that may be missing
+LEAST_SHORT_S = 0.2  # shorter shortfalls give no warning
+AT_LIMIT = 0.999  # load from which an actuator is saturated: friction keeps a wheel just below its limit
+
+
+def shortfall(lab: Lab) -> str:
+    """A warning if the actuators cannot give the torque that the maneuver needs; empty if they can.
+
+    The vehicle is put on the reference in each period. Then
+
+    1. the torque needed is that of MuJoCo's inverse dynamics for the mean acceleration over the period, less the
+       disturbances, plus what the actuators still owe;
+    2. the flight computer allocates it, and wheels and gimbals respond.
+
+    A jump of the rate is a torque over one period. Jumps of the attitude and knocks are left out.
+    """
+    scene = lab.scene
+    control = scene.motion.control
+    if control is None or scene.motion.is_prescribed:
+        return ""
+    # The torque is given, so the control law does not matter.
+    pid = control.model_copy(update={"law": "pid"})
+    motion = scene.motion.model_copy(update={"control": pid})
+    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+    period_s = max(FORECAST_S, lab.duration_s / FORECAST_PERIODS)
+    vehicle = lab.vehicle
+    start = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), period_s)
+    angles = start.angles_rad.copy()
+    speeds = start.speeds_rad_s.copy()
+    t_s = np.arange(0.0, lab.duration_s, period_s)
+    computer = FlightComputer(scene.model_copy(update={"motion": motion}), vehicle, reference)
+    disturbances = build_disturbances(lab, (), period_s)
+    needed = np.zeros((len(t_s), 3))
+    given = np.zeros((len(t_s), 3))
+    loads = np.zeros((len(t_s), len(computer.names)))
+    following = reference.state_at(0.0)
+    for k, t in enumerate(t_s.tolist()):
+        # 1. Torque.
+        attitude, rate, _ = following
+        following = reference.state_at(t + period_s)
+        angles[:4] = attitude
+        speeds[:3] = rate
+        momentum = computer.momentum_nms(angles, speeds)
+        ends_s = np.array([t, t + period_s])
+        mean = (following[1] - rate) / period_s
+        needed[k] = start.required_torque_nm(angles, speeds, mean)
+        needed[k] -= disturbances.torque_nm(ends_s, attitude, rate, momentum)[0]
+        # 2. Allocation and response.
+        inputs = ControlInput(t, period_s, rate, angles, speeds)
+        owed = (needed - given).sum(axis=0)
+        controls = computer.compute_controls(inputs, attitude, momentum, owed)
+        given[k] = computer.achieved_nm
+        loads[k] = computer.loads
+        angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
+        for spun in (vehicle.wheels, vehicle.rotors):
+            torque = np.where(spun.motor < 0, 0.0, controls[spun.motor])
+            speeds[spun.dof] += period_s * torque / spun.inertia_kg_m2
+    missing = np.linalg.norm(needed - given, axis=1)
+    if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
+        return ""
+    n = int(missing.argmax())
+    wanted, possible = (
+        ", ".join(f"{component:.2g}" for component in torque[n]) for torque in (needed, given)
+    )
+    text = saturation_text(t_s, dict(zip(computer.names, loads.T, strict=True)))
+    return (
+        f"motion.maneuver: needs a torque of ({wanted}) N m at {t_s[n]:.1f} s, of which the actuators"
+        f" {control.actuators} give ({possible}){text and ': '}{text}; change it to a slower or smaller one, balance"
+        " the vehicle, or take stronger actuators"
+    )
+
+
+def at_limit(loads: Mapping[str, Floats]) -> dict[str, NDArray[np.bool_]]:
+    """Whether each actuator is at its limit, (K,) by name; actuators that never are left out."""
+    found = {name: load >= AT_LIMIT for name, load in loads.items()}
+    return {name: full for name, full in found.items() if full.any()}
+
+
+def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
+    """The actuators at their limits, with the first and the last of the times (K,), and their share of the time."""
+    parts = []
+    for name, full in at_limit(loads).items():
+        first, last = np.flatnonzero(full)[[0, -1]]
+        share = full[first : last + 1].mean()
+        part = f", {100 * share:.0f} % of the time" if share < 0.95 else ""
+        parts.append(f"{name} saturated from {t_s[first]:.1f} s to {t_s[last]:.1f} s{part}")
+    return "; ".join(parts)
+
+
 # Records of true and estimated states.
 
 
@@ -168,6 +268,7 @@ class TelemetryRecorder:
         self.imu_wxyz = np.zeros((rows, 4))
         self.filter_wxyz = np.zeros((rows, 4))
         self.saturated = np.zeros(rows, dtype=bool)
+        self.loads = np.zeros((rows, len(flight_computer.names)))
         self.bias_rad_s = np.zeros((rows, 3))
         # Of the filter: sigma of the attitude, bias, and sigma of the bias.
         self.filter_estimates = np.zeros((rows, 3, 3))
@@ -189,6 +290,7 @@ class TelemetryRecorder:
         self.recorded[k] = True
         self.torque_nm[k] = self.flight_computer.control_torque_nm
         self.momentum_nms[k] = momentum_nms
+        self.loads[k] = self.flight_computer.loads
         if self.navigation:
             self.record_estimates(k, self.navigation)
 
@@ -255,6 +357,7 @@ class TelemetryRecorder:
             self.filter_estimates[rows, 1] if has_filter else None,
             self.filter_estimates[rows, 2] if has_filter else None,
             self.mountings_by_camera(t_s, cameras),
+            dict(zip(self.flight_computer.names, self.loads[rows].T, strict=True)),
         )
 
     def mountings_by_camera(
@@ -350,14 +453,8 @@ class Motion:
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, controllers)
         self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
-        self.disturbances = DisturbanceModel.from_config(
-            scene.vehicle.disturbances,
-            imu.earth_rate_lab_rad_s(scene.site),
-            guidance.impulses(scene.motion, self.reference),
-            vehicle.inertia_kg_m2,
-            self.flight_computer.period_s,
-            random_stream(scene.seed, AIR_CURRENT, 0),
-        )
+        impulses = guidance.impulses(scene.motion, self.reference)
+        self.disturbances = build_disturbances(lab, impulses, self.flight_computer.period_s)
         self.recorder = None
         if kept_s is None:
             self.recorder = TelemetryRecorder(
@@ -463,6 +560,21 @@ def build_simulation(
         )
     rate = guidance.body_rate_rad_s(lab.scene, lab.start, lab.profiles)
     return multibody.Simulation(lab.vehicle, lab.start, rate, duration_s, kept_s)
+
+
+def build_disturbances(
+    lab: Lab, impulses: tuple[guidance.Impulse, ...], period_s: float
+) -> DisturbanceModel:
+    """The scene's disturbances, with these knocks."""
+    scene = lab.scene
+    return DisturbanceModel.from_config(
+        scene.vehicle.disturbances,
+        imu.earth_rate_lab_rad_s(scene.site),
+        impulses,
+        lab.vehicle.inertia_kg_m2,
+        period_s,
+        random_stream(scene.seed, AIR_CURRENT, 0),
+    )
 
 
 def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:

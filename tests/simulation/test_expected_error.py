@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from estimator.centroiding.centroid import CENTROIDERS
+from estimator.detection.detect import DETECTORS
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import metrics
@@ -14,7 +19,7 @@ from skysim.results.simulate import render_at
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, sampling
 from skysim.simulation.checks.attitudes import CheckedAttitudes
-from skysim.simulation.checks.detection import Context, fit_loss, timing_sigma_s
+from skysim.simulation.checks.detection import Context, timing_sigma_s
 from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure
@@ -55,6 +60,11 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
     )
 
 
+def px2(sigma_px: Floats) -> Floats:
+    """(n, 2, 2) covariances of equal standard deviations along both axes."""
+    return sigma_px[:, None, None] ** 2 * np.eye(2)
+
+
 def around(radius: float, height: float, count: int = LEDS) -> Floats:
     """(count, 3) points on a ring about the boresight."""
     angle = 2 * np.pi * np.arange(count) / count
@@ -80,7 +90,7 @@ def test_expected_errors_of_stars_on_a_ring_match_the_textbook(stars: Lab) -> No
     places = around(tangent, 1.0)
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     circle = ring(places, places, stars)
-    gain = gains(circle, np.full(LEDS, 0.3))  # equal weights: their size does not matter
+    gain = gains(circle, px2(np.full(LEDS, 0.3)))  # equal weights: their size does not matter
     variance = np.diag(
         covariance(gain, Independent(np.tile(sigma_px**2 * np.eye(2), (LEDS, 1, 1))))
     )
@@ -98,7 +108,7 @@ def test_weights_favor_the_accurate_lights(stars: Lab) -> None:
     focal_px = stars.scene.camera.focal_px
     places = np.array([[tangent, 0, 1], [-tangent, 0, 1], [0, tangent, 1], [0, -tangent, 1]])
     sigma_px = np.array([0.1, 0.1, 0.4, 0.4])
-    gain = gains(ring(places, places, stars), sigma_px)
+    gain = gains(ring(places, places, stars), px2(sigma_px))
     variance = np.diag(
         covariance(gain, Independent(sigma_px[:, None, None] ** 2 * np.eye(2)))
     )
@@ -116,7 +126,7 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     """Of a narrow ring: LEDs sigma / (R sqrt n) across each axis and sigma / (ring sqrt n) in roll; lever sigma / R."""
     circle = under_ring(leds)
     sigma_m = 1e-4
-    gain = gains(circle, np.ones(LEDS))
+    gain = gains(circle, px2(np.ones(LEDS)))
     places = np.diag(
         covariance(
             gain,
@@ -137,7 +147,7 @@ def test_a_rotated_survey_rotates_the_solution_equally(leds: Lab) -> None:
     circle = under_ring(leds)
     turn_rad = np.array([2e-4, -1e-4, 3e-4])
     shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, circle.arm_m))
-    matrix = covariance(gains(circle, np.ones(LEDS)), Common(shift_px[:, :, None]))
+    matrix = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))
     np.testing.assert_allclose(matrix, np.outer(turn_rad, turn_rad), rtol=1e-6, atol=1e-16)
 
 
@@ -147,7 +157,7 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
         places = around(0.02, 1.0) + np.array([aside, 0, 0])
         circle = ring(places, places, stars)
         shift_px = 1e-3 * (circle.xy_px - np.array(stars.scene.camera.center_px))
-        cross = covariance(gains(circle, np.ones(LEDS)), Common(shift_px[:, :, None]))[
+        cross = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))[
             :2, :2
         ].trace()
         assert np.sqrt(cross) == pytest.approx(1e-3 * aside, rel=0.02, abs=1e-9)
@@ -156,8 +166,8 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
 def test_a_fitted_place_absorbs_the_lever(leds: Lab) -> None:
     """`pnp`: the lever's error does nothing, and noise does far more across the boresight."""
     circle = under_ring(leds)
-    exact = gains(circle, np.ones(LEDS))
-    free = gains(circle, np.ones(LEDS), circle.gradient)
+    exact = gains(circle, px2(np.ones(LEDS)))
+    free = gains(circle, px2(np.ones(LEDS)), circle.gradient)
     lever = Common(circle.gradient)
     noise = Independent(np.tile(np.eye(2), (LEDS, 1, 1)))
     assert covariance(free, lever).trace() < 1e-6 * covariance(exact, lever).trace()
@@ -197,12 +207,121 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
     assert found["non_dimensional", 33.25][1] < found["led_pairs", 33.25][1]
 
 
-def test_the_centroid_error_with_background_matches_the_integral() -> None:
+def images(
+    electrons: float, sigma_px: float, disk_px: float = 0.0, streak_px: float = 0.0
+) -> View:
+    """One image with a streak along x."""
+    one = np.ones(1)
+    zero = np.zeros(1)
+    places = np.array([[0.0, 0.0, 1.0]])
+    rms_px = np.sqrt(sigma_px**2 + disk_px**2 / 4) * one
+    streak = np.array([[streak_px, 0.0]])
+    gradient = np.zeros((1, 2, 3))
+    row = np.zeros(1, int)
+    return View(
+        row,
+        zero[:, None] + np.zeros(2),
+        places,
+        places,
+        gradient,
+        one,
+        electrons * one,
+        disk_px * one,
+        zero,
+        rms_px,
+        streak,
+        zero,
+        np.zeros((1, 2)),
+        row,
+    )
+
+
+def test_a_fit_reaches_the_bound_of_mortensen() -> None:
+    """sigma^2 / N / (1 + int_0^1 ln t / (1 + t / tau) dt), tau = 2 pi sigma^2 b / N (2010, Nature Methods 7, 377)."""
+    electrons = 1000.0
+    sigma_px = 0.8
     for tau in (0.01, 0.3, 7.0):
         integral = scipy.integrate.quad(lambda t, tau=tau: np.log(t) / (1 + t / tau), 0, 1)[0]
-        assert fit_loss(np.array([tau]))[0] == pytest.approx(1 / (1 + integral), rel=1e-6)
-    assert fit_loss(np.array([0.0]))[0] == pytest.approx(1, abs=1e-6)
-    assert fit_loss(np.array([1e4]))[0] == pytest.approx(4e4, rel=1e-3)
+        noise_e2 = tau * electrons / (2 * np.pi * sigma_px**2)
+        found = detection.weighted_variance(
+            images(electrons, sigma_px), np.array([electrons]), noise_e2, detection.fit
+        )
+        expected_px2 = sigma_px**2 / electrons / (1 + integral)
+        assert np.ravel(found) == pytest.approx(np.full(2, expected_px2), rel=2e-3)
+
+
+def mosaic(light: View, background_e: float, angle_rad: float) -> tuple[Floats, Floats]:
+    """144 images of a light with shot noise, its streak turned, each in 64 pixels; and their (144, 2) centers."""
+    rng = np.random.default_rng(5)
+    cells = 12
+    size = 64
+    x, y = np.mgrid[:cells, :cells].reshape(2, -1) * size + size / 2
+    centers = np.column_stack([x, y]) + rng.uniform(-0.5, 0.5, (cells**2, 2))
+    # Points of the disk along the path.
+    k = np.arange(60)
+    r = light.disk_px[0] * np.sqrt((k + 0.5) / 60)
+    along = (np.arange(60) + 0.5) / 60 * light.streak_px[0, 0]
+    along = (along - along.mean()) * np.array([[np.cos(angle_rad)], [np.sin(angle_rad)]])
+    disk = r * np.array([np.cos(2.4 * k), np.sin(2.4 * k)])
+    points = (along[:, :, None] + disk[:, None]).reshape(2, -1)
+    blur = np.sqrt(light.blur2_px2[0] - 1 / 12)
+    edge = np.arange(size + 1) - 0.5
+    frame = np.full((cells * size, cells * size), background_e)
+    for center in centers:
+        corner = (center // size).astype(int) * size
+        place = (center - corner)[:, None] + points
+        share_x, share_y = (
+            np.diff(scipy.special.ndtr((edge[:, None] - axis) / blur), axis=0)
+            for axis in place
+        )
+        frame[corner[1] : corner[1] + size, corner[0] : corner[0] + size] += (
+            light.electrons[0] * (share_y @ share_x.T) / points.shape[1]
+        )
+    return rng.poisson(frame).astype(np.uint16), centers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("centroider", "detector", "disk_px", "streak_px"),
+    [
+        ("default", "default", 0.0, 0.0),
+        ("weighted", "default", 0.0, 0.0),
+        ("gaussian_window", "default", 0.0, 0.0),
+        ("gaussian_fit", "default", 0.0, 0.0),
+        ("cog", "local", 0.0, 0.0),
+        ("cog", "local", 3.0, 0.0),
+        ("weighted", "local", 3.0, 0.0),
+        ("default", "default", 0.0, 5.0),
+        ("default", "default", 0.0, 20.0),
+        ("default", "default", 0.0, 40.0),
+        ("weighted", "default", 0.0, 20.0),
+    ],
+)
+def test_every_centroider_scatters_as_forecast(
+    stars: Lab, centroider: str, detector: str, disk_px: float, streak_px: float
+) -> None:
+    """Rms of 144 images along and across the path, within 22 %: it varies by 6 %, and `cog` errs by 8 % less."""
+    context = detection.context_of(stars)
+    background_e = 60.0
+    settings = replace(context.settings, centroider=centroider, detector=detector)
+    context = context._replace(
+        settings=settings,
+        camera=context.camera._replace(noise_e=np.sqrt(background_e)),
+        timing_s=np.zeros(1),
+    )
+    light = images(10_000.0, 0.75, disk_px, streak_px)
+    angle_rad = 0.5
+    frame, centers = mosaic(light, background_e, angle_rad)
+    blobs = DETECTORS[detector](frame, 5.0, 3, 400)
+    centroids = CENTROIDERS[centroider](frame, blobs, 1.0)
+    away_px, near = cKDTree(centroids.xy_px).query(centers)
+    assert away_px.max() < 3
+    error = centroids.xy_px[near] - centers
+    turned = error @ np.array(
+        [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
+    )
+    forecast = np.sqrt(np.diag(detection.centroid_variance(light, context, prnu=0.0)[0]))
+    assert turned.std(axis=0) == pytest.approx(forecast, rel=0.22)
 
 
 def test_the_mean_time_of_pulses_varies_as_their_integral_does() -> None:

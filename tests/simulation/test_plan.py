@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.dynamics import multibody
+from skysim.results import telemetry_report
 from skysim.scene import loader
 from skysim.simulation.checks import (
     Check,
@@ -119,7 +120,7 @@ def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
     [
         (
             {"motion__start": "{pitch_deg: 40}", "motion__maneuver": "[]"},
-            "motion.start: tilt of 40.0 deg",
+            "motion.start: tilt of 40",
         ),
         ({"motion__maneuver": TILTED.replace("25", "35")}, "motion.maneuver: tilt of 3"),
     ],
@@ -854,6 +855,91 @@ def test_a_profile_that_is_too_fast_is_refused_before_the_run(tmp_path: Path) ->
     ):
         check(lab_of("simsat_slew", **changes))
     check(lab_of("simsat_slew", motion__control="prescribed", filter="null", **changes))
+
+
+WEAK = {"vehicle__wheels__torque_limit": "0.05 N m"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "words", "lost"),
+    [
+        # A slew needs 0.2 N m.
+        (WEAK, "wheel_z saturated from", True),
+        # A hold: gravity on 90 kg whose center of mass is 1 mm aside, 0.9 N m, beyond 0.6 N m.
+        (
+            {
+                "vehicle__center_of_mass": '["1 mm", "0 m", "-0.5 mm"]',
+                "motion__maneuver": '[{kind: hold, duration: "1 s"}]',
+            },
+            "wheel_y saturated from 0.0 s",
+            True,
+        ),
+        # Momentum runs out, although the torque would do.
+        (
+            {
+                "vehicle__wheels__speed_limit_rpm": "400",
+                "vehicle__wheels__start_rpm": "[0, 0, 0]",
+            },
+            "wheel_",
+            False,
+        ),
+        ({}, "", False),
+    ],
+)
+def test_what_the_actuators_cannot_give_is_forecast_and_reported(
+    changes: dict[str, str], words: str, lost: bool
+) -> None:
+    """The forecast names the actuators that the flight then saturates; a shipped scene has no warning."""
+    lab = lab_of("simsat_slew", **changes)
+    found = [
+        line for line in check(lab).findings if line.startswith("motion.maneuver: needs")
+    ]
+    log = Flight(lab).simulate_motion().telemetry()
+    assert bool(found) == bool(words)
+    assert words in "".join(found)
+    flown = telemetry_report.findings(log)
+    for name in re.findall(r"(wheel_\w) saturated", "".join(found)):
+        assert f"{name} saturated from" in flown[0]
+    off = [line for line in flown if "from its commanded attitude" in line]
+    assert bool(off) == lost
+    assert telemetry_report.saturated_s(log) > (1.0 if words else 0.0)
+
+
+def test_a_torque_of_statics_is_that_of_gravity() -> None:
+    """m g times the horizontal distance of the center of mass, against the inverse dynamics."""
+    lab = lab_of("simsat_slew", vehicle__center_of_mass='["1 mm", "0 m", "0 m"]')
+    at_rest = multibody.Simulation(lab.vehicle, Rotation.identity(), np.zeros(3), 1.0)
+    still = np.zeros_like(at_rest.speeds_rad_s)
+    torque_nm = at_rest.required_torque_nm(at_rest.angles_rad, still, np.zeros(3))
+    weight_n = lab.vehicle.mass.mass_kg * lab.vehicle.gravity_m_s2
+    assert torque_nm == pytest.approx([0, -1e-3 * weight_n, 0], rel=1e-6, abs=1e-4)
+
+
+def test_check_and_run_refuse_a_tilt_in_the_same_words() -> None:
+    """A rate goes on after its maneuver, to 32 deg; a run refused it only within the maneuver."""
+    rate = '[{kind: rate, rate_deg_s: [5, 0, 0], duration: "1 s"}]'
+    lab = lab_of("afit_simsat", motion__maneuver=rate)
+    messages = []
+    for simulate in (check, Flight):
+        with pytest.raises(InputError, match=r"motion\.maneuver: tilt of 30\.2 deg") as found:
+            simulate(lab)
+        messages.append(str(found.value))
+    assert messages[0] == messages[1]
+
+
+@pytest.mark.slow
+def test_forecasts_are_of_the_rate_that_they_state() -> None:
+    """A faster scene has fewer lights and larger errors also in reach, and its claims are of that rate."""
+    slow, fast = (
+        check(lab_of("shefex2", motion__rate_deg_s=f"[0, {rate}, 0]")) for rate in (0.5, 12)
+    )
+    for name in ("expected error", "lights in the field", "claimed errors"):
+        assert "at 12 deg/s" in fact(fast, name).lines[-1 if name == "claimed errors" else 1]
+    errors = [
+        fact(one, "expected error").values["reach"]["roll_arcsec"] for one in (slow, fast)
+    ]
+    assert errors[1] > 3 * errors[0]
 
 
 @pytest.mark.parametrize(

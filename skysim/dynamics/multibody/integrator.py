@@ -163,6 +163,21 @@ class Simulation:
         # 3. Stability.
         self.check_warnings()
 
+    def required_torque_nm(
+        self, angles_rad: Floats, speeds_rad_s: Floats, acceleration_rad_s2: Floats
+    ) -> Floats:
+        """(3,) torque of the actuators in body axes for an acceleration (3,) of the body, by MuJoCo's inverse dynamics.
+
+        It is J a + w x (J w + h), less the torques of gravity, air drag and cable spring.
+        """
+        data = self.data
+        data.qpos[:] = angles_rad
+        data.qvel[:] = speeds_rad_s
+        data.qacc[:] = 0.0
+        data.qacc[:3] = acceleration_rad_s2
+        mujoco.mj_inverse(self.model, data)
+        return np.array(data.qfrc_inverse[:3])
+
     def check_warnings(self) -> None:
         """Raise InputError if the last call made MuJoCo warn."""
         if self.data.warning.number.any():

@@ -54,6 +54,7 @@ FLIGHT_QUANTITIES = (
     "drift_arcsec",
     "pointing_arcsec",
     "pointing_worst_arcsec",
+    "saturated_s",
     "exposure_ms",
 )
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.

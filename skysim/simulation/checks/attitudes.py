@@ -13,7 +13,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
 from skysim.scene.scene import Scene
@@ -34,7 +33,7 @@ class CheckedAttitudes(NamedTuple):
     lab_from_body
         N rotations
     rate_body_rad_s
-        (N, 3) rates in body axes; zeros if only the direction matters
+        (N, 3) rates in body axes
     t_s
         (N,) times of the frames; NaN for an attitude that is not of a frame
     """
@@ -45,10 +44,7 @@ class CheckedAttitudes(NamedTuple):
 
 
 def of_frames(lab: Lab) -> CheckedAttitudes:
-    """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted.
-
-    Raises InputError for a motion beyond the tilt stop, as a run would.
-    """
+    """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
     # 1. The reference at many frames.
     scene = lab.scene
     exposure = scene.exposure
@@ -61,30 +57,11 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     chosen.add(int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()))
     chosen.add(int(tilts_rad(every).argmax()))
     rows = np.array(sorted(chosen))
-    # 3. Without a controller the vehicle may reach the stop later; the frames before are checked.
-    tilt_rad = tilts_rad(every)[rows]
+    # 3. Without a controller the vehicle may reach the stop; the frames before are checked.
     if scene.vehicle.mount == "air_bearing":
-        check_stop(scene, t_s[rows], np.degrees(tilt_rad))
-        rows = rows[tilt_rad <= math.radians(scene.vehicle.tilt_stop_deg)]
+        free = tilts_rad(every)[rows] <= math.radians(scene.vehicle.tilt_stop_deg)
+        rows = rows[free] if free.any() else rows[:1]
     return CheckedAttitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
-
-
-def check_stop(scene: Scene, t_s: Floats, tilt_deg: Floats) -> None:
-    """Raise InputError for a start or a maneuver beyond the tilt stop, as a run would."""
-    stop_deg = scene.vehicle.tilt_stop_deg
-    beyond = np.flatnonzero(tilt_deg > stop_deg)
-    if len(beyond) == len(tilt_deg):
-        raise InputError(
-            "motion.start",
-            f"tilt of {tilt_deg[0]:.1f} deg",
-            f"up to vehicle.tilt_stop_deg {stop_deg:g}",
-        )
-    if len(beyond) and scene.motion.control is not None:
-        raise InputError(
-            "motion.maneuver",
-            f"tilt of {tilt_deg[beyond[0]]:.3g} deg at {t_s[beyond[0]]:.3g} s",
-            f"up to vehicle.tilt_stop_deg {stop_deg:g}",
-        )
 
 
 def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
@@ -118,8 +95,8 @@ def within_reach(
 ) -> CheckedAttitudes:
     """A sample of the attitudes in reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
-    Directions are evenly spread on a Fibonacci spiral. The rotations about them are multiples of the golden ratio,
-    which spreads them evenly too.
+    They have the rates of the frames in turn. Directions are evenly spread on a Fibonacci spiral. The
+    rotations about them are multiples of the golden ratio, which spreads them evenly too.
 
     Parameters
     ----------
@@ -128,7 +105,7 @@ def within_reach(
     mount
         Mount of the camera
     frames
-        Attitudes of the frames, whose greatest tilt is the default
+        Attitudes of the frames, with their rates; their greatest tilt is the default
     tilt_deg
         Greatest tilt, for example that of a study's trials; None for `greatest_tilt_rad`
     """
@@ -151,9 +128,16 @@ def within_reach(
         # With a yaw of minus the azimuth, the tilt is about a horizontal axis.
         angles = np.column_stack([azimuth_rad, tilt_rad, turn_rad - azimuth_rad])
         lab_from_body = Rotation.from_euler("ZYZ", angles)
-    return CheckedAttitudes(
-        lab_from_body, np.zeros((DIRECTIONS, 3)), np.full(DIRECTIONS, np.nan)
-    )
+    turn = n % len(frames.t_s)
+    rate_body_rad_s = frames.rate_body_rad_s[turn]
+    return CheckedAttitudes(lab_from_body, rate_body_rad_s, np.full(DIRECTIONS, np.nan))
+
+
+def rates_text(attitudes: CheckedAttitudes) -> str:
+    """The least and the greatest rate."""
+    rates_deg_s = np.degrees(np.linalg.norm(attitudes.rate_body_rad_s, axis=1))
+    low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
+    return f"at {high} deg/s" if low == high else f"at {low} to {high} deg/s"
 
 
 def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) -> str:

@@ -8,14 +8,26 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from estimator.centroiding.gaussian_fit import HALF_WINDOW_PX
+from estimator.centroiding.moments import sampling_variance
+from estimator.detection.detect import (
+    MAX_STREAK_PX,
+    SHORTEST_PX,
+    line_taps,
+    noise_factor,
+)
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
+from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.light import DomeConfig
@@ -29,10 +41,13 @@ from skysim.tracking.factory import assumed_settings
 BINOMIAL_VARIANCE_PX2 = (
     0.5  # variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
 )
-FILTERED_NOISE = 0.375  # factor of that filter on the noise of a pixel
-COG_MARGIN_PX = (
-    4.5  # margin of the window about the pixels above the threshold, half a pixel included
-)
+# Grid on which images are integrated, in standard deviations of the blur: its step, and its margin.
+STEP = 0.4
+MARGIN = 5.0
+DISK_POINTS = 24  # points of a disk
+SHAPES = 10  # images whose sizes differ by less than one in this number count as equal
+COG_MARGIN_PX = 4.0  # margin of the window about the pixels above the threshold
+STILL_PX = np.zeros(2)
 PHASES = 64  # number of phases of the pulses relative to the exposure
 MAX_PULSES = (
     500  # number of pulses in an exposure from which the mean time of the light does not vary
@@ -96,8 +111,11 @@ def context_of(lab: Lab) -> Context:
     )
 
 
-def threshold_e(context: Context) -> float:
-    """Detection threshold: electrons above the background of a pixel after the binomial filter."""
+def threshold_e(context: Context, streak_px: Floats = STILL_PX) -> float:
+    """Detection threshold: electrons above the background of a pixel after the detector's filter.
+
+    The detector `default` averages along streaks (2,), with `line_taps`.
+    """
     settings = context.settings
     camera = context.camera
     if settings.detector == "thesis":
@@ -107,7 +125,10 @@ def threshold_e(context: Context) -> float:
             (threshold_dn - detector.offset_dn) * detector.gain_e_dn - camera.background_e,
             1.0,
         )
-    return settings.threshold_sigma * FILTERED_NOISE * camera.noise_e
+    length_px = np.abs(streak_px).max()
+    along = settings.detector == "default" and SHORTEST_PX <= length_px <= MAX_STREAK_PX
+    taps = line_taps(tuple(streak_px) if along else (0.0, 0.0))
+    return settings.threshold_sigma * noise_factor(taps) * camera.noise_e
 
 
 def full_scale_e(detector: DetectorConfig) -> float:
@@ -115,34 +136,44 @@ def full_scale_e(detector: DetectorConfig) -> float:
     return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
 
 
-def detected_area_px(view: View, context: Context) -> Floats:
-    """(n,) area in px^2 of each image above the detection threshold.
-
-        r = R + s sqrt(2 ln(peak / T)),    area = pi r^2 + 2 r L
-
-    The image is a disk of radius R, blurred by a Gaussian of deviation s, on a path of length L. It is above the
-    threshold T up to the radius r, which is exact for a Gaussian alone (R = 0).
-    """
-    blur2_px2 = view.blur2_px2 + BINOMIAL_VARIANCE_PX2
-    share = peak_share(blur2_px2, view.disk_px, view.defocus_px, view.streak_length_px)
-    ratio = np.maximum(view.electrons * share / threshold_e(context), 1e-9)
-    large = np.maximum(view.disk_px, view.defocus_px)
-    small = np.minimum(view.disk_px, view.defocus_px)
-    radius = large + np.sqrt((blur2_px2 + small**2 / 4) * 2 * np.maximum(np.log(ratio), 0))
-    return np.asarray(
-        np.where(ratio > 1, np.pi * radius**2 + 2 * radius * view.streak_length_px, 0.0)
+def detected_radius_px(view: View, context: Context) -> Floats:
+    """(n,) distance from its path up to which each image is above the detection threshold; 0 if it is below."""
+    share = peak_share(
+        view.blur2_px2 + BINOMIAL_VARIANCE_PX2,
+        view.disk_px,
+        view.defocus_px,
+        view.streak_length_px,
     )
+    median_px = np.median(view.streak_px, axis=0) if len(view) else STILL_PX
+    log_ratio = np.log(
+        np.maximum(view.electrons * share / threshold_e(context, median_px), 1.0)
+    )
+    radius = np.zeros(len(view))
+    for rows, blur_px, ((u, v), image, *_) in shapes_of(view, BINOMIAL_VARIANCE_PX2):
+        outward = v[0] >= 0
+        fall = -np.log(image[len(u) // 2, outward])
+        # Linear for a Gaussian.
+        square = np.interp(log_ratio[rows], fall - fall[0], v[0, outward] ** 2)
+        radius[rows] = blur_px * np.sqrt(square)
+    return radius
+
+
+def detected_area_px(view: View, context: Context) -> Floats:
+    """(n,) area pi r^2 + 2 r L in px^2 of each image above the detection threshold, on a path of length L."""
+    radius = detected_radius_px(view, context)
+    return np.asarray(np.pi * radius**2 + 2 * radius * view.streak_length_px)
 
 
 def usable(view: View, context: Context) -> View:
     """The brightest lights, at most `tracker.brightest`, whose images are detected and entirely on the detector."""
     settings = context.settings
     config = context.lab.scene.camera
-    # Distance of each image from the nearest edge, which must exceed its radius.
+    # Distance of each image from the nearest edges, which must exceed its half size.
     far_px = np.array([config.width_px, config.height_px]) - 1 - view.xy_px
-    edge = np.minimum(view.xy_px, far_px).min(axis=1)
-    area = detected_area_px(view, context)
-    found = np.flatnonzero((area >= settings.min_area_px) & (edge > np.sqrt(area / np.pi)))
+    edge = np.minimum(view.xy_px, far_px)
+    half_px = np.abs(view.streak_px) / 2 + detected_radius_px(view, context)[:, None]
+    large = detected_area_px(view, context) >= settings.min_area_px
+    found = np.flatnonzero(large & (edge > half_px).all(axis=1))
     return view.take(
         found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs]
     )
@@ -151,9 +182,9 @@ def usable(view: View, context: Context) -> View:
 def centroid_variance(view: View, context: Context, prnu: float | None = None) -> Floats:
     """(n, 2, 2) covariance of the centroids in px^2: the sum of
 
-    1. photon noise, and background noise of b electrons^2 a pixel. For a center of gravity in a window of side W it is
-       sigma^2 / N + b W^4 / (12 N^2) along each axis; for a fit it is the Cramer-Rao bound of a Gaussian (`fit_loss`).
-       Along the path, sigma^2 is increased by L^2 / 12.
+    1. photon noise, and background noise of b electrons^2 a pixel. For a center of gravity in a window of sides A along
+       and B across an axis it is sigma^2 / N + b A^3 B / (12 N^2), with sigma^2 increased by L^2 / 12 along the path;
+       for other centroiders see `weighted_variance`; `weighted` adds its S-curve.
     2. pixel sensitivity that varies by p: p^2 sum(I^2 x^2) / N^2, which is p^2 / (8 pi) for a Gaussian and
        p^2 / (4 pi) for a disk.
     3. the plateau of a saturated image.
@@ -173,43 +204,130 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     camera = context.camera
     noise_e2 = camera.noise_e**2
     n_e = np.maximum(view.electrons, 1e-9)
-    along2 = view.sigma_px**2 + view.streak_length_px**2 / 12
-    if context.settings.centroider == "cog":
-        side = 2 * (np.sqrt(detected_area_px(view, context) / np.pi) + COG_MARGIN_PX)
-        floor = noise_e2 * side**4 / (12 * n_e**2)
-        along = along2 / n_e + floor
-        across = view.sigma_px**2 / n_e + floor
+    length_px = view.streak_length_px
+    centroider = context.settings.centroider
+    if centroider == "gaussian_fit" and (length_px > HALF_WINDOW_PX).any():
+        centroider = "cog"  # what does not fit keeps its center of gravity
+    floor = np.zeros((len(view), 2))
+    if centroider == "cog":
+        margin_px = detected_radius_px(view, context)[:, None] + COG_MARGIN_PX
+        sides_px = np.abs(view.streak_px) + 2 * margin_px
+        floor = sides_px**2 * (noise_e2 * sides_px.prod(axis=1) / (12 * n_e**2))[:, None]
+        along = (view.sigma_px**2 + length_px**2 / 12) / n_e
+        across = view.sigma_px**2 / n_e
     else:
-        loss = fit_loss(2 * np.pi * np.sqrt(along2) * view.sigma_px * noise_e2 / n_e)
-        along = along2 / n_e * loss
-        across = view.sigma_px**2 / n_e * loss
+        along, across = weighted_variance(view, n_e, noise_e2, WEIGHTS.get(centroider, fit))
+        if centroider == "weighted" and len(view):
+            curve_px2 = sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
+            floor += np.where(length_px < 1, curve_px2, 0.0)[:, None]  # a path averages it
     # 2. Sensitivity of the pixels, between that of a Gaussian and that of a disk.
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2
     varies = lab.scene.camera.detector.prnu if prnu is None else prnu
     pattern = varies**2 / (8 * np.pi) * (1 + disk)
     # 3. Saturation.
     plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(lab.scene.camera.detector))
-    unit = view.streak_px / np.maximum(view.streak_length_px, 1e-12)[:, None]
+    unit = view.streak_px / np.maximum(length_px, 1e-12)[:, None]
     along_path = unit[:, :, None] * unit[:, None, :]
     # 4. Timing.
     moved = (view.streak_px / lab.scene.exposure.time_s) * context.timing_s[view.row, None]
     return np.asarray(
-        (across + pattern + plateau)[:, None, None] * np.eye(2)
+        ((across + pattern + plateau)[:, None] + floor)[:, :, None] * np.eye(2)
         + (along - across)[:, None, None] * along_path
         + moved[:, :, None] * moved[:, None, :]
     )
 
 
-def fit_loss(tau: Floats) -> Floats:
-    """Factor by which background increases the least variance sigma^2 / N of a Gaussian's fitted position:
+# Weights of the pixels in centroiders: functions of the distance from the center along an axis, of that from the
+# center, of the image, of its derivative, and of the variance of the pixels. Lengths are in deviations of the blur.
+Weight = Callable[[Floats, Floats, Floats, Floats, Floats], Floats]
 
-        1 / (1 + int_0^1 ln t / (1 + t / tau) dt),    tau = 2 pi sigma^2 b / N
 
-    (Mortensen et al. 2010, Nature Methods 7, 377). The integral is tau Li2(-1 / tau). The factor is 1 without
-    background and tends to 4 tau.
+def fit(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
+    """Weighted least squares, which reaches the Cramer-Rao bound."""
+    return slope / variance
+
+
+def window(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
+    """A Gaussian of twice the image's variance."""
+    return np.asarray(u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum())))
+
+
+WEIGHTS: dict[str, Weight] = {
+    "weighted": lambda u, r, image, slope, variance: u * image,
+    "gaussian_window": window,
+}
+
+
+def weighted_variance(
+    view: View, n_e: Floats, noise_e2: float, weight: Weight
+) -> tuple[Floats, Floats]:
+    """(n,) variances along and across the path, in px^2, of a centroid that is linear in the pixels.
+
+    With N electrons in an image I of unit volume, b electrons^2 of background in a pixel, and the pixels' weight W for
+    a displacement along u, to first order
+
+        variance = sum W^2 (N I + b) / (N sum W dI/du)^2
+
+    The fit of the image, W = N dI/du / (N I + b), has the least, 1 / sum (N dI/du)^2 / (N I + b): the Cramer-Rao bound.
     """
-    tau = np.maximum(tau, 1e-9)
-    return np.asarray(1 / (1 + tau * special.spence(1 + 1 / tau)))
+    variance = np.empty((2, len(view)))
+    for rows, blur_px, (grid, image, *slopes) in shapes_of(view):
+        scale = blur_px[:, None, None]
+        pixels = n_e[rows, None, None] * image + noise_e2 * scale**2
+        r = np.hypot(*grid)
+        for axis, slope in enumerate(slopes):
+            w = weight(grid[axis], r, image, slope, pixels)
+            gain = n_e[rows] * (w * slope).sum(axis=(-2, -1))
+            noise = (w**2 * pixels).sum(axis=(-2, -1))
+            variance[axis, rows] = blur_px**2 * noise / (STEP * gain) ** 2
+    return variance[0], variance[1]
+
+
+def shapes_of(
+    view: View, filter_px2: float = 0.0
+) -> Iterator[tuple[NDArray[np.bool_], Floats, tuple[Floats, ...]]]:
+    """Lights with images of one shape: their mask (n,), the blur of each, filtered or not, and the shape."""
+    large = np.maximum(view.disk_px, view.defocus_px)
+    small = np.minimum(view.disk_px, view.defocus_px)
+    blur_px = np.sqrt(view.blur2_px2 + filter_px2 + small**2 / 4)
+    sizes = np.column_stack([view.streak_length_px, large]) / blur_px[:, None]
+    keys = np.rint(SHAPES * np.log1p(sizes)).astype(int)
+    for key in np.unique(keys, axis=0):
+        rows = (keys == key).all(axis=1)
+        yield rows, blur_px[rows], image_shape(*key.tolist())
+
+
+@lru_cache(maxsize=256)
+def image_shape(length_key: int, radius_key: int) -> tuple[Floats, ...]:
+    """The grid (2, U, V), and on it an image of unit volume and its derivatives (U, V) along and across its path.
+
+    It is a segment, spread over a disk and blurred by a Gaussian of unit variance; the keys are SHAPES ln(1 + size).
+    """
+    length = max(math.expm1(length_key / SHAPES), 1e-3)
+    radius = math.expm1(radius_key / SHAPES)
+    k = np.arange(DISK_POINTS if radius else 1)
+    at = (
+        radius
+        * np.sqrt((k + 0.5) / len(k))
+        * np.stack([np.cos(GOLDEN_ANGLE_RAD * k), np.sin(GOLDEN_ANGLE_RAD * k)])
+    )
+    end = MARGIN + radius
+    counts = (math.ceil(half / STEP) for half in (end + length / 2, end))
+    u, v = (STEP * np.arange(-count, count + 1) for count in counts)
+    du = u[:, None] - at[0]
+    dv = v[:, None] - at[1]
+    low = du - length / 2
+    high = du + length / 2
+    across = gauss(dv).T / len(k)
+    along = (special.ndtr(high) - special.ndtr(low)) / length
+    slope = (gauss(high) - gauss(low)) / length
+    grid = np.array(np.meshgrid(u, v, indexing="ij"))
+    return grid, along @ across, slope @ across, along @ (-dv.T * across)
+
+
+def gauss(x: Floats) -> Floats:
+    """The normal density."""
+    return np.asarray(np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi))
 
 
 def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:

@@ -20,8 +20,8 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.detection import Context, centroid_variance, threshold_e
-from skysim.simulation.checks.expected_error import Independent, believed_sigma_px
+from skysim.simulation.checks.detection import Context, threshold_e
+from skysim.simulation.checks.expected_error import believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.lights.lab_room import IMAGES, Mirror
@@ -194,11 +194,7 @@ def compared(
     # 1. Distance within which LEDs coincide, from the tracker's standard deviation of an image position.
     lab = context.lab
     camera = context.camera.optics.camera
-    sigma_px = [
-        believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
-        for view in samples.reach.used
-        if len(view)
-    ]
+    sigma_px = [believed_sigma_px(view, context) for view in samples.reach.used if len(view)]
     distance_m = float(np.median(samples.reach.joined("distance_m")))
     typical_px = float(np.median(np.concatenate(sigma_px)))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px

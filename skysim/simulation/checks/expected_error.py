@@ -4,9 +4,9 @@ A solution is a rotation of the camera that is fitted to the image positions x_i
 For a small rotation w of the lights in camera axes, dx_i = J_i w. An error e_i of the measured or predicted position
 causes, to first order, the attitude error
 
-    w = sum_i K_i e_i,      K_i = M^-1 J_i' / s_i^2,      M = sum_i J_i' J_i / s_i^2,
+    w = sum_i K_i e_i,      K_i = M^-1 J_i' C_i^-1,      M = sum_i J_i' C_i^-1 J_i,
 
-with M the Fisher information of the rotation for the standard deviations s_i that the tracker believes (its weights).
+with M the Fisher information of the rotation for the covariances C_i that the tracker believes (its weights).
 Each cause is an e_i, so each has its own covariance of w:
 
     independent in each light, covariance S_i      sum_i K_i S_i K_i'         centroid noise, LED survey
@@ -247,15 +247,15 @@ EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 # Propagation to the attitude.
 
 
-def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
-    """(n, 3, 2) gains K_i = M^-1 J_i' / s_i^2: rotation vector by a unit error of each image position.
+def gains(view: View, covariance_px2: Floats, fitted: Floats | None = None) -> Floats:
+    """(n, 3, 2) gains K_i = M^-1 J_i' C_i^-1: rotation vector by a unit error of each image position.
 
     Parameters
     ----------
     view
         The n lights
-    sigma_px
-        (n,) standard deviations s_i
+    covariance_px2
+        (n, 2, 2) covariances C_i
     fitted
         (n, 2, k) derivatives of the image positions by k parameters that are fitted with the rotation
 
@@ -267,7 +267,7 @@ def gains(view: View, sigma_px: Floats, fitted: Floats | None = None) -> Floats:
     jacobian = view.jacobian
     if fitted is not None:
         jacobian = np.concatenate([jacobian, fitted], axis=2)
-    weighted = jacobian / sigma_px[:, None, None] ** 2
+    weighted = np.linalg.solve(covariance_px2, jacobian)
     # Scale the columns, because a rotation in rad and a shift in meters have different sizes.
     size = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian))
     information = np.einsum("nij,nik->jk", weighted, jacobian) / np.outer(size, size)
@@ -285,16 +285,27 @@ def covariance(gain: Floats, errors: Independent | Common) -> Floats:
     return np.asarray(response @ response.T)
 
 
-def believed_sigma_px(view: View, noise: Independent, context: Context) -> Floats:
-    """(n,) standard deviation of each image position that the tracker believes: centroid, floor and LED survey."""
+def believed_px2(view: View, context: Context, prnu: float | None = None) -> Floats:
+    """(n, 2, 2) covariance of each image position that the tracker believes: centroid, floor and LED survey.
+
+    Only the fit of streaks tells the star tracker the directions of its errors.
+    """
     settings = context.settings
     beliefs = context.beliefs
-    own2 = np.trace(noise.covariance_px2, axis1=1, axis2=2) / 2
+    own = centroid_variance(view, context, prnu)
+    if context.surface is not None or settings.centroider not in ("default", "streak"):
+        own = np.trace(own, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(2)
     survey_px = np.zeros(len(view))
     if beliefs.dome:
         camera, leds, lever = beliefs.dome
         survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
-    return np.asarray(np.sqrt(own2 + settings.centroid_sigma_px**2 + survey_px**2))
+    added_px2 = settings.centroid_sigma_px**2 + survey_px**2
+    return np.asarray(own + added_px2[:, None, None] * np.eye(2))
+
+
+def believed_sigma_px(view: View, context: Context) -> Floats:
+    """(n,) standard deviation of each image position that the tracker believes, see `believed_px2`."""
+    return np.sqrt(np.trace(believed_px2(view, context), axis1=1, axis2=2) / 2)
 
 
 class Mismatch(NamedTuple):
@@ -351,9 +362,9 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
         shifts.pop("focal length", None)  # the tracker corrects it
     if not shifts:
         return None
-    sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+    sigma_px = believed_sigma_px(view, context)
     try:
-        gain = gains(view, sigma_px)
+        gain = gains(view, believed_px2(view, context))
     except np.linalg.LinAlgError:
         return None
     known = np.zeros((len(view), 2, 1))
@@ -422,7 +433,7 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
     try:
         if len(view) < MIN_EVIDENCE_MATCHES:
             raise np.linalg.LinAlgError("too few lights")
-        gain = gains(view, believed_sigma_px(view, noise, context), fitted)
+        gain = gains(view, believed_px2(view, context), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. Causes.

@@ -92,8 +92,9 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
         behind = "".join(
             f"; {count:.1f} more are behind {name}" for name, count in hidden.items()
         )
+        rates = attitudes.rates_text(sampled.attitudes)
         lines.append(
-            f"{what}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}"
+            f"{what}, {rates}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}"
         )
         values[key] = {
             "mean": counts.mean(),
@@ -455,7 +456,8 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             if cross == cross
             else "no solution"
         )
-        lines.append(f"{what}: {errors}{worst}{few}")
+        rates = attitudes.rates_text(sampled.attitudes)
+        lines.append(f"{what}, {rates}: {errors}{worst}{few}")
         values[key] = {
             "cross_arcsec": cross,
             "roll_arcsec": roll,

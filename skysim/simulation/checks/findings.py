@@ -24,14 +24,12 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     Context,
-    centroid_variance,
     detected_area_px,
     full_scale_e,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
-    Independent,
-    believed_sigma_px,
+    believed_px2,
     gains,
     mismatch,
 )
@@ -521,14 +519,14 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     assert config is not None
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)
-    sigma_px = believed_sigma_px(view, Independent(centroid_variance(view, context)), context)
+    gain = gains(view, believed_px2(view, context))
     lights = context.beliefs.lights.take(view.row)
     mount = context.lab.camera.mount
     optics = context.camera.optics
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
     moved = thermal_motion.camera_at(config, mount, optics, t_s)
     drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
-    return np.asarray(np.einsum("nij,nj->i", gains(view, sigma_px), drifted_px - surveyed_px))
+    return np.asarray(np.einsum("nij,nj->i", gain, drifted_px - surveyed_px))
 
 
 def image_px(

@@ -28,7 +28,7 @@ from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.lab import Lab
-from skysim.simulation.motion import check_reference
+from skysim.simulation.motion import check_reference, shortfall
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
 
 # Keys of a head; findings with other keys are about the scene.
@@ -85,16 +85,16 @@ def check(
         return Check([], [outside])
     # 1. Attitudes.
     context = context_of(lab)
-    frames = attitudes.of_frames(lab)
-    if rate_body_rad_s is not None:
-        rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
-        frames = frames._replace(rate_body_rad_s=rates)
     check_reference(
         guidance.plan(scene.motion, lab.start, lab.profiles),
         scene,
         lab.vehicle,
         lab.duration_s,
     )
+    frames = attitudes.of_frames(lab)
+    if rate_body_rad_s is not None:
+        rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
+        frames = frames._replace(rate_body_rad_s=rates)
     # 2. Views.
     samples = samples_of(context, frames, tilt_deg)
     # 3. Facts and warnings.
@@ -109,7 +109,7 @@ def check(
         facts.insert(2, dome_warnings.fact(alike))
         warning = dome_warnings.finding(alike, scene.light)
         findings += [warning] if warning else []
-    findings += broken_assumptions(lab)
+    findings += [*broken_assumptions(lab), *filter(None, [shortfall(lab)])]
     # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
     checked = [check(head, tilt_deg, rate_body_rad_s) for head in heads]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
+    STILL_PX,
     Context,
     centroid_variance,
     full_scale_e,
@@ -22,6 +24,7 @@ from skysim.simulation.checks.detection import (
 )
 from skysim.simulation.checks.expected_error import (
     Independent,
+    believed_px2,
     covariance,
     gains,
     star_places,
@@ -160,20 +163,21 @@ LARGEST_FLOOR_PX = 1.0
 def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     """Median of the expected NEES over some attitudes; NaN without lights.
 
-    The tracker claims the covariance M^-1, the inverse Fisher information for the standard deviations s_i that it
+    The tracker claims the covariance M^-1, the inverse Fisher information for the covariances C_i that it
     believes: those of photon and read-out noise, and the least centroid error floor_px (`tracker.centroid_sigma_px`)
     in quadrature. The errors of the centroids have a covariance C of noise, the pixels' sensitivity and star places.
     The mean of the NEES, e' M e, is trace(M C): 3 if the claim is true.
     """
     found = []
+    settings = replace(context.settings, centroid_sigma_px=floor_px)
+    claiming = context._replace(settings=settings)
     cam_from_body = context.lab.camera.mount.cam_from_body
     for view, lab_from_body in zip(
         sampled.used, sampled.attitudes.lab_from_body, strict=True
     ):
-        own = centroid_variance(view, context, prnu=0.0)
-        sigma_px = np.sqrt(np.trace(own, axis1=1, axis2=2) / 2 + floor_px**2)
+        believed = believed_px2(view, claiming, prnu=0.0)
         try:
-            gain = gains(view, sigma_px) if len(view) > 2 else None
+            gain = gains(view, believed) if len(view) > 2 else None
         except np.linalg.LinAlgError:
             gain = None
         if gain is None:
@@ -182,9 +186,8 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         places = star_places(view, lab_from_body * cam_from_body.inv(), context)
         errors = covariance(gain, Independent(centroid_variance(view, context)))
         errors = errors if places is None else errors + covariance(gain, places)
-        information = np.einsum(
-            "nij,nik,n->jk", view.jacobian, view.jacobian, 1 / sigma_px**2
-        )
+        weighted = np.linalg.solve(believed, view.jacobian)
+        information = np.einsum("nij,nik->jk", view.jacobian, weighted)
         found.append(float(np.trace(information @ errors)))
     return float(np.median(found)) if found else math.nan
 
@@ -202,7 +205,8 @@ def fact(context: Context, samples: CheckedSamples) -> Fact | None:
     if math.isnan(nees):
         return None
     floor_px = context.settings.centroid_sigma_px
-    text = f"NEES {nees:.2g} over the sky (3 if true), with a least centroid error of {short(floor_px)} px"
+    rates = attitudes.rates_text(samples.reach.attitudes)
+    text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
 
@@ -388,18 +392,18 @@ def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
 def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
     """V of a star of the Sun's color that is detected in about half of the cases, at the slowest frame.
 
-    A Gaussian of variance s^2 has the least area A above the threshold T if its peak is T exp(A / (2 pi s^2)), see
-    `detection.detected_area_px`.
+    An image of deviation s on a path L has the least area A = pi r^2 + 2 r L above the threshold T if its peak is
+    T exp(r^2 / (2 s^2)), see `detection.detected_area_px`.
     """
     camera = context.camera
+    streak_px = least_streak_px(samples)
+    length_px = float(np.hypot(*streak_px))
     blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
-    peak_e = threshold_e(context) * math.exp(
-        context.settings.min_area_px / (2 * math.pi * blur2_px2)
-    )
+    half_px = length_px / math.pi
+    radius_px = math.sqrt(half_px**2 + context.settings.min_area_px / math.pi) - half_px
+    peak_e = threshold_e(context, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
-    share = peak_share(
-        np.array([blur2_px2]), none, none, np.array([least_streak_px(samples)])
-    )[0]
+    share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
         reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
@@ -418,7 +422,7 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     """
     camera = context.camera
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
-    area_px = width_px * math.hypot(width_px, least_streak_px(samples))
+    area_px = width_px * math.hypot(width_px, *least_streak_px(samples))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
     reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
     return 2.5 * math.log10(
@@ -426,9 +430,9 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     )
 
 
-def least_streak_px(samples: CheckedSamples) -> float:
-    """Length of the images' path at the slowest frame."""
-    lengths_px = [
-        np.median(view.streak_length_px) for view in samples.frames.known if len(view)
+def least_streak_px(samples: CheckedSamples) -> Floats:
+    """(2,) path of the images at the slowest frame."""
+    paths_px = [
+        np.median(view.streak_px, axis=0) for view in samples.frames.known if len(view)
     ]
-    return float(min(lengths_px, default=0.0))
+    return min(paths_px, key=np.linalg.norm, default=STILL_PX)

@@ -456,7 +456,7 @@ def test_findings_of_many_levels_are_summarized(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: Path) -> None:
-    """Levels of other factors are checked at the first number of LEDs, which the finding names."""
+    """A finding names the number of LEDs of each checked point."""
     factors = {
         "leds": {"key": "light.layout.count", "values": [60, 900]},
         "disk": {"levels": {"small": {}, "large": {"light.led.disk_diameter": "10 mm"}}},
@@ -465,7 +465,26 @@ def test_a_finding_names_the_number_of_leds_where_the_study_varies_it(tmp_path: 
         loaded(tmp_path, trial={"kind": "frames"}, factors=factors)
     ).findings
     (wide,) = [one for one in found if "px wide; local treats" in one]
-    assert wide.endswith("[disk = large, 60 LEDs]")
+    assert "disk = large, 60 LEDs" in wide
+
+
+@pytest.mark.slow
+def test_the_corners_of_a_design_are_checked(tmp_path: Path) -> None:
+    """Neither a long exposure at rest nor a fast rate with a short one smears; both together do."""
+    factors = {
+        "exposure": {"key": "exposure.time", "values": ["20 ms", "2 ms", "100 ms"]},
+        "rate": {"key": "trial.rate_deg_s", "values": [0.1, 4, 1]},
+    }
+    keys: dict[str, Any] = {"scene": "shefex2", "set": {}, "trial": {"kind": "frames"}}
+    plan = loaded(tmp_path, factors=factors, **keys)
+    names = [name for name, _ in overview.checked_points(plan)]
+    assert names[:2] == ["first levels", "exposure = 100 ms, rate = 4"]
+    assert len(names) == len(set(names))
+    (smear,) = [
+        line for line in overview.overview(plan).findings if "images move by up to" in line
+    ]
+    assert "exposure = 100 ms, rate = 4" in smear
+    assert "exposure = 2 ms" not in smear
 
 
 @pytest.mark.slow

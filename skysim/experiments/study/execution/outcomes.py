@@ -19,7 +19,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
-from skysim.results.telemetry_report import attitude_error_deg
+from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
@@ -61,6 +61,8 @@ class Outcome:
     pointing_arcsec, pointing_worst_arcsec
         Angle between a flight's attitude and the commanded one, RMS and worst; NaN without a
         maneuver
+    saturated_s
+        Time of a flight during which an actuator of the controller was at its limit
     ambiguous
         Number of frames refused because another attitude fits the lights as well
     misidentified
@@ -118,6 +120,7 @@ class Outcome:
     drift_arcsec: float = math.nan
     pointing_arcsec: float = math.nan
     pointing_worst_arcsec: float = math.nan
+    saturated_s: float = math.nan
     ambiguous: int = 0
     misidentified: float = math.nan
     roll_noise: float = math.nan
@@ -395,6 +398,7 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         rms(error[-quarter:]) - rms(error[:quarter]) if quarter else math.nan,
         rms(pointing),
         float(pointing.max()) if len(pointing) else math.nan,
+        saturated_s(log, settle_s) if len(pointing) else math.nan,
         sum(one.ambiguous for one in outcomes),
         **{
             name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan

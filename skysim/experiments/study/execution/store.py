@@ -35,8 +35,8 @@ from skysim.results.files import row_parts
 from skysim.results.files.row_parts import Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
-FORMAT = 8  # raised when the columns of `trials` or `timings` change
-FORMAT_OF_PARTS = 9  # format of a store with parts, which an earlier skysim would not see
+FORMAT = 10  # raised when the columns of `trials` or `timings` change
+FORMAT_OF_PARTS = 11  # format of a store with parts, which an earlier skysim would not see
 MOST_ROWS = 1_000_000  # maximum number of rows in SQLite; beyond, rows move to parts
 PART_ROWS = 250_000  # rows of a part, about 50 MB in memory
 EVERY = (0, 2**62)  # range of all trials

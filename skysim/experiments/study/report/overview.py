@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,9 +26,9 @@ from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
-RATE = "trial.rate_deg_s"
+Level = tuple[object, dict[str, object]]  # value, settings
 MAX_CHECKED = (
-    8  # maximum number of scenes that are checked: building one takes up to a second
+    16  # maximum number of scenes that are checked: building one takes up to a second
 )
 
 
@@ -135,33 +136,44 @@ def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
-    """The points whose scenes are checked, with their names.
+    """The points whose scenes are checked, with their names; each once.
 
-    They are the point of all first levels, the greatest rate of the trials, and each other level of a factor that
-    changes the scene.
+    They are the point of all first levels, the corners of the design with all factors at their ends first, since a long
+    exposure and a fast rate smear only together, and each other level of a factor that changes the scene.
     """
-    factors = plan.study.factors
-    first = {name: options(factor)[0] for name, factor in factors.items()}
-    yield "first levels", make_point(first)
-    for name, factor in factors.items():
-        rates = [
-            option
-            for option in options(factor)
-            if isinstance(option[1].get(RATE), int | float)
+    levels = {name: options(factor) for name, factor in plan.study.factors.items()}
+    first = {name: one[0] for name, one in levels.items()}
+    corners = itertools.product(*(ends(one) for one in levels.values()))
+    chosen = [
+        first,
+        *reversed([dict(zip(levels, corner, strict=True)) for corner in corners]),
+    ]
+    for name, one in levels.items():
+        chosen += [
+            first | {name: level}
+            for level in one[1:]
+            if any(not key.startswith("trial.") for key in level[1])
         ]
-        fastest = max(rates, key=lambda option: float(str(option[1][RATE])), default=None)
-        if fastest is not None and fastest != first[name]:
-            yield f"{name} = {format_level(fastest[0])}", make_point(first | {name: fastest})
-    for name, factor in factors.items():
-        for value, settings in options(factor)[1:]:
-            if any(not key.startswith("trial.") for key in settings):
-                yield (
-                    f"{name} = {format_level(value)}",
-                    make_point(first | {name: (value, settings)}),
-                )
+    named = {}
+    for point in chosen:
+        changed = [
+            f"{name} = {format_level(level[0])}"
+            for name, level in point.items()
+            if level != first[name]
+        ]
+        named[", ".join(changed) or "first levels"] = make_point(point)
+    yield from named.items()
 
 
-def options(factor: Factor) -> list[tuple[object, dict[str, object]]]:
+def ends(levels: list[Level]) -> list[Level]:
+    """The levels with the least and the greatest number; the first and the last one of levels without numbers."""
+    numbers = [float(found[0]) for value, _ in levels if (found := NUMBER.match(str(value)))]
+    if len(numbers) == len(levels):
+        levels = [levels[n] for n in np.argsort(numbers)]
+    return [levels[0], levels[-1]] if len(levels) > 1 else levels
+
+
+def options(factor: Factor) -> list[Level]:
     """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
