@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.files import header_numbers, write_table
+from skysim.core.files import header_numbers, read_table, write_table
 from skysim.core.types import Floats
 
 
@@ -81,16 +81,9 @@ def read_dome_map(path: Path) -> DomeMap:
     """The dome map in a file that `write_dome_map` wrote. Raises InputError for any other file."""
     import warnings
 
-    from astropy.table import Table
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            table = Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # astropy's parsers raise many types of error
-        raise InputError(
-            path, f"not an ECSV table: {' '.join(str(error).split())[:120]}"
-        ) from None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        table = read_table(path)
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
         fault = f"no column {missing[0]}" if missing else "no LED"
