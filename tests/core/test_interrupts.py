@@ -177,9 +177,11 @@ def test_sigterm_to_a_worker_in_a_kernel_is_no_failed_trial() -> None:
 def test_a_command_that_is_killed_ends_at_once(tmp_path: Path, words: list[str]) -> None:
     command = [sys.executable, "-m", "skysim", *words]
     for n in range(3):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+        folder = tmp_path / str(n)
+        folder.mkdir()
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder)
         until = time.monotonic() + 200
-        while not list(tmp_path.glob("out/*")):
+        while not list(folder.glob("out/*")):
             assert process.poll() is None
             assert time.monotonic() < until
             time.sleep(0.02)
