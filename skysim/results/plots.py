@@ -300,25 +300,6 @@ def draw_label(
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
 
 
-def contact_sheet(
-    images: list[NDArray], captions: list[str], scale: int
-) -> NDArray[np.uint8]:
-    """Frames of one size side by side, enlarged `scale` times and captioned.
-
-    All use the black and white levels of the first frame, so that their brightnesses can be compared.
-    """
-    low = np.percentile(images[0], 30)
-    high = float(np.percentile(images[0], 99.95))
-    tiles = []
-    for image, caption in zip(images, captions, strict=True):
-        gray = to_8bit(image, "square root", levels_dn=(low, high))
-        large = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-        picture = cv2.copyMakeBorder(large, 24, 2, 2, 2, cv2.BORDER_CONSTANT, value=40)
-        draw_label(picture, caption, 6, 16, (255, 255, 255))
-        tiles.append(picture)
-    return np.hstack(tiles)
-
-
 def pixel_positions(xy_px: Floats | None, scale: int) -> list[tuple[int, int]]:
     """Integer pixel positions in an image enlarged `scale` times; empty for None.
 

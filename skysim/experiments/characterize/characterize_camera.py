@@ -99,6 +99,7 @@ def facts(statistics: dict[str, Any]) -> Facts:
             [f"{100 * statistics['linearity_error']:.2g} %, of 5 to 95 % of the saturation"],
         ),
         ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
+        ("drift between flats", [f"{100 * statistics['drift']:.2g} %"]),
     ]
     if night:
         residuals = (
@@ -298,7 +299,7 @@ def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, st
         "principal_point_px": ([rounded(x.value), rounded(y.value)], points),
         "distortion": (
             [rounded(one.value) for one in distortion],
-            f"k1 {comment(distortion[0])}",
+            ", ".join(f"k{n} {comment(one)}" for n, one in enumerate(distortion, start=1)),
         ),
     }
 
@@ -420,6 +421,7 @@ def write_results(
         ],
         "linearity_error": found.linearity_error,
         "flicker": found.transfer.flicker,
+        "drift": found.transfer.drift,
         "misfit": found.transfer.misfit,
         "night": night_statistics(config, night) if night else None,
         "remarks": found.remarks + (night.remarks if night else []),

@@ -115,14 +115,37 @@ def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
     if enough:
         fraction = Estimate.logistic(theta[2], sigma[2])
     else:
-        # Clopper & Pearson's interval.
-        low, high = metrics.exact_bounds(hot, rates.size, metrics.TAILS[1])
-        error = math.sqrt(max(hot, 1)) / rates.size
-        fraction = Estimate(hot / rates.size, error, low, high)
+        fraction = counted(hot, rates.size)
     expected = counts.sum() * probabilities(theta, edges, noise)
     return DarkCurrent(
         values[0], values[1], fraction, values[3] if enough else None, edges, counts, expected
     )
+
+
+def counted(hot: int, pixels: int) -> Estimate:
+    """The fraction of pixels that were counted, with Clopper & Pearson's interval."""
+    low, high = metrics.exact_bounds(hot, pixels, metrics.TAILS[1])
+    return Estimate(hot / pixels, math.sqrt(max(hot, 1)) / pixels, low, high)
+
+
+def hot_tail(
+    rates: Floats, noise: RateNoise, greatest: float
+) -> tuple[Estimate, Estimate | None]:
+    """Fraction of hot pixels and mean H of their excess, without the law of the others: from rates beyond a limit.
+
+    An exponential has no memory: the excess over the limit has the mean H too, and the fraction
+    exp(-(limit - core) / H) of the hot pixels is beyond it. Rates beyond `greatest` count as at least that.
+    """
+    core, _, limit = core_values(rates, noise)
+    hot = rates[rates > limit]
+    below = int(np.count_nonzero(hot < greatest))
+    if below < LEAST_HOT:
+        return counted(hot.size, rates.size), None
+    mean = float(np.sum(np.minimum(hot, greatest) - limit)) / below
+    depth = (limit - core) / mean
+    share = hot.size / rates.size * math.exp(depth)
+    sigma = share * math.sqrt(1 / hot.size + depth**2 / below)
+    return Estimate.lognormal(share, sigma), Estimate.lognormal(mean, mean / math.sqrt(below))
 
 
 def median_and_spread(values: Floats) -> tuple[float, float]:
@@ -198,14 +221,21 @@ def maximize(
     return theta, np.linalg.inv(information)
 
 
-def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
-    """Parameters from moments of the core, and the number of pixels far above it."""
+def core_values(rates: Floats, noise: RateNoise) -> tuple[float, float, float]:
+    """Mean and DSNU of the core from robust moments, and the rate above which pixels are hot."""
     median, spread = median_and_spread(rates)
     core = max(median, 1e-3 * spread, 1e-12)
     own = max(spread**2 - noise.reading - noise.counting * core, (0.02 * spread) ** 2)
     dsnu = min(math.sqrt(own) / core, 2.0)
     width = math.sqrt(math.log1p(dsnu**2))
     limit = max(core * math.exp(HOT_SIGMAS / 1.6 * width), core + HOT_SIGMAS * spread)
+    return core, dsnu, limit
+
+
+def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
+    """Parameters from moments of the core, and the number of pixels far above it."""
+    core, dsnu, limit = core_values(rates, noise)
+    _, spread = median_and_spread(rates)
     hot = rates[rates > limit]
     excess = max(float(hot.mean()) - limit, spread) if hot.size else spread
     share = max(hot.size, 1) / rates.size * math.exp(min((limit - core) / excess, 3.0))

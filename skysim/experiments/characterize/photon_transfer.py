@@ -9,7 +9,9 @@ signal changes it to x (1 - c x). A level's mean and its temporal variance over 
 with the black level o, the read noise r in DN, and 1/12 DN^2 of the converter's rounding (Janesick 2007, Photon
 Transfer, ch. 5; EMVA 1288, release 4.0 Linear, has the law without c). Darks (R = 0) and flats follow one law and
 are fitted at once by weighted least squares, with a rate D for each temperature. Differences between the means of two
-frames that their noise does not explain are the lamp's flicker, which is part of the error of a mean.
+frames that their noise does not explain are the lamp's flicker. The light of a flat's level has an unknown relative
+error, fitted with the flicker, or the greater scatter of the levels about the law, as its prior: a lamp may drift from
+level to level and be steady within a pair.
 
 Only levels up to FIT_RANGE of the saturation are fitted, as EMVA 1288 does for the photon transfer curve. In a
 saturated level the variance collapses: it grows up to the turnover and falls to the read noise beyond it.
@@ -25,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from scipy.optimize import least_squares
+from scipy.optimize import brentq, least_squares
 
 from skysim.core.types import Floats
 from skysim.results.metrics import SIGMAS
@@ -218,7 +220,8 @@ def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArr
 
 ROUNDING_DN2 = 1 / 12  # variance of a rounding error, uniform over one number
 FIT_RANGE = 0.7
-SIGNIFICANT = 2.0  # standard errors above which a flicker is significant
+SIGNIFICANT = 2.0  # standard errors above which flicker and drift are significant
+LEAST_DRIFT = 1e-7
 COLLAPSED = 0.5  # a level beyond the turnover is saturated if its variance is below this fraction of the greatest
 GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the parameters
 
@@ -256,6 +259,8 @@ class Transfer(NamedTuple):
         Chi-square over its degrees of freedom
     points
         The levels that were fitted
+    drift
+        Relative standard deviation of the light from level to level if it exceeds that of the flicker, else 0
     """
 
     values: Floats
@@ -263,6 +268,7 @@ class Transfer(NamedTuple):
     flicker: float
     misfit: float
     points: list[TransferPoint]
+    drift: float = 0.0
 
     @property
     def gain_e_dn(self) -> Estimate:
@@ -300,11 +306,16 @@ def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
     return 2 * signal_dn / (1 + root)
 
 
-def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floats]:
-    """Means and variances of the levels."""
+def model(
+    points: Sequence[TransferPoint], values: Floats, light: Floats | float = 1.0
+) -> tuple[Floats, Floats]:
+    """Means and variances of the levels. `light`: that of each level, relative to the lamp's mean."""
     t_s = np.array([one.exposure_s for one in points])
     lit = np.array([one.lit for one in points])
-    rate = lit * values[LIGHT] + values[FIRST_DARK + np.array([one.dark for one in points])]
+    rate = (
+        lit * light * values[LIGHT]
+        + values[FIRST_DARK + np.array([one.dark for one in points])]
+    )
     x = rate * t_s
     slope = 1 - 2 * values[CURVATURE] * rate * t_s
     mean = values[BLACK] + x - values[CURVATURE] * x**2
@@ -312,19 +323,49 @@ def model(points: Sequence[TransferPoint], values: Floats) -> tuple[Floats, Floa
 
 
 def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
-    """Fit levels of darks and flats with the relative flicker of the lamp from `lamp_flicker`."""
+    """Fit levels of darks and flats with the relative flicker of the lamp from `lamp_flicker`.
+
+    If the flats' means scatter about the law by more than noise and flicker, by SIGNIFICANT sigmas of chi-square, the
+    drift is such that chi-square is the expected one, times the square of the ratio of the normal to Student's 95 %
+    limit: a drift from few levels is uncertain, and the intervals are normal.
+    """
+    # Flicker of the mean of a pair, the fewest frames of a level.
+    steady = flicker / math.sqrt(2)
+    found, excess = fit_levels(points, flicker, steady)
+    # The lamp's rate and the curvature are fitted.
+    freedom = sum(one.lit for one in points) - 2
+    if excess <= freedom + SIGNIFICANT * math.sqrt(2 * freedom):
+        return found
+
+    def too_small(log: float) -> float:
+        return fit_levels(points, flicker, math.exp(log))[1] - expected
+
+    expected = freedom * (SIGMAS_95 / special.stdtrit(freedom, 0.975)) ** 2
+    least = math.log(max(steady, LEAST_DRIFT))
+    if too_small(least) <= 0 or too_small(0.0) >= 0:
+        return found
+    drift = math.exp(brentq(too_small, least, 0.0, xtol=0.01))
+    return fit_levels(points, flicker, drift)[0]._replace(drift=drift)
+
+
+def fit_levels(
+    points: Sequence[TransferPoint], flicker: float, scatter: float
+) -> tuple[Transfer, float]:
+    """The fit with a relative standard deviation of the light of the levels, and chi-square of the flats' means."""
     kept = list(points)
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
     black = min(mean)
     lit = np.array([one.lit for one in kept])
-    # Flicker of the mean of a pair, the fewest frames of a level.
-    mean_sigma = np.hypot(mean_sigma, lit * flicker * (mean - black) / np.sqrt(2))
     start = start_values(kept)
+    size = len(start)
 
     def residuals(values: Floats) -> Floats:
-        expected_mean, expected_variance = model(kept, values)
+        light = np.ones(len(kept))
+        light[lit > 0] += scatter * values[size:]
+        expected_mean, expected_variance = model(kept, values[:size], light)
         return np.concatenate(
             [
+                values[size:],
                 (mean - expected_mean) / mean_sigma,
                 (variance - expected_variance) / variance_sigma,
             ]
@@ -332,12 +373,19 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
 
     scale = np.maximum(np.abs(start), 1e-9)
     scale[CURVATURE] = 0.01 / max(mean.max() - black, 1.0)
+    # The errors of the light are in units of their prior's standard deviation.
+    levels = np.count_nonzero(lit)
+    scale = np.append(scale, np.ones(levels))
+    start = np.append(start, np.zeros(levels))
     found = least_squares(
         lambda p: residuals(p * scale), start / scale, x_scale="jac", method="lm", xtol=1e-12
     )
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(scale, scale)
-    misfit = 2 * found.cost / max(2 * len(kept) - len(start), 1)
-    return Transfer(found.x * scale, covariance, flicker, misfit, kept)
+    misfit = 2 * found.cost / max(2 * len(kept) - size, 1)
+    values = (found.x * scale)[:size]
+    transfer = Transfer(values, covariance[:size, :size], flicker, misfit, kept)
+    light, means = np.split(found.fun[: levels + len(kept)], [levels])
+    return transfer, float(np.sum(light**2) + np.sum(means[lit > 0] ** 2))
 
 
 def start_values(points: Sequence[TransferPoint]) -> Floats:

@@ -101,7 +101,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     found.estimates["gain_e_dn"] = transfer.gain_e_dn
     found.estimates["read_noise_e"] = transfer.read_noise_e
     full_well(found, flat_points)
-    chosen = best_temperature(temperatures, darks, transfer)
+    chosen = best_temperature(temperatures, darks, transfer, own)
     at_it = [one for one in darks if one.temperature_c == temperatures[chosen]]
     first, second = (
         fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
@@ -119,6 +119,11 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     scatter_dn = columns.value * transfer.values[GAIN] / math.sqrt(usable.shape[1])
     black = transfer.offset_dn
     estimates["offset_dn"] = Estimate.normal(black.value, math.hypot(black.sigma, scatter_dn))
+    if transfer.drift:
+        found.remarks.append(
+            f"lamp: the flats scatter by {100 * transfer.drift:.2g} % about the law, more than the frames of a pair"
+            " differ; drift and a nonlinearity of another law look alike; allowed: a steadier lamp, or more flats"
+        )
     error = linearity_error(flat_points, transfer)
     saturation_dn = max(one.moments.mean_dn for one in flat_points)
     return MeasuredSensor(
@@ -175,13 +180,20 @@ def nearest_index(temperatures: Sequence[float | None], temperature_c: float | N
 
 
 def best_temperature(
-    temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer
+    temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer, own: int
 ) -> int:
-    """Index of the temperature at which the dark charge grows most from the shortest to the longest dark frame."""
+    """Index of the temperature at which the dark charge grows most from the shortest to the longest dark frame.
 
-    def signal(index: int) -> float:
+    A dark current within its error has no ratio to another: without any beyond it, `own`, if it has two exposures.
+    """
+    sigma = np.sqrt(np.diag(transfer.covariance))
+
+    def signal(index: int) -> tuple[float, float, float]:
         times = [one.exposure_s for one in darks if one.temperature_c == temperatures[index]]
-        return float(transfer.values[FIRST_DARK + index]) * (max(times) - min(times))
+        span_s = max(times) - min(times)
+        rate = float(transfer.values[FIRST_DARK + index])
+        known = rate if rate > 3 * sigma[FIRST_DARK + index] else 0.0
+        return known * span_s, (index == own) * span_s, span_s
 
     return max(range(len(temperatures)), key=signal)
 
@@ -253,18 +265,27 @@ def dark_parameters(
         float(np.sum(weights**2 * read / counts)),
         float(np.sum(weights**2 * gain * times / counts)),
     )
-    if not fixed_pattern.is_resolved(rates, noise):
-        unresolved(found, own, rates, noise, float(times.max()))
-        return None
     top_dn = max(one.greatest_dn for one in darks)
-    greatest = (0.98 * top_dn - transfer.values[BLACK]) / times.max()
-    dark = fixed_pattern.fit(rates, noise, float(greatest))
+    full_dn = np.array(0.98 * top_dn)
+    greatest = float(transfer.linear_dn(full_dn - transfer.values[BLACK]) / times.max())
+    # A pixel that saturates in the longest dark has a greater rate than the line through its darks.
+    longest = max(darks, key=lambda one: one.exposure_s)
+    rates[longest.mean_dn[steady] >= full_dn] = greatest
     relative = math.sqrt(transfer.covariance[GAIN, GAIN]) / gain
 
     def in_electrons(one: Estimate) -> Estimate:
         value = ratio * one.value / gain
         return Estimate.lognormal(value, value * math.hypot(one.sigma / one.value, relative))
 
+    if not fixed_pattern.is_resolved(rates, noise):
+        unresolved(found, own, rates, noise, float(times.max()))
+        # A few hot pixels change no median.
+        fraction, hot = fixed_pattern.hot_tail(rates, noise, greatest)
+        found.estimates["hot_pixels"] = fraction
+        if hot is not None:
+            found.estimates["hot_e_s"] = in_electrons(hot)
+        return None
+    dark = fixed_pattern.fit(rates, noise, greatest)
     found.estimates["dark_e_s"] = in_electrons(dark.mean)
     found.estimates["dsnu"] = dark.dsnu
     found.estimates["hot_pixels"] = dark.hot_pixels
@@ -290,16 +311,13 @@ def unresolved(
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
         found.estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)
-        found.remarks.append(
-            "hot pixels: all pixels have the same dark current within its noise"
-        )
         return
     noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
     needed = "much longer exposures"
     if value > 3 * sigma:
         needed = f"{longest_s * noise_e_s / value:.2g} s or more"
     found.remarks.append(
-        f"DSNU and hot pixels: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
+        f"DSNU: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
         f" {longest_s:g} s; allowed: darks of {needed}"
     )
 

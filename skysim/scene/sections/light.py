@@ -77,6 +77,14 @@ class SurfaceConfig(ConfigModel):
         )
 
 
+def check_below_apex(rim_height_m: float | None, apex_m: float) -> None:
+    """Raise InputError if a surface's rim is not below its apex."""
+    if rim_height_m is not None and rim_height_m >= apex_m:
+        raise InputError(
+            "rim_height", f"{rim_height_m:g} m is not below the apex", "less than apex"
+        )
+
+
 class RimmedConfig(SurfaceConfig):
     """A surface with a rim at a height above the bearing, or at an angle from its axis seen from the bearing."""
 
@@ -87,14 +95,7 @@ class RimmedConfig(SurfaceConfig):
     def check_rim(self) -> Self:
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
-        if self.rim_height_m is not None and self.rim_height_m >= getattr(
-            self, "apex_m", math.inf
-        ):
-            raise InputError(
-                "rim_height",
-                f"{self.rim_height_m:g} m is not below the apex",
-                "less than apex",
-            )
+        check_below_apex(self.rim_height_m, getattr(self, "apex_m", math.inf))
         return self
 
 
@@ -169,12 +170,7 @@ class CylinderSurfaceConfig(SurfaceConfig):
     def check_extent(self) -> Self:
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
-        if self.rim_height_m is not None and self.rim_height_m >= self.apex_m:
-            raise InputError(
-                "rim_height",
-                f"{self.rim_height_m:g} m is not below the apex",
-                "less than apex",
-            )
+        check_below_apex(self.rim_height_m, self.apex_m)
         return self
 
 

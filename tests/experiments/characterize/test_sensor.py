@@ -64,8 +64,13 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
     )
 
 
-def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> MeasuredSensor:
-    """Darks of three exposures at two temperatures, and flats in pairs, of one simulated chip."""
+def measured(
+    side_px: int, seed: int, darks: int = 8, drift: float = 0.0, **changes: Any
+) -> MeasuredSensor:
+    """Darks of three exposures at two temperatures, and flats in pairs, of one simulated chip.
+
+    The lamp has another power in every pair, by the relative standard deviation `drift`.
+    """
     rng = np.random.default_rng(1000 + seed)
 
     def frames(temperature_c: float, rate_e_s: float, exposure_s: float, count: int) -> Level:
@@ -76,12 +81,17 @@ def measured(side_px: int, seed: int, darks: int = 8, **changes: Any) -> Measure
         shots = (detector.expose(light_e.copy(), exposure_s, made, rng) for _ in range(count))
         return level(exposure_s, temperature_c, shots)
 
-    rate_e_s = float((CHIP | changes)["full_well_e"])
+    lamp = np.random.default_rng(seed)
+    rate_e_s = float((CHIP | changes)["full_well_e"]) * (1 + drift * lamp.normal(size=99))
     dark_levels = [
         frames(at_c, 0.0, t_s, darks) for at_c in (20.0, 30.0) for t_s in (0.1, 5.0, 20.0)
     ]
     return sensor_fit.characterize(
-        dark_levels, [frames(20.0, rate_e_s, t_s, 2) for t_s in FLAT_S]
+        dark_levels,
+        [
+            frames(20.0, float(rate), t_s, 2)
+            for rate, t_s in zip(rate_e_s, FLAT_S, strict=False)
+        ],
     )
 
 
@@ -251,6 +261,37 @@ def test_a_dark_current_below_the_noise_is_not_resolved() -> None:
     noise = RateNoise(4.0, 0.01)
     assert not fixed_pattern.is_resolved(rng.normal(0.3, 2.0, 50_000), noise)
     assert fixed_pattern.is_resolved(drawn_rates(rng, 50_000, noise), noise)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dark_e_s", [5.0, 5e-4], ids=["equal", "none"])
+def test_hot_pixels_beside_equal_dark_currents_are_measured(dark_e_s: float) -> None:
+    """They change no median, neither of currents without scatter nor of a cold chip without current."""
+    drawn = 200
+    found = measured(
+        256, 3, dsnu=0.0, hot_pixels=drawn / 256**2, hot_e_s=558.0, dark_e_s=dark_e_s
+    )
+    for key, truth in (("hot_pixels", drawn / 256**2), ("hot_e_s", 558.0)):
+        one = found.estimates[key]
+        assert one.value == pytest.approx(truth, abs=3 * one.sigma)
+        assert one.sigma < 0.2 * truth
+    assert not any("hot" in remark for remark in found.remarks)
+    none = measured(128, 3, dsnu=0.0, hot_pixels=0.0, dark_e_s=dark_e_s).estimates
+    assert none["hot_pixels"].value == 0
+    assert none["hot_pixels"].high == pytest.approx(-np.log(0.025) / 128**2, rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_drifting_lamp_widens_the_interval_of_the_nonlinearity() -> None:
+    """Over twelve chips: a drift of 0.2 % between levels, unseen by pairs, is found; the intervals cover the truth."""
+    found = [measured(128, seed, drift=0.002) for seed in range(12)]
+    intervals = [one.estimates["nonlinearity"] for one in found]
+    # 95 % of twelve: fewer than nine by chance in 0.02 % of the cases.
+    assert sum(one.low < 0.03 < one.high for one in intervals) >= 9
+    assert np.median([one.transfer.drift for one in found]) == pytest.approx(0.002, rel=0.5)
+    assert all("lamp" in one.remarks[-1] for one in found if one.transfer.drift)
+    steady = [measured(128, seed) for seed in range(12)]
+    assert sum(one.transfer.drift > 0 for one in steady) <= 3
 
 
 def test_uneven_illumination_is_not_counted_as_prnu() -> None:

@@ -223,11 +223,16 @@ def characterize(
         ),
     ],
     darks: Annotated[
-        Path | None, typer.Option(help="Folder of darks, of two exposures or more.")
+        Path | None,
+        typer.Option(
+            help="Folder of darks, of two exposures or more; required without --frames-to."
+        ),
     ] = None,
     flats: Annotated[
         Path | None,
-        typer.Option(help="Folder of flats: pairs at exposures up to saturation."),
+        typer.Option(
+            help="Folder of flats: pairs at exposures up to saturation; required without --frames-to."
+        ),
     ] = None,
     night: Annotated[
         Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
