@@ -340,7 +340,7 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     def too_small(log: float) -> float:
         return fit_levels(points, flicker, math.exp(log))[1] - expected
 
-    expected = freedom * (SIGMAS_95 / special.stdtrit(freedom, 0.975)) ** 2
+    expected = freedom * (metrics.SIGMAS / special.stdtrit(freedom, metrics.TAILS[1])) ** 2
     least = math.log(max(steady, LEAST_DRIFT))
     if too_small(least) <= 0 or too_small(0.0) >= 0:
         return found
