@@ -30,7 +30,7 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.types import Floats
-from skysim.results.metrics import SIGMAS
+from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
 
@@ -340,7 +340,7 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     def too_small(log: float) -> float:
         return fit_levels(points, flicker, math.exp(log))[1] - expected
 
-    expected = freedom * (metrics.SIGMAS / special.stdtrit(freedom, metrics.TAILS[1])) ** 2
+    expected = freedom * (SIGMAS / special.stdtrit(freedom, TAILS[1])) ** 2
     least = math.log(max(steady, LEAST_DRIFT))
     if too_small(least) <= 0 or too_small(0.0) >= 0:
         return found
