@@ -207,6 +207,7 @@ def flown(
         "model": "vehicles/simsat.xml",
         "mount": "free",
         "inertia": ["6 kg m2", "6.5 kg m2", "9 kg m2"],
+        "center_of_mass": ["0 m", "0 m", "0 m"],
     }
     vehicle = multibody.build(VehicleConfig.model_validate(given | parts))
     flight = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), 1.0)

@@ -171,6 +171,14 @@ class FlightComputer:
             stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
         return stored
 
+    def relative_loads(self, control: Floats, inputs: ControlInput) -> Floats:
+        """(n,) commands of the motors over their limits; of wheels the speeds over theirs, if these are closer."""
+        loads = np.abs(control[self.motors]) / self.limit
+        if isinstance(self.actuator, WheelActuator):
+            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
+            loads = np.maximum(loads, np.abs(speeds) / self.actuator.model.speed_limit_rad_s)
+        return np.asarray(loads)
+
     def compute_controls(
         self,
         inputs: ControlInput,
@@ -209,11 +217,8 @@ class FlightComputer:
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         self.achieved_nm = achieved_nm + dump_nm
-        self.loads = np.abs(control[self.motors]) / self.limit
-        if isinstance(self.actuator, WheelActuator):
-            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
-            speed_loads = np.abs(speeds) / self.actuator.model.speed_limit_rad_s
-            self.loads = np.maximum(self.loads, speed_loads)
+        if self.names:
+            self.loads = self.relative_loads(control, inputs)
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

@@ -19,7 +19,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
-from skysim.core import interrupts
+from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.core.plugins import ProgramError, describe_error, host_command
 from skysim.core.types import Floats, Frame
@@ -165,7 +165,7 @@ class FunctionTracker:
         try:
             answer = check_answer(to_answer(self.function(np.array(frame.image_dn))))
         except Exception as error:
-            interrupts.raise_wrapped(error)
+            errors.raise_wrapped(error)
             return Report(Attitude(f"{FAILED}{describe_error(error)}"), Centroids.empty())
         report = to_report(answer)
         report.seconds.setdefault("solve", time.perf_counter() - begin_s)

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from skysim.core import interrupts
+from skysim.core import errors
 from skysim.experiments.study.execution import engines, store, trials
 from skysim.experiments.study.plan import TrialSpec
 
@@ -24,7 +24,7 @@ DRIVER = """
 import os, signal, sys, threading
 from typing import NamedTuple
 import numba
-from skysim.core import interrupts
+from skysim.core import errors
 from skysim.experiments.study.execution import engines, trials
 from skysim.experiments.study.plan import TrialSpec
 
@@ -46,7 +46,7 @@ kernel(1)
 trials.TRIALS["centroids"] = trial
 job = trials.TrialJob(TrialSpec("shefex2", ".", 1, {}, {"kind": "centroids"}, True))
 trials.prepared_setup(job.spec, {})
-interrupts.handle_signals()
+errors.handle_signals()
 seen = []
 for n in range(10):
     chunks = iter([(trials.Segment(0, {}, 0, range(1)),), ()])
@@ -69,7 +69,7 @@ def lost(handler: Callable[[], object]) -> None:
 
 def handle() -> None:
     """Run the handler as Python does for a signal that arrives here."""
-    interrupts.interrupt(signal.SIGTERM, sys._getframe())
+    errors.interrupt(signal.SIGTERM, sys._getframe())
 
 
 class Finalized:

@@ -231,7 +231,6 @@ def images(
         rms_px,
         streak,
         zero,
-        np.zeros((1, 2)),
         row,
     )
 

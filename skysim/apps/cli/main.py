@@ -26,7 +26,7 @@ from skysim.apps.cli.commands.validate import check, validate
 from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
-from skysim.core import __version__, errors, interrupts
+from skysim.core import __version__, errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
@@ -103,7 +103,7 @@ def main() -> None:
     # Importing creates a hundred thousand objects; their collection takes 5 % of the time of a short command.
     gc.set_threshold(50_000)
     # Clean up after SIGTERM as after Ctrl-C.
-    interrupts.handle_signals()
+    errors.handle_signals()
     try:
         code = app(standalone_mode=False)
     except InputError as error:

@@ -239,6 +239,7 @@ OPTIONS = {  # the option of each function parameter, by the parameter's key in 
     "characterize.flats": "--flats",
     "characterize.night": "--night",
     "solve.fov_deg": "--fov",
+    "solve.near_deg": "--near",
     "solve.time_utc": "--time",
     "solve.catalog": "--catalog",
     "solve.detector": "--detector",

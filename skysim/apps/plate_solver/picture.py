@@ -267,7 +267,7 @@ def solve_list(path: Path, solver: Solver) -> SolvedReading:
         raise InputError(
             path,
             "a list of lights of a picture of unknown size",
-            "--size 1024x768, or --camera",
+            "a size in pixels, or a camera",
         )
     centroids = read_lights(path)
     begin = Clock()

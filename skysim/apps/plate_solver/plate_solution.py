@@ -216,7 +216,9 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
     dates = [one["date_utc"] for one in results]
     if rate_hz is None and None in dates:
         raise InputError(
-            results[dates.index(None)]["file"], "no date", "DATE-OBS, or --rate HZ"
+            results[dates.index(None)]["file"],
+            "no date",
+            "DATE-OBS in its header, or a frame rate",
         )
     last: dict[str, Any] | None = None
     for n, one in enumerate(results):

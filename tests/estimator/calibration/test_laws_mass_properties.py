@@ -162,13 +162,17 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
 
 
 @law(
-    mass_properties.considered, BearingRecord.noise_rad2, BearingRecord.with_noise, slow=True
+    mass_properties.considered,
+    BearingRecord.noise_rad2,
+    BearingRecord.varying_rad2,
+    BearingRecord.with_noise,
+    slow=True,
 )
 @given(rng=SEEDS, at=some.integers(2, 24))
 def test_consider_covariance_is_the_effect_of_attitude_errors(
     rng: np.random.Generator, at: int
 ) -> None:
-    """The covariance e e^T of one attitude adds d d^T, with d the change of the estimate by the error e.
+    """The covariance e e^T of a constant error adds d d^T, with d the change of the estimate by the error e.
 
     To 12 %, at errors of any size: Gauss and Newton leave out the curvature times the residuals.
     """
@@ -180,7 +184,9 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
         RECORD,
         covariance_rad2=RECORD.covariance_rad2 + systematic,
         systematic_rad2=systematic,
+        constant_rad2=systematic,
     )
+    np.testing.assert_allclose(shared.varying_rad2, RECORD.covariance_rad2, rtol=1e-12)
     np.testing.assert_allclose(shared.noise_rad2, RECORD.covariance_rad2, rtol=1e-12)
     np.testing.assert_allclose(
         shared.with_noise(3.0).noise_rad2, 3 * shared.noise_rad2, rtol=1e-12
@@ -198,6 +204,16 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
     np.testing.assert_allclose(
         added, np.outer(change, change), rtol=0.05, atol=0.12 * change @ change
     )
+
+
+@law(mass_properties.symmetric_root)
+@given(rng=SEEDS)
+def test_the_square_of_a_symmetric_root_is_the_matrix(rng: np.random.Generator) -> None:
+    half = rng.standard_normal((4, 3, 2))  # of rank 2
+    matrix = half @ half.transpose(0, 2, 1)
+    root = mass_properties.symmetric_root(matrix)
+    np.testing.assert_allclose(root @ root, matrix, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(root, root.transpose(0, 2, 1), rtol=0, atol=1e-12)
 
 
 @law(

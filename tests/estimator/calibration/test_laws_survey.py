@@ -223,7 +223,7 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     assert dome_survey.redundancy(alone, covariances) == 2 * rows - (len(pixels) - 4)
 
 
-@law(bundle_covariance.common_errors, Camera.with_lens, ba.free_lens)
+@law(bundle_covariance.common_errors, Camera.with_lens, Camera.lens, ba.free_lens)
 @given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), fits=some.booleans())
 def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_share(
     rng: np.random.Generator, list_m: float, fits: bool

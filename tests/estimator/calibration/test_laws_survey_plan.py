@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import (
@@ -149,6 +150,21 @@ def test_an_led_far_from_the_list_is_displaced(
     assert 0.5 * size < sigma < 1.6 * size
     none = survey_faults.displaced(listed, found, np.full((60, 3, 3), np.nan))
     assert (len(none[0]), none[1]) == (0, 0.0)
+
+
+@law(survey_faults.found_displacements_m)
+@given(size=some.floats(1e-5, 1e-1), ratio=some.floats(0.1, 10), count=some.integers(3, 2000))
+def test_a_displacement_that_is_found_exceeds_the_limit_in_95_percent_of_surveys(
+    size: float, ratio: float, count: int
+) -> None:
+    """The test value of a displaced LED is noncentral chi-square of three degrees."""
+    covariance = np.tile(np.eye(3) * size**2, (count + 2, 1, 1))
+    covariance[:2] = np.nan
+    found_m = survey_faults.found_displacements_m(covariance, ratio * size)
+    assert found_m.shape == (count,)
+    limit = stats.chi2.isf(survey_faults.FALSE_ALARMS / count, 3)
+    shift2 = found_m[0] ** 2 / (size**2 * (1 + ratio**2))
+    assert 0.945 < stats.ncx2.sf(limit, 3, shift2) < 0.98
 
 
 @law(survey_faults.stray_lights)

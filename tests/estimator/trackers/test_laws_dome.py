@@ -45,12 +45,37 @@ OVAL = LedMap(
     np.arange(0), np.empty((0, 3)), np.array([0, 0, 0.4]), np.array([1.0, 1.0, 0.8])
 )
 RAYS = arrays("f8", (5, 3), elements=ANY)
+UP = np.array([[0.1, -0.2, 1.0], [0.0, 0.0, 1.0], [-0.1, 0.1, 1.0]])
 
 
 def lever(rng: np.random.Generator) -> Lever:
     """A random lever of up to 0.35 m, nearly upward, with the camera nearly aligned to the body."""
     along = np.array([0.0, 0.0, rng.uniform(0.1, 0.35)]) + rng.normal(0, 0.01, 3)
     return Lever(along, turn(rng, 0.05))
+
+
+@law(dome_map.common_shifts_m, dome_map.common_images_px)
+@given(rng=SEEDS)
+def test_common_errors_move_all_lights_and_the_lens(rng: np.random.Generator) -> None:
+    """A light's shift from the pupil is that of its place less that of the pupil; the lens has the changed numbers."""
+    place_m = rng.normal([0, 0, 1.2], 0.1, (6, 3))
+    common_m = 1e-3 * rng.standard_normal((2, 6, 3))
+    change = rng.standard_normal((2, 11)) * [*[1e-3] * 3, 2.0, 1.0, 1.0, *[1e-3] * 5]
+    leds = replace(SPHERE, position_m=place_m, common_m=common_m, common_camera=change)
+    arm = lever(rng)
+    body_from_lab = turn(rng)
+    star = rng.permutation(6)[:4]
+    cam_from_lab = arm.cam_from_body * body_from_lab
+    shifts_m = dome_map.common_shifts_m(leds, star, arm, cam_from_lab)
+    images_px = dome_map.common_images_px(leds, CAMERA, UP)
+    for n in range(2):
+        in_body = body_from_lab.apply(place_m + common_m[n]) - arm.camera_body_m
+        moved = arm.cam_from_body.apply(in_body - change[n, :3])
+        still = arm.cam_from_body.apply(body_from_lab.apply(place_m) - arm.camera_body_m)
+        np.testing.assert_allclose(shifts_m[n], (moved - still)[star], rtol=0, atol=1e-12)
+        focal_px, x, y = [900.0, 319.5, 239.5] + change[n, 3:6]
+        lens = Camera(640, 480, focal_px, (x, y), tuple(change[n, 6:]))
+        np.testing.assert_allclose(images_px[n], lens.pixels(UP), rtol=0, atol=1e-9)
 
 
 def seen_through(

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 import yaml
 
-from skysim.core import interrupts
+from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution import store
@@ -184,7 +184,7 @@ def histogram(error_arcsec: Any) -> tuple[tuple[float, ...], tuple[int, ...]]:
 
 def run_and_report(study: Path, folder: Path) -> None:
     """Body of the process: run a study's missing trials and write its report. SIGTERM ends it as Ctrl-C does."""
-    interrupts.handle_signals()
+    errors.handle_signals()
     try:
         run_study(study, out=folder, workers=1).report().save(folder / "report.html")
     except InputError as error:

@@ -23,7 +23,7 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera.detector import AddedCharge
-from skysim.core import interrupts, quaternion
+from skysim.core import errors, quaternion
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
@@ -188,7 +188,7 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
         start_s = time.perf_counter()
         outcomes = TRIALS[setup.trial.kind](setup, seeds)
     except Exception as raised:
-        interrupts.raise_wrapped(raised)
+        errors.raise_wrapped(raised)
         if len(seeds) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
         if isinstance(raised, InputError):
