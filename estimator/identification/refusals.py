@@ -11,7 +11,13 @@ OWN_RULE = ("saa", "shefex", "master_star", "fialho_1", "fialho_2", "fialho_3", 
 CROWDED = 1.5  # lights per catalog star in a field from which the lights are too many
 
 
-def advice(identifier: str, lights: int, acceptance: str, in_field: float = inf) -> str:
+def advice(
+    identifier: str,
+    lights: int,
+    acceptance: str,
+    in_field: float = inf,
+    cos_error: float | None = None,
+) -> str:
     """The setting that would help a published identifier that has refused a field.
 
     The text depends on the frame only by its case, so that equal refusals are counted together.
@@ -26,6 +32,8 @@ def advice(identifier: str, lights: int, acceptance: str, in_field: float = inf)
         See `solver_options.Options`
     in_field
         Mean number of its catalog's stars in a field; infinite if unknown
+    cos_error
+        The tolerance that is set for `shefex`, which then takes no other; None if none is
     """
     if lights < MIN_MATCHES:
         return (
@@ -39,6 +47,7 @@ def advice(identifier: str, lights: int, acceptance: str, in_field: float = inf)
         )
     if identifier == "fialho_1":
         return "its lists of the whole catalog are too long; set identifier to fialho_2"
+    wider = "centroid_sigma_px" if cos_error is None else "cos_error"
     if acceptance == "evidence" and identifier in OWN_RULE:
-        return "set acceptance to thesis for the paper's rule, without this test, or raise centroid_sigma_px"
-    return "raise centroid_sigma_px, or set another identifier"
+        return f"set acceptance to thesis for the paper's rule, without this test, or raise {wider}"
+    return f"raise {wider}, or set another identifier"

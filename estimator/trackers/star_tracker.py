@@ -405,7 +405,9 @@ class StarTracker:
         settings = self.settings
         lights = len(brightest(centroids, settings))
         in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
-        why = advice(settings.identifier, lights, settings.acceptance, in_field)
+        why = advice(
+            settings.identifier, lights, settings.acceptance, in_field, settings.cos_error
+        )
         return Attitude(f"{NO_MATCH}: {why}")
 
     def _candidates(

@@ -29,12 +29,14 @@ LIMIT_MAG = "limit_mag"  # of the scene's tracker, whose catalog it shortens
     lights=some.integers(0, 60),
     acceptance=some.sampled_from(["evidence", "thesis"]),
     in_field=some.floats(0.1, 100),
+    cos_error=some.none() | some.floats(1e-6, 1e-3),
 )
 @law(advice)
 def test_every_refusal_names_a_setting(
-    identifier: str, lights: int, acceptance: str, in_field: float
+    identifier: str, lights: int, acceptance: str, in_field: float, cos_error: float | None
 ) -> None:
-    text = advice(identifier, lights, acceptance, in_field)
+    text = advice(identifier, lights, acceptance, in_field, cos_error)
+    assert cos_error is None or "centroid_sigma_px" not in text
     assert any(name in text for name in (*Settings.__slots__, "brightest", LIMIT_MAG))
     assert ("acceptance" not in text) or identifier in OWN_RULE
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Build, inspect and select star catalogs; prepare on-board ones.",
+    help="Build, inspect, select and convert star catalogs.",
 )
 Source = Annotated[
     str, typer.Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")
