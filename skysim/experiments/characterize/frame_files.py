@@ -63,19 +63,10 @@ class Stack:
 
 def image_files(folder: Path) -> list[Path]:
     """The images of a folder and its subfolders by name; FITS if one name has several formats. Raises InputError."""
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of images")
-    best: dict[Path, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
-            stem = path.with_name(path.name[: -len(suffix)])
-            best[stem] = min(
-                best.get(stem, path), path, key=lambda one: not images.is_fits(one)
-            )
-    found = list(best.values())
+    found = images.best_images(folder, lambda path: not images.is_fits(path), recursive=True)
     if not found:
         raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
-    return found
+    return list(found.values())
 
 
 def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
@@ -175,9 +166,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     stack = Stack(folder)
     shift = None
     for path, setting, frame in read_frames(folder):
-        if frame.shape != shape:
-            size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
-            raise InputError(path, size, f"{shape[1]} x {shape[0]}, as the camera has them")
+        images.check_size(path, frame, shape)
         shift = padding_bits(frame, bits) if shift is None else shift
         numbers = np.right_shift(frame, np.uint16(shift))
         if numbers.max() >= 2**bits:

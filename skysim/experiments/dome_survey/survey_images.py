@@ -60,21 +60,12 @@ def image_files(folder: Path) -> list[Path]:
 
 def best_images(folder: Path) -> list[Path]:
     """The images of a folder by name; of one stem, that of the first of FORMATS. Raises InputError for no folder."""
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of images")
-    best: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+
+    def rank(path: Path) -> int:
         suffix = images.image_suffix(path.name)
-        if suffix and not path.name.startswith("."):
-            stem = path.name[: -len(suffix)]
-            if stem not in best or rank(suffix) < rank(images.image_suffix(best[stem].name)):
-                best[stem] = path
-    return [best[stem] for stem in sorted(best)]
+        return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
 
-
-def rank(suffix: str) -> int:
-    """Rank of an image format among images of one name."""
-    return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
+    return [path for _, path in sorted(images.best_images(folder, rank).items())]
 
 
 def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[SurveyImage]:
@@ -99,12 +90,7 @@ def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
 def pixels_of(path: Path, camera: Camera) -> NDArray:
     """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
     pixels = images.monochrome(images.read_image(path))
-    if pixels.shape != (camera.height_px, camera.width_px):
-        raise InputError(
-            path,
-            f"{pixels.shape[1]} x {pixels.shape[0]} pixels",
-            f"{camera.width_px} x {camera.height_px}, as the camera has them",
-        )
+    images.check_size(path, pixels, (camera.height_px, camera.width_px))
     return pixels
 
 
