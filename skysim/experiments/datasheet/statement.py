@@ -11,7 +11,7 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts, Limit
+from skysim.experiments.datasheet.performance import Counts
 from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -164,18 +164,15 @@ def limits(statement: Statement) -> dict[str, Any]:
         "acquisition": (statement.rates, statement.accelerations),
         "tracking": (statement.tracked_rates, statement.tracked_accelerations),
     }
-    return as_numbers(
-        {
-            mode: {
-                key: performance.bracket(rows, key)
-                for key, rows in zip(
-                    ("rate_deg_s", "acceleration_deg_s2"), tables, strict=True
-                )
-            }
-            for mode, tables in measured.items()
-            if tables[0]
+    found = {
+        mode: {
+            key: performance.bracket(rows, key)
+            for key, rows in zip(UNITS, tables, strict=True)
         }
-    )
+        for mode, tables in measured.items()
+        if tables[0]
+    }
+    return as_numbers(found)
 
 
 # As sections.
@@ -416,22 +413,26 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
 
 
 def pair_cells(row: dict[str, Any]) -> list[str]:
-    """Cells of a pair of frames: noise-equivalent angle and error, and the normalized error squared."""
+    """Cells of a pair of frames: noise-equivalent angle and error, the normalized error squared, and outcomes."""
     errors = [
         arcsec(row[f"{kind}_{name}"])
         for name in variance_components.GROUPS
         for kind in ("nea", "rms")
     ]
-    return [*errors, bounded(row["nees"])]
+    return [*errors, bounded(row["nees"]), *outcome_cells(row)]
 
 
-PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
 OUTCOME_HEADERS = ["right %", "refused", "false"]
 FIELD_HEADERS = ["both right %", "one refused", "one false"]
+PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
+PAIR_HEADERS += FIELD_HEADERS
+UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²"}
 
 
-def bracket_text(what: str, limit: Limit, unit: str) -> str:
+def bracket_text(what: str, rows: list[dict[str, Any]], key: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
+    limit = performance.bracket(rows, key)
+    unit = UNITS[key]
     needed = metrics.trials_needed(1 - limit.share)
     if limit.fields < needed:
         return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
@@ -452,20 +453,13 @@ def rate_section(statement: Statement) -> StatementSection:
         " Shares are of attitudes that are right in both frames."
         f" {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known beyond"
         f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
-        bracket_text(
-            "acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"
-        ),
+        bracket_text("acquisition in rate", statement.rates, "rate_deg_s"),
     ]
     rows = [
-        [
-            f"{row['rate_deg_s']:g}",
-            f"{row['streak_px']:.2g}",
-            *pair_cells(row),
-            *outcome_cells(row),
-        ]
+        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row)]
         for row in statement.rates
     ]
-    headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
+    headers = ["rate °/s", "streak px", *PAIR_HEADERS]
     return StatementSection("By rate", texts, headers, rows, ["rates"])
 
 
@@ -486,9 +480,7 @@ def acceleration_section(statement: Statement) -> StatementSection:
         f" ({ONE_UNIT}). Errors are relative to the mean attitude over the exposure, which is a T² / 24 from that at"
         " mid-exposure.",
         bracket_text(
-            "acquisition in acceleration",
-            performance.bracket(statement.accelerations, "acceleration_deg_s2"),
-            "°/s²",
+            "acquisition in acceleration", statement.accelerations, "acceleration_deg_s2"
         ),
     ]
     rows = [
@@ -520,24 +512,17 @@ def tracking_section(statement: Statement) -> StatementSection:
         " same motion, without a gyro: stars are detected in windows of 8 pixels around their predicted places. A frame"
         " that only the lost-in-space search would solve counts as refused. The prediction extrapolates the rate"
         " between the last two frames, so an acceleration a misses by a t².",
-        bracket_text("tracking in rate", performance.bracket(rates, "rate_deg_s"), "°/s"),
-        bracket_text(
-            "tracking in acceleration",
-            performance.bracket(accelerations, "acceleration_deg_s2"),
-            "°/s²",
-        ),
+        bracket_text("tracking in rate", rates, "rate_deg_s"),
+        bracket_text("tracking in acceleration", accelerations, "acceleration_deg_s2"),
     ]
-    rows = [
-        [f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates
-    ]
+    rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row)] for row in rates]
     rows += [
-        ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
-        for row in accelerations
+        ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row)] for row in accelerations
     ]
     return StatementSection(
         "In tracking mode",
         texts,
-        ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS],
+        ["rate °/s", "acceleration °/s²", *PAIR_HEADERS],
         rows,
     )
 
@@ -553,14 +538,13 @@ def magnitude_section(statement: Statement) -> StatementSection:
         [
             f"{row['limit_mag']:g}{' (of the scene)' * (row['limit_mag'] == own)}",
             *pair_cells(row),
-            *outcome_cells(row),
         ]
         for row in statement.magnitudes
     ]
     return StatementSection(
         "By magnitude limit",
         texts,
-        ["limit V", *PAIR_HEADERS, *FIELD_HEADERS],
+        ["limit V", *PAIR_HEADERS],
         rows,
         ["magnitudes"],
     )
