@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
 from skysim.core import files
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
 from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
 from skysim.results.plots import bgr_image
@@ -34,9 +34,7 @@ INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
 
 
-def statistics(
-    scene: str, plan: BalancePlan, iterations: Sequence[Iteration]
-) -> dict[str, Any]:
+def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> Record:
     """All numbers of a balance, SI except where a unit is in the name."""
     last = iterations[-1]
     return {
@@ -51,7 +49,7 @@ def statistics(
     }
 
 
-def flight_row(number: int, one: Iteration) -> dict[str, Any]:
+def flight_row(number: int, one: Iteration) -> Record:
     """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
     trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
@@ -84,7 +82,7 @@ def true_values(flight: BalanceFlight) -> Floats:
     return np.concatenate([inertia_six(inertia), moment])
 
 
-def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[str, Any]]:
+def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[Record]:
     """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
     scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
     names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
@@ -143,12 +141,12 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
         axes.legend(fontsize="small")
 
 
-def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
+def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
     """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
 
 
-def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
+def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
     """The report of a balance with the picture of `balance_figure` as PNG bytes."""
     blocks = [
         verdict(statistics),
@@ -179,7 +177,7 @@ FLIGHTS = (
 )
 
 
-def verdict(statistics: dict[str, Any]) -> Verdict:
+def verdict(statistics: Record) -> Verdict:
     """Whether the vehicle is balanced, with the torque and its bound."""
     flights = statistics["flights"]
     last = flights[-1]
@@ -193,7 +191,7 @@ def verdict(statistics: dict[str, Any]) -> Verdict:
     )
 
 
-def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
+def flight_table(flights: Sequence[Record]) -> Table:
     """One row per flight."""
     columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
     columns += [
@@ -213,13 +211,13 @@ def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
     return Table(columns, rows)
 
 
-def offset_text(flight: dict[str, Any]) -> str:
+def offset_text(flight: Record) -> str:
     """The center of mass with its standard deviations."""
     found = zip(flight["offset_um"], flight["offset_sigma_um"], strict=True)
     return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
 
 
-def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
+def mass_blocks(rows: Sequence[Record]) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's."""
     heads = ("estimate", "1σ", "simulated vehicle")
     columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
@@ -235,7 +233,7 @@ def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
 
 
 def write_all(
-    folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str
+    folder: Path, statistics: Record, iterations: Sequence[Iteration], command: str
 ) -> Report:
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
 from skysim.core.random_streams import random_stream
+from skysim.core.types import Record
 from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
 from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
@@ -48,7 +49,7 @@ from skysim.experiments.study.plan import (
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # sections of a file of variations
 # The factors if there are no variations.
-AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}
+AS_IT_IS: Record = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
@@ -95,7 +96,7 @@ class DatasetPlan:
         """The seed of a frame's attitude and noise."""
         return seed_of(self.spec, 0, frame)
 
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> Record:
         """The description of the dataset for `dataset.json`."""
         spec = self.spec
         return {
@@ -265,7 +266,7 @@ class ShardQueue:
 
 def labelled_frames(
     plan: DatasetPlan, shard: int
-) -> Iterator[tuple[int, dict[str, Any], TrialSetup, LabelledFrame]]:
+) -> Iterator[tuple[int, Record, TrialSetup, LabelledFrame]]:
     """The frames of a shard: number, level of each factor, lab, frame with labels."""
     known = None  # settings of the previous frame
     for frame in plan.frames_of(shard):
@@ -282,7 +283,7 @@ def labelled_frames(
 def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     """Render a shard's frames and write all of its files, the index last."""
     frames = plan.frames_of(shard)
-    rows = list[dict[str, Any]]()
+    rows = list[Record]()
     sources = []
     images = []
     coco = []
@@ -360,7 +361,7 @@ def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
     )
 
 
-def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
+def check_manifest(storage: Storage, own: Record) -> None:
     """Raise InputError if the existing dataset is another one, or of another version."""
     try:
         stored = json.loads(storage.read_text(MANIFEST))

@@ -45,7 +45,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -354,7 +354,7 @@ def quest_attitude(body_m: Floats, lab_m: Floats) -> Rotation:
 # Numbers and pages.
 
 
-def statistics(found: Calibration) -> dict[str, Any]:
+def statistics(found: Calibration) -> Record:
     """The numbers of `skysim calibrate --json`: LEDs by their brightness, pairs by their angle, stops in order."""
     order = np.argsort(-found.magnitude.mean(axis=0), kind="stable")
     ranked = -np.sort(-found.magnitude, axis=1)
@@ -413,7 +413,7 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     }
 
 
-def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
+def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
     return {
         "mean": float(values.mean()),
@@ -429,7 +429,7 @@ def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
 
 
 def calibration_report(
-    title: str, command: str, found: Calibration, numbers: dict[str, Any]
+    title: str, command: str, found: Calibration, numbers: Record
 ) -> Report:
     """The report of `statistics`: histograms as in the thesis's appendix A, the tables, and the epsilons."""
     epsilon = numbers["epsilon"]
@@ -485,9 +485,7 @@ def calibration_report(
     return Report(title, [Verdict(text), *figures, *sections], command)
 
 
-def spread_table(
-    keys: Iterable[int], name: str, value: Column, rows: list[dict[str, Any]]
-) -> Table:
+def spread_table(keys: Iterable[int], name: str, value: Column, rows: list[Record]) -> Table:
     """Mean and deviation of the rows of `statistics`, over all frames, and the mean at each stop."""
     stops = max((len(one["stops"]) for one in rows), default=0)
     columns = [Column(name), value, value._replace(title="deviation", format=".2f")]
@@ -500,7 +498,7 @@ def spread_table(
 
 def write_results(
     folder: Path, known: Assumed, found: Calibration, command: str
-) -> tuple[dict[str, Any], Report]:
+) -> tuple[Record, Report]:
     """Write the report, and the catalog as a map for `tracker.map`; return what `--json` prints, and the report."""
     numbers = statistics(found)
     made = calibration_report(f"Calibration of {known.scene.name}", command, found, numbers)

@@ -11,6 +11,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
+from skysim.core.types import Record
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.frame_files import read_stack
@@ -45,7 +46,7 @@ from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 
 
 def characterize_report(
-    statistics: dict[str, Any],
+    statistics: Record,
     config: CameraConfig,
     found: MeasuredSensor,
     night: Night | None,
@@ -76,7 +77,7 @@ def characterize_report(
     return Report(f"{statistics['camera']}, measured", blocks)
 
 
-def verdict(statistics: dict[str, Any], values: int) -> Verdict:
+def verdict(statistics: Record, values: int) -> Verdict:
     """How many values are known, and how well the law of photon transfer holds."""
     unknown = len(statistics["remarks"])
     misfit = statistics["misfit"]
@@ -84,7 +85,7 @@ def verdict(statistics: dict[str, Any], values: int) -> Verdict:
     return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
 
 
-def facts(statistics: dict[str, Any]) -> Facts:
+def facts(statistics: Record) -> Facts:
     """The preset, and the conditions of the values."""
     celsius = statistics["temperature_c"]
     night = statistics["night"]
@@ -112,7 +113,7 @@ def facts(statistics: dict[str, Any]) -> Facts:
     return Facts(rows)
 
 
-def value_table(statistics: dict[str, Any]) -> Table:
+def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
     columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
@@ -364,7 +365,7 @@ UNITS = {
 }
 
 
-def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
+def read_camera(name: str) -> tuple[CameraConfig, Record]:
     """The camera of a preset, a camera file or a scene, and its raw section. Raises InputError."""
     path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
     camera = loader.load_camera(path, PLACEHOLDER_LENS)
@@ -388,7 +389,7 @@ def measure_sensor(
 
 
 def measure_night(
-    config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor
+    config: CameraConfig, raw: Record, folder: Path, found: MeasuredSensor
 ) -> Night:
     """The lens from a folder of night frames. Raises InputError for a camera without a lens, or unusable frames."""
     if "focal_length" not in raw:
@@ -403,11 +404,11 @@ def measure_night(
 def write_results(
     folder: Path,
     config: CameraConfig,
-    raw: dict[str, Any],
+    raw: Record,
     found: MeasuredSensor,
     night: Night | None,
     name: str,
-) -> tuple[dict[str, Any], Report]:
+) -> tuple[Record, Report]:
     """Write preset, report and `characterize.json`; return the statistics in it, and the report."""
     path = folder / "camera.yaml"
     write(path, preset_text(raw, config, found, night, name))
@@ -432,7 +433,7 @@ def write_results(
     return statistics, report
 
 
-def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
+def night_statistics(config: CameraConfig, night: Night) -> Record:
     """Rows of the lens, and the numbers of frames and stars that were used."""
     psf = config.psf if isinstance(config.psf, GaussianPsfConfig) else None
     rows = [
@@ -455,7 +456,7 @@ def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
     }
 
 
-def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
+def row(key: str, one: Estimate, before: object) -> Record:
     """A row of the table: name, value, interval, unit, and the value of the camera's file."""
     return {
         "what": key,

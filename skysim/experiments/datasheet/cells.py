@@ -21,7 +21,7 @@ from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
@@ -96,7 +96,7 @@ class DatasheetCell(NamedTuple):
     """One cell: its experiment, its levels there, and its settings."""
 
     experiment: str
-    levels: dict[str, Any]
+    levels: Record
     settings: Settings
 
     @property
@@ -466,7 +466,7 @@ def study_tree(
     overrides: Mapping[str, str],
     size: Size,
     cells: list[DatasheetCell],
-) -> dict[str, Any]:
+) -> Record:
     """The study file of the cells."""
     settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
     return {
@@ -488,7 +488,7 @@ def study_tree(
     }
 
 
-def attitudes(scene: Scene) -> dict[str, Any]:
+def attitudes(scene: Scene) -> Record:
     """Keys of the trial that bound the attitudes: under a dome, the tilt limit of the vehicle."""
     if scene.light.kind != "dome":
         return {}

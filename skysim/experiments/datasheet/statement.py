@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
 from skysim.experiments.datasheet.performance import Counts
@@ -50,17 +51,17 @@ class Statement(NamedTuple):
     terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
-    causes: list[dict[str, Any]]
+    causes: list[Record]
     counts: Counts
-    claims: list[dict[str, Any]]
-    quantiles: list[dict[str, Any]]
-    consistency: dict[str, Any]
-    rates: list[dict[str, Any]]
-    accelerations: list[dict[str, Any]]
-    tracked_rates: list[dict[str, Any]]
-    tracked_accelerations: list[dict[str, Any]]
-    magnitudes: list[dict[str, Any]]
-    disturbances: list[dict[str, Any]]
+    claims: list[Record]
+    quantiles: list[Record]
+    consistency: Record
+    rates: list[Record]
+    accelerations: list[Record]
+    tracked_rates: list[Record]
+    tracked_accelerations: list[Record]
+    magnitudes: list[Record]
+    disturbances: list[Record]
     times_s: list[float]
 
 
@@ -133,7 +134,7 @@ def as_numbers(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def numbers(statement: Statement) -> dict[str, Any]:
+def numbers(statement: Statement) -> Record:
     """The statement for JSON; squares in arcsec^2 of one axis.
 
     Numbers outside `rates`, `accelerations` and those of tracking mode hold at `rate_deg_s`.
@@ -158,7 +159,7 @@ def numbers(statement: Statement) -> dict[str, Any]:
     return head | as_numbers(parts)
 
 
-def limits(statement: Statement) -> dict[str, Any]:
+def limits(statement: Statement) -> Record:
     """The limits of acquisition and of tracking in rate and acceleration."""
     measured = {
         "acquisition": (statement.rates, statement.accelerations),
@@ -385,7 +386,7 @@ def quantile_section(statement: Statement) -> StatementSection:
     )
 
 
-def consistency_text(found: dict[str, Any]) -> str:
+def consistency_text(found: Record) -> str:
     """How well the covariances of the attitudes fit their errors, and whether x and y have equal errors."""
     shares = ", ".join(
         f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
@@ -403,7 +404,7 @@ def quantile_text(found: Summary) -> str:
     return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
 
 
-def outcome_cells(row: dict[str, Any]) -> list[str]:
+def outcome_cells(row: Record) -> list[str]:
     """Cells of a row's outcomes."""
     return [
         percent(row["counts"].share("right")),
@@ -412,7 +413,7 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
-def pair_cells(row: dict[str, Any]) -> list[str]:
+def pair_cells(row: Record) -> list[str]:
     """Cells of a pair of frames: noise-equivalent angle and error, the normalized error squared, and outcomes."""
     errors = [
         arcsec(row[f"{kind}_{name}"])
@@ -429,7 +430,7 @@ PAIR_HEADERS += FIELD_HEADERS
 UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²"}
 
 
-def bracket_text(what: str, rows: list[dict[str, Any]], key: str) -> str:
+def bracket_text(what: str, rows: list[Record], key: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
     limit = performance.bracket(rows, key)
     unit = UNITS[key]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
 from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
@@ -240,7 +240,7 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
     )
 
 
-def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[str, Any]]:
+def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[Record]:
     """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
     rows = (
@@ -255,7 +255,7 @@ def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[
     return [compared(*row) for row in rows]
 
 
-def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
+def compared(what: str, sigma: float | None, squares: Floats) -> Record:
     """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
     mean = float(squares.mean())
     simulated = math.sqrt(mean)

@@ -17,7 +17,7 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_plan import Mask
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Frame, Mount, Truth
+from skysim.core.types import Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -59,7 +59,7 @@ FIT = (
 FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "survey.json"))
 
 
-def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
+def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     """The report of a survey from the numbers of `survey.json`."""
     reached = accuracy_statistics(run.accuracy)
     dome = Figure(
@@ -94,7 +94,7 @@ def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
     return Verdict(text, "warning" if faults else "good")
 
 
-def value_table(statistics: dict[str, Any]) -> Table:
+def value_table(statistics: Record) -> Table:
     """Lens and lever before and after the survey, with the truth if it was simulated."""
     truth = statistics.get("truth")
     rows = []
@@ -109,7 +109,7 @@ def value_table(statistics: dict[str, Any]) -> Table:
     return Table([text_column(""), *map(Column, heads)], rows)
 
 
-def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
+def truth_blocks(statistics: Record) -> list[Block]:
     """The true errors of a simulated survey, and the tracker before and after it."""
     if not statistics.get("truth"):
         return []
@@ -138,7 +138,7 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
     return [Text(text), Table(columns, rows)]
 
 
-def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
+def accuracy_table(statistics: Record, reached: Mapping[str, Any]) -> Table:
     """Errors: predicted by the plan, by the covariance, true, and predicted with the next attitudes."""
     predicted = statistics.get("predicted")
     after = statistics.get("led_mm_after")
@@ -152,7 +152,7 @@ def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Ta
     return Table([text_column("1σ"), *(Column(head, format=".3g") for head in columns)], rows)
 
 
-def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
+def coverage_blocks(statistics: Record) -> list[Block]:
     """The measured LEDs, the attitudes to hold next, and the accuracy predicted with them."""
     counts = statistics["coverage"]
     reaches = statistics["next_reaches"]
@@ -167,7 +167,7 @@ def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
     return [Text(seen), stop_table(stops), Text(f"{with_them}.")]
 
 
-def stop_table(stops: list[dict[str, Any]]) -> Table:
+def stop_table(stops: list[Record]) -> Table:
     """Attitudes as roll, pitch and yaw, with tilt and number of LEDs."""
     names = ("roll", "pitch", "yaw", "tilt")
     rows = [
@@ -179,14 +179,14 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
     )
 
 
-def fault_blocks(faults: dict[str, Any]) -> list[Block]:
+def fault_blocks(faults: Record) -> list[Block]:
     """The faults as a table, with their number, the error of the other places, and the exchanges that can be found."""
     columns = [Column("LED"), text_column("fault"), text_column("details")]
     *_, counts = fault_lines(faults)
     return [Table(columns, fault_rows(faults)), Text(counts)]
 
 
-def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
+def fault_rows(faults: Record) -> list[tuple[str, str, str]]:
     """LED, fault and details, one row per fault."""
     found = {led: f"at {coordinates(place_m)}" for led, place_m in faults["found_m"].items()}
     rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
@@ -340,7 +340,7 @@ def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErro
     return LedErrors(true_m[row], before_m, position_m - true_m[nearest], nearest != row)
 
 
-def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any]:
+def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
     """Statistics of a survey without the truth. `values` holds one row per lens and lever parameter that is fitted."""
     survey = run.survey
     sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
@@ -365,7 +365,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
     }
 
 
-def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> dict[str, Any]:
+def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> Record:
     """The errors of a simulated survey: of the LEDs before and after it, and the true parameters."""
     errors = led_errors(run.survey, before, lab)
     truth = parameters(lab.scene.camera, lab.camera.mount)

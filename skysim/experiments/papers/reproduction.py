@@ -32,6 +32,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments import home_calibration
 from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
 from skysim.experiments.study import table as study_table
@@ -86,7 +87,7 @@ class Comparison(NamedTuple):
     ours: Ours
     verdict: Verdict
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Record:
         """For JSON. A bound is published as [least, most], an open end as null."""
         row = self.row
         bounds = [row.at_least, row.at_most]
@@ -196,7 +197,7 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
     return commands, number
 
 
-def run_result(scene: Scene) -> dict[str, Any]:
+def run_result(scene: Scene) -> Record:
     """What `skysim run --json` prints of a flight, without the files."""
     with open_flight(scene) as flight:
         rows = [scoring.score(shot).row for shot in flight.shots()]
@@ -207,7 +208,7 @@ def run_result(scene: Scene) -> dict[str, Any]:
     }
 
 
-def calibrate_result(scene: Scene, experiment: Experiment) -> dict[str, Any]:
+def calibrate_result(scene: Scene, experiment: Experiment) -> Record:
     """What `skysim calibrate --json` prints."""
     clicks = home_calibration.CLICKS if experiment.clicks is None else experiment.clicks
     known, frames = home_calibration.measure_scene(scene)
