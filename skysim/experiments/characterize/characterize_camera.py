@@ -341,13 +341,6 @@ def section_lines(
             yield from section_lines(value, f"{prefix}{key}.", sources)
 
 
-def write(path: Path, contents: str) -> None:
-    """Write the file and read it as a scene would. Raises InputError if it is not a valid camera."""
-    files.make_folder(path.parent)
-    files.write_text(path, contents)
-    loader.load_camera(path, PLACEHOLDER_LENS)
-
-
 UNITS = {
     "gain_e_dn": "e-/DN",
     "offset_dn": "DN",
@@ -409,9 +402,16 @@ def write_results(
     night: Night | None,
     name: str,
 ) -> tuple[Record, Report]:
-    """Write preset, report and `characterize.json`; return the statistics in it, and the report."""
-    path = folder / "camera.yaml"
-    write(path, preset_text(raw, config, found, night, name))
+    """Write preset, report and `characterize.json`; return the statistics in it, and the report.
+
+    Raises
+    ------
+    InputError
+        If the preset is not a valid camera.
+    """
+    path = files.make_folder(folder) / "camera.yaml"
+    files.write_text(path, preset_text(raw, config, found, night, name))
+    loader.load_camera(path, PLACEHOLDER_LENS)  # as a scene reads it
     statistics = {
         "camera": name,
         "preset": str(path),
@@ -470,14 +470,10 @@ def row(key: str, one: Estimate, before: object) -> Record:
 
 def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     """Both folders. Raises InputError if one is missing."""
-
-    def required(folder: Path | None, name: str, unknown: str) -> Path:
-        if folder is None:
-            problem = f"missing: without them {unknown} are unknown"
-            raise InputError(f"characterize.{name}", problem, f"a folder of {name}")
-        return folder
-
-    return (
-        required(darks, "darks", "dark current and black level"),
-        required(flats, "flats", "gain and full well"),
-    )
+    if darks and flats:
+        return darks, flats
+    name, unknown = ("flats", "gain and full well")
+    if not darks:
+        name, unknown = ("darks", "dark current and black level")
+    problem = f"missing: without them {unknown} are unknown"
+    raise InputError(f"characterize.{name}", problem, f"a folder of {name}")

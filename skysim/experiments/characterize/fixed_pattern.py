@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -30,6 +29,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Level,
     Mask,
     Transfer,
+    median_and_spread,
 )
 from skysim.results import metrics
 
@@ -146,12 +146,6 @@ def hot_tail(
     share = hot.size / rates.size * math.exp(depth)
     sigma = share * math.sqrt(1 / hot.size + depth**2 / below)
     return Estimate.lognormal(share, sigma), Estimate.lognormal(mean, mean / math.sqrt(below))
-
-
-def median_and_spread(values: Floats) -> tuple[float, float]:
-    """Median and robust standard deviation."""
-    median = float(np.median(values))
-    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
 def bin_edges(rates: Floats, greatest: float) -> Floats:

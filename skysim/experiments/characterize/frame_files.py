@@ -21,7 +21,6 @@ from scipy import ndimage
 from skysim.camera import detector
 from skysim.camera.detector import Detector
 from skysim.core import images
-from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
@@ -32,6 +31,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Level,
     LevelBuilder,
     Mask,
+    median_and_spread,
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
@@ -401,7 +401,7 @@ def check_dark(darks: Stack, level: Level) -> None:
     # particle is in one half of the frames.
     both = np.minimum(level.first_dn, level.second_dn)
     bright = both > np.median(mean) + SPOT_SIGMAS * max(
-        spread(mean), noise_dn / math.sqrt(level.count)
+        median_and_spread(mean)[1], noise_dn / math.sqrt(level.count)
     )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))
     sizes = np.bincount(labels.ravel())[1:]
@@ -466,11 +466,6 @@ def check_flat(folder: Path, which: str, medians: Floats) -> None:
             f"{which} are not flat: {100 * extent:.0f} % brighter at the {place.brightest} than at the {place.darkest}",
             f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
         )
-
-
-def spread(image: Floats) -> float:
-    """Robust standard deviation of the pixels."""
-    return float(np.median(np.abs(image - np.median(image)))) / MAD_PER_SIGMA
 
 
 def block_medians(image: Floats) -> Floats:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.optimize import brentq, least_squares
 
+from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.results.metrics import SIGMAS, TAILS
 
@@ -87,6 +88,12 @@ def propagate(
         moved[n] = step[n]
         slope[n] = (function(at + moved) - function(at - moved)) / (2 * step[n])
     return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+
+
+def median_and_spread(values: Floats) -> tuple[float, float]:
+    """Median and robust standard deviation."""
+    median = float(np.median(values))
+    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
 # Frames of one exposure, reduced to two mean frames and the temporal variance of every pixel.
@@ -287,13 +294,6 @@ class Transfer(NamedTuple):
     @property
     def offset_dn(self) -> Estimate:
         return Estimate.normal(self.values[BLACK], math.sqrt(self.covariance[BLACK, BLACK]))
-
-    @property
-    def light_e_s(self) -> Estimate:
-        """Electrons that the lamp gives a pixel in a second."""
-        return Estimate.normal(
-            *propagate(lambda p: p[LIGHT] / p[GAIN], self.values, self.covariance)
-        )
 
     def linear_dn(self, signal_dn: Floats) -> Floats:
         """The signal x that a linear amplifier would give, from the measured x (1 - c x)."""

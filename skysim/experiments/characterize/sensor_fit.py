@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Floats
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
@@ -24,6 +23,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Mask,
     Transfer,
     TransferPoint,
+    median_and_spread,
     propagate,
 )
 
@@ -106,7 +106,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     first, second = (
         fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
     )
-    ratio = rate_ratio(transfer, own, chosen)
+    rates = transfer.values[FIRST_DARK:]
+    # Of the dark currents of the same pixels at the two temperatures.
+    ratio = 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
     dark = dark_parameters(found, at_it, first, second, own, ratio)
     doubling(found, temperatures)
     estimates = found.estimates
@@ -138,12 +140,6 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     )
 
 
-def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
-    """Ratio of the dark currents of the same pixels at two temperatures, `own` to `chosen`."""
-    rates = transfer.values[FIRST_DARK:]
-    return 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
-
-
 def usable_pixels(darks: Sequence[Level]) -> Mask:
     """Pixels that no particle has hit, and that are not hot in any dark.
 
@@ -152,9 +148,8 @@ def usable_pixels(darks: Sequence[Level]) -> Mask:
     usable = np.ones(darks[0].first_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
-        median = np.median(mean)
-        spread = max(np.median(np.abs(mean - median)) / MAD_PER_SIGMA, 0.5)
-        usable &= (mean < median + HOT_SIGMAS * spread) & steady_pixels(
+        median, spread = median_and_spread(mean)
+        usable &= (mean < median + HOT_SIGMAS * max(spread, 0.5)) & steady_pixels(
             one, float(np.median(one.variance_dn2))
         )
     return usable

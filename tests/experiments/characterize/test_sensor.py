@@ -164,7 +164,7 @@ def test_the_fit_returns_the_law_of_its_points() -> None:
     assert found.read_noise_e.value == pytest.approx(read / gain, rel=2e-3)
     assert found.values[photon_transfer.CURVATURE] == pytest.approx(curvature, rel=5e-3)
     assert found.offset_dn.value == pytest.approx(black, abs=2e-3)
-    assert found.light_e_s.value == pytest.approx(2000, rel=2e-3)
+    assert found.values[photon_transfer.LIGHT] / gain == pytest.approx(2000, rel=2e-3)
     assert found.values[photon_transfer.FIRST_DARK] / gain == pytest.approx(3, rel=2e-3)
 
 
