@@ -82,24 +82,20 @@ class Bars(NamedTuple):
 
 def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
     """Parse the bars. Raises InputError if one is not a torque or length, or not positive."""
-    values: list[float | None] = []
-    for name, text, unit, what in (
-        ("torque", torque, "N m", "torque"),
-        ("offset_bar", offset, "m", "length"),
-    ):
+
+    def positive(name: str, text: str, unit: str, what: str, example: str) -> float:
         try:
-            value = (
-                None
-                if text is None
-                else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
-            )
+            value = quantity(unit, what, example)(text)
         except InputError as error:
             raise error.under(f"balance.{name}") from None
-        if value is not None and not value > 0:
+        if not value > 0:
             raise InputError(f"balance.{name}", text, "above 0")
-        values.append(value)
-    torque_nm, offset_m = values
-    assert torque_nm is not None
+        return value
+
+    torque_nm = positive("torque", torque, "N m", "torque", '"5e-5 N m"')
+    offset_m = None
+    if offset is not None:
+        offset_m = positive("offset_bar", offset, "m", "length", '"1 um"')
     return Bars(torque_nm, inertia_percent / 100, offset_m)
 
 

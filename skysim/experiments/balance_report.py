@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
 from skysim.core import files
@@ -100,27 +99,19 @@ def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
 
 
-def balance_figure(
-    iterations: Sequence[Iteration], torque_bar_nm: float
-) -> NDArray[np.uint8]:
-    """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
-    return bgr_image(lambda fig: draw_flights(fig, iterations, torque_bar_nm), (15, 4.5))
-
-
 def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float) -> None:
-    """Draw the three panels of `balance_figure`."""
+    """Draw gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
     torque, offset, motion = fig.subplots(1, 3)
     numbers = np.arange(1, len(iterations) + 1)
-    torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
-    torque.semilogy(
-        numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound"
-    )
-    torque.semilogy(
-        numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
-    )
+    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
+    for key, style, label in (
+        ("torque_nm", "o-", "estimate"),
+        ("torque_bound_nm", "v--", "bound"),
+        ("true_torque_nm", "kx", "simulated vehicle"),
+    ):
+        torque.semilogy(numbers, [row[key] for row in rows], style, label=label)
     torque.axhline(torque_bar_nm, color="0.5", linestyle=":")
     torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
-    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
     for axis, name in enumerate(MOMENT_NAMES):
         values, sigma = (
             [row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um")
@@ -147,7 +138,7 @@ def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
 
 
 def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
-    """The report of a balance with the picture of `balance_figure` as PNG bytes."""
+    """The report of a balance with the picture of `draw_flights` as PNG bytes."""
     blocks = [
         verdict(statistics),
         Facts(
@@ -237,7 +228,9 @@ def write_all(
 ) -> Report:
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
-    files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))
+    bar_nm = statistics["torque_bar_nm"]
+    image = bgr_image(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
+    files.write_image(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))
     report = balance_report(statistics, picture.read_bytes(), command)
