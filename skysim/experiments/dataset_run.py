@@ -86,7 +86,9 @@ class DatasetPlan:
         levels = {}
         settings = Settings()
         for n, (name, factor) in enumerate(self.factors.items()):
-            number = (0, frame) if is_of_frame(factor) else (1, shard)
+            # A factor that sets only keys of the trial is drawn in every frame.
+            of_frame = all(key.startswith(TRIAL) for key in keys_of(factor))
+            number = (0, frame) if of_frame else (1, shard)
             u = float(random_stream(self.spec.seed, DRAW, *number, n).random())
             levels[name], own = factor.value_at(u)
             settings |= own
@@ -127,11 +129,6 @@ def keys_of(factor: Factor) -> set[str]:
     return {key for settings in options for key in settings}
 
 
-def is_of_frame(factor: Factor) -> bool:
-    """Whether a factor sets only keys of the trial, so that it is drawn in every frame."""
-    return all(key.startswith(TRIAL) for key in keys_of(factor))
-
-
 def load(
     scene: str,
     vary: Path | None,
@@ -158,7 +155,9 @@ def load(
         if name not in FORMATS:
             raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
     plan = study_plan(scene, vary, seed, overrides or {})
-    check_trial(plan, vary)
+    keys = set().union(*map(keys_of, plan.study.factors.values()))
+    if "tracked" in plan.spec.trial or TRACKED in keys:  # which only affects solving
+        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
     return DatasetPlan(
         plan.spec,
         dict(plan.study.factors),
@@ -166,15 +165,6 @@ def load(
         frames_per_shard,
         tuple(dict.fromkeys(formats)),
     )
-
-
-def check_trial(plan: Plan, vary: Path | None) -> None:
-    """Raise InputError for `trial.tracked`, which only affects solving."""
-    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(
-        *map(keys_of, plan.study.factors.values())
-    )
-    if TRACKED in keys:
-        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
 
 
 def study_plan(
@@ -390,16 +380,6 @@ def check_manifest(storage: Storage, own: Record) -> None:
         )
 
 
-def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
-    """The shards without an index."""
-    there = storage.names(INDEX)
-    return [
-        shard
-        for shard in range(plan.shards)
-        if shard_name("", shard, "parquet")[1:] not in there
-    ]
-
-
 def run(
     plan: DatasetPlan,
     url: str,
@@ -409,7 +389,12 @@ def run(
     """Make the missing shards. Progress counts frames; frames of shards that killed their workers count as failed."""
     storage = Storage(url)
     prepare(plan, storage)
-    missing = missing_shards(plan, storage)
+    there = storage.names(INDEX)
+    missing = [
+        shard
+        for shard in range(plan.shards)
+        if shard_name("", shard, "parquet")[1:] not in there
+    ]
     left = sum(len(plan.frames_of(shard)) for shard in missing)
     progress = Progress(plan.frames, plan.frames - left, began=time.perf_counter())
     for results in engine.run(DatasetJob(plan, url), ShardQueue(missing)) if missing else ():
