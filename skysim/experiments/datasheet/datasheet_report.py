@@ -118,37 +118,20 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
-        errors.plot(
-            x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
-        )
-        errors.plot(
-            x,
-            [row[f"rms_{group}"] for row in rows],
-            "s--",
-            color=INK[n],
-            label=f"rms {group}",
-        )
+        for kind, style in (("NEA", "o-"), ("rms", "s--")):
+            values = [row[f"{kind.lower()}_{group}"] for row in rows]
+            errors.plot(x, values, style, color=INK[n], label=f"{kind} {group}")
     errors.set_yscale("log")
     errors.yaxis.set_major_formatter("{x:g}")
     errors.set_ylabel("one axis [″]")
     errors.legend()
     found = [row["counts"].share("right") for row in rows]
-    values = np.array([one.value for one in found])
+    right = np.array([one.value for one in found])
     ends = np.array([[one.value - one.low, one.high - one.value] for one in found]).T
-    share.errorbar(x, 100 * values, 100 * ends, fmt="o-", color=INK[2])
+    share.errorbar(x, 100 * right, 100 * ends, fmt="o-", color=INK[2])
     share.set_ylabel("right attitudes [%]")
     for axes in (errors, share):
         axes.set_xlabel(label)
-
-
-def draw_rates(fig: Any, statement: Statement) -> None:
-    """Noise and error by rate."""
-    draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]")
-
-
-def draw_magnitudes(fig: Any, statement: Statement) -> None:
-    """Noise and error by the catalog's limit."""
-    draw_by(fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]")
 
 
 FIGURES = {
@@ -166,12 +149,14 @@ FIGURES = {
         draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."
     ),
     "rates": DatasheetFigure(
-        draw_rates,
+        lambda fig, of: draw_by(fig, of.rates, "rate_deg_s", "rate [°/s]"),
         (9, 3),
         "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
     ),
     "magnitudes": DatasheetFigure(
-        draw_magnitudes,
+        lambda fig, of: draw_by(
+            fig, of.magnitudes, "limit_mag", "faintest star of the catalog [V]"
+        ),
         (9, 3),
         "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
     ),
