@@ -62,6 +62,10 @@ FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "s
 def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     """The report of a survey from the numbers of `survey.json`."""
     reached = accuracy_statistics(run.accuracy)
+    faults = statistics["faults"]
+    columns = [Column("LED"), text_column("fault"), text_column("details")]
+    # Their number, the error of the other places, and the exchanges that can be found.
+    *_, counts = fault_lines(faults)
     dome = Figure(
         Path(statistics["picture"]).read_bytes(),
         "The dome from above: LED errors, faults, next attitudes.",
@@ -79,7 +83,7 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
         Section("Truth and survey", truth_blocks(statistics)),
         Section("Predicted and reached", [accuracy_table(statistics, reached)]),
         Section("Coverage and next attitudes", coverage_blocks(statistics)),
-        Section("Faults", fault_blocks(statistics["faults"])),
+        Section("Faults", [Table(columns, fault_rows(faults)), Text(counts)]),
     ]
     return Report(f"Survey of {statistics['scene']}", blocks, command)
 
@@ -177,13 +181,6 @@ def stop_table(stops: list[Record]) -> Table:
     return Table(
         [Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows
     )
-
-
-def fault_blocks(faults: Record) -> list[Block]:
-    """The faults as a table, with their number, the error of the other places, and the exchanges that can be found."""
-    columns = [Column("LED"), text_column("fault"), text_column("details")]
-    *_, counts = fault_lines(faults)
-    return [Table(columns, fault_rows(faults)), Text(counts)]
 
 
 def fault_rows(faults: Record) -> list[tuple[str, str, str]]:
@@ -386,12 +383,14 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
 def survey_figure(
     so_far: Coverage,
     faults: DomeFaults,
-    further: Rotation | None,
+    further: Rotation,
     errors: LedErrors | None,
-    shifts: LedErrors,
+    run: SurveyRun,
 ) -> NDArray[np.uint8]:
     """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
-    panels = [("found minus list", shifts.true_m, -shifts.before_m)]
+    row = np.flatnonzero(run.survey.surveyed)
+    found_m = run.survey.leds.position_m[row]
+    panels = [("found minus list", found_m, found_m - run.listed.position_m[row])]
     if errors is not None:
         panels = [
             ("error before the survey", errors.true_m, errors.before_m),
@@ -407,9 +406,7 @@ def survey_figure(
     return bgr_image(draw, (7 * (1 + len(panels)), 6.5))
 
 
-def draw_coverage(
-    axes: Any, so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
-) -> None:
+def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
     """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
     from matplotlib.colors import LogNorm
 
@@ -432,32 +429,26 @@ def draw_coverage(
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
-    if faults is not None:
-        marks = {
-            "dark": (faults.dark, "x", "black"),
-            "displaced": (list(faults.displaced), "D", "magenta"),
-            "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
-        }
-        for name, (numbers, marker, color) in marks.items():
-            rows = rows_of(numbers, leds.id)
-            colors = (
-                {"color": color}
-                if marker == "x"
-                else {"facecolor": "none", "edgecolor": color}
-            )
-            if len(rows):
-                axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
-            for row in rows:
-                text = {"textcoords": "offset points", "color": color}
-                axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
-    if further is not None:
-        lever = so_far.model.lever
-        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(
-            -1, 3
+    marks = {
+        "dark": (faults.dark, "x", "black"),
+        "displaced": (list(faults.displaced), "D", "magenta"),
+        "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
+    }
+    for name, (numbers, marker, color) in marks.items():
+        rows = rows_of(numbers, leds.id)
+        colors = (
+            {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
         )
-        for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
-            at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
-            axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
+        if len(rows):
+            axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
+        for row in rows:
+            text = {"textcoords": "offset points", "color": color}
+            axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
+    lever = so_far.model.lever
+    toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+    for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
+        at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
+        axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
     axes.legend(loc="upper left", fontsize="small")
     axes.set(
         xlabel="x [m]",
@@ -480,13 +471,3 @@ def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None
     axes.set_title(f"{title}: {rms_mm:.2g} mm rms an axis", loc="left")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.figure.colorbar(arrows, ax=axes, label="z error [mm]", shrink=0.8)
-
-
-def list_shifts(run: SurveyRun) -> LedErrors:
-    """The measured LEDs as found, with the errors of the list relative to them."""
-    row = np.flatnonzero(run.survey.surveyed)
-    found_m = run.survey.leds.position_m[row]
-    none = np.zeros(len(row), dtype=bool)
-    return LedErrors(
-        found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none
-    )

@@ -268,10 +268,7 @@ def write_results(
     further = survey_frames.from_rows(statistics["next"])
     errors = survey_report.led_errors(run.survey, before, lab) if lab else None
     files.write_image(
-        picture,
-        survey_report.survey_figure(
-            so_far, faults, further, errors, survey_report.list_shifts(run)
-        ),
+        picture, survey_report.survey_figure(so_far, faults, further, errors, run)
     )
     return statistics
 
