@@ -284,8 +284,9 @@ def calibrated(
     imu = Rotation.concatenate([common[n].body_from_lab.inv() for n in first])
     brightness = np.array([one.brightness for one in common])
     brightest = np.argsort(-brightness[0])[:QUEST_LEDS]
+    at_home = unit(lab_m[0, brightest])
     algorithm_deg = [
-        euler_deg(quest_attitude(body_m[n, brightest], lab_m[0, brightest]))
+        euler_deg(quest(at_home, unit(body_m[n, brightest]), np.ones(len(brightest))))
         if np.array_equal(common[n].led, common[0].led)
         else np.full(3, np.nan)
         for n in first
@@ -344,11 +345,6 @@ def pair_angles_rad(body_m: Floats) -> Floats:
     directions = body_m / np.linalg.norm(body_m, axis=-1, keepdims=True)
     a, b = np.triu_indices(directions.shape[-2], 1)
     return separation_rad(directions[..., a, :], directions[..., b, :])
-
-
-def quest_attitude(body_m: Floats, lab_m: Floats) -> Rotation:
-    """lab_from_body by QUEST from N points in both frames."""
-    return quest(unit(lab_m), unit(body_m), np.ones(len(body_m)))
 
 
 # Numbers and pages.
