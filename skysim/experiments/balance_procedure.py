@@ -9,7 +9,7 @@ bar.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from skysim.experiments.balance_flight import (
 )
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
+from skysim.simulation.flight import Progress
 
 CONFIDENCE = 2.0  # standard deviations by which the estimated torque must be below the bar
 MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
@@ -138,11 +139,8 @@ class Iteration(NamedTuple):
         return float(self.gravity_m_s2 * mass.mass_kg * np.linalg.norm(mass.center_m))
 
 
-Watch = Callable[[float, float], None]
-
-
 def balance(
-    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Watch | None = None
+    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Progress | None = None
 ) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 

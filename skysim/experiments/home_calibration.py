@@ -45,7 +45,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Ints, Mask, Record
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -59,13 +59,11 @@ from skysim.tracking import onboard_model
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 SAME_STOP_DEG = 0.5  # frames of a stop differ by less, two stops in a row by more
-STILL_DEG = (
-    0.05  # a frame whose attitude differs by more from the frame before is taken in motion
-)
+# A frame whose attitude differs by more from the frame before is taken in motion.
+STILL_DEG = 0.05
 CLICKS = 4
-DISTINCT_ARCSEC = (
-    100.0  # angles with a larger gap are distinct: a bucket of the thesis's pair catalog
-)
+# Angles with a larger gap are distinct: a bucket of the thesis's pair catalog.
+DISTINCT_ARCSEC = 100.0
 QUEST_LEDS = 2
 
 
@@ -99,8 +97,8 @@ class Calibration(NamedTuple):
 
     camera: Camera
     catalog: HomeCatalog
-    led: NDArray[np.int64]
-    stop: NDArray[np.int64]
+    led: Ints
+    stop: Ints
     magnitude: Floats
     body_m: Floats
     lab_m: Floats
@@ -409,7 +407,7 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     }
 
 
-def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> Record:
+def spread(values: Floats, sets: Sequence[Mask]) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
     return {
         "mean": float(values.mean()),
@@ -435,18 +433,12 @@ def calibration_report(
         f" position, {epsilon['separation_arcsec']:.3g}″ of an angle"
     )
     figures = [
-        Figure(
-            png(partial(draw_magnitudes, found), (7.4, 4.2)),
-            "Magnitudes by LED, a color for each stop.",
-        ),
-        Figure(
-            png(partial(draw_angles, found), (7.4, 3.2)),
-            "Angles of all pairs about the bearing.",
-        ),
-        Figure(
-            png(partial(draw_places, found), (6.0, 4.6)),
-            "LEDs in the lab by the IMU, a color for each stop.",
-        ),
+        Figure(png(partial(draw, found), (width_in, height_in)), caption)
+        for draw, width_in, height_in, caption in (
+            (draw_magnitudes, 7.4, 4.2, "Magnitudes by LED, a color for each stop."),
+            (draw_angles, 7.4, 3.2, "Angles of all pairs about the bearing."),
+            (draw_places, 6.0, 4.6, "LEDs in the lab by the IMU, a color for each stop."),
+        )
     ]
     magnitude = Column("magnitude", "", ".2f")
     angle = Column("angle", "″", ".1f")
