@@ -23,6 +23,8 @@ from skysim.experiments.characterize.photon_transfer import (
     GAIN,
     LIGHT,
     Estimate,
+    by_level,
+    exposures_s,
     model,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
@@ -157,8 +159,8 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
         ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
     )
     for name, points, colors in groups:
-        signal = np.array([one.moments.mean_dn for one in points]) - black
-        variance = np.array([one.moments.variance_dn2 for one in points])
+        signal = by_level(points, "mean_dn") - black
+        variance = by_level(points, "variance_dn2")
         shown = np.maximum(signal, 0.1), np.maximum(variance, 0.05)
         curve.scatter(*shown, 18, label=name, **colors)
     expected_mean, expected_variance = model(fitted, transfer.values)
@@ -171,8 +173,8 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     curve.legend()
     plain_labels(curve.xaxis, curve.yaxis)
     flats = [one for one in fitted if one.lit] + beyond
-    time_s = np.array([one.exposure_s for one in flats])
-    signal = np.array([one.moments.mean_dn for one in flats]) - black
+    time_s = exposures_s(flats)
+    signal = by_level(flats, "mean_dn") - black
     linear = (transfer.values[LIGHT] + transfer.values[FIRST_DARK + flats[0].dark]) * time_s
     inside = signal < 0.98 * signal.max()
     line.scatter(linear[inside], 100 * (signal / linear - 1)[inside], 18, color=INK[0])
@@ -235,10 +237,11 @@ def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
 
 
 DIGITS = 6
+Stated = dict[str, tuple[Any, str]]  # value and comment by key
 
 
 def preset_text(
-    camera: Mapping[str, Any],
+    camera: Record,
     config: CameraConfig,
     sensor: MeasuredSensor,
     night: Night | None,
@@ -259,12 +262,12 @@ def preset_text(
     return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
 
 
-def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
+def measured(sensor: MeasuredSensor) -> Stated:
     """Value and comment by key of the section camera; an estimate below 0 becomes 0."""
-    found: dict[str, tuple[Any, str]] = {}
-    for key, one in sensor.estimates.items():
-        value = max(one.value, 0.0)
-        found[f"detector.{key}"] = (rounded(value), comment(one))
+    found = {
+        f"detector.{key}": stated(one._replace(value=max(one.value, 0.0)))
+        for key, one in sensor.estimates.items()
+    }
     if sensor.dark_temperature_c is not None:
         celsius = rounded(sensor.dark_temperature_c)
         found["detector.dark_temperature_c"] = (celsius, "[M] of the darks")
@@ -275,16 +278,13 @@ def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
     return found
 
 
-def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, str]]:
+def measured_lens(config: CameraConfig, night: Night) -> Stated:
     """Value and comment by key of the lens."""
     size = night.size
-    found: dict[str, tuple[Any, str]] = {
+    found: Stated = {
         "psf.kind": ("gaussian", "[M]"),
-        "psf.sigma_px": (rounded(size.sigma_px.value), comment(size.sigma_px)),
-        "psf.corner_sigma_px": (
-            rounded(size.corner_sigma_px.value),
-            comment(size.corner_sigma_px),
-        ),
+        "psf.sigma_px": stated(size.sigma_px),
+        "psf.corner_sigma_px": stated(size.corner_sigma_px),
     }
     if night.lens is None:
         return found
@@ -305,6 +305,11 @@ def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, st
     }
 
 
+def stated(one: Estimate) -> tuple[Any, str]:
+    """An estimate's value and comment."""
+    return rounded(one.value), comment(one)
+
+
 def comment(one: Estimate) -> str:
     return f"[M] {one.low:.5g} to {one.high:.5g}"
 
@@ -314,9 +319,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def lines(
-    camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]
-) -> Iterator[SheetLine]:
+def lines(camera: Record, found: Stated) -> Iterator[SheetLine]:
     """The lines of the section, with measured values in place of the camera's own; subsections come last."""
     tree = copy.deepcopy(dict(camera))
     if "psf.kind" in found:
@@ -328,7 +331,7 @@ def lines(
 
 
 def section_lines(
-    section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
+    section: Record, prefix: str, sources: Mapping[str, str]
 ) -> Iterator[SheetLine]:
     """The lines of a section: its values, then its subsections."""
     for key, value in section.items():

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
 
 from skysim.camera import detector
@@ -21,9 +23,9 @@ from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
+    LevelBuilder,
     Moments,
     TransferPoint,
-    level,
     propagate,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
@@ -62,6 +64,14 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
     return CameraConfig.model_validate(
         lens | {"detector": CHIP | {"hardware_seed": seed} | changes}
     )
+
+
+def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
+    """The level of two frames or more."""
+    builder = LevelBuilder()
+    for frame in frames:
+        builder.add(frame)
+    return builder.level(exposure_s, temperature_c)
 
 
 def measured(
