@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 from skysim.core.text import excerpt, read_named_rows
+from skysim.core.types import Ints
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
@@ -107,7 +107,7 @@ def write_attitudes(
     path: Path,
     names: Sequence[str],
     lab_from_body: Rotation,
-    leds: NDArray[np.int64] | None = None,
+    leds: Ints | None = None,
 ) -> None:
     """Write attitudes as `read_attitudes` reads them.
 
@@ -230,20 +230,17 @@ class WatchedFolder:
             if stamp != before or stamp == self._done.get(path.name):
                 continue
             try:
-                self._read(path)
+                if path.name == ATTITUDES:
+                    self._attitudes = read_attitudes(path)
+                else:
+                    self._lights.pop(path.name, None)
+                    self._lights[path.name] = lights_of(path, self.camera, self.settings)
             except InputError as error:
                 news.complaints.append(error)
             else:
                 news.read.append(path.name)
             self._done[path.name] = stamp
         return news
-
-    def _read(self, path: Path) -> None:
-        if path.name == ATTITUDES:
-            self._attitudes = read_attitudes(path)
-        else:
-            self._lights.pop(path.name, None)
-            self._lights[path.name] = lights_of(path, self.camera, self.settings)
 
 
 def stamp_of(path: Path) -> Stamp | None:

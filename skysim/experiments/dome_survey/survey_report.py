@@ -26,9 +26,8 @@ from skysim.experiments.dome_survey.survey_findings import (
     accuracy_statistics,
     fault_lines,
     residuals_px,
-    rows_of,
 )
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
 from skysim.results import metrics
 from skysim.results.plots import INK, bgr_image, png
 from skysim.results.report import Report
@@ -88,7 +87,7 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     return Report(f"Survey of {statistics['scene']}", blocks, command)
 
 
-def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
+def verdict(statistics: Record, led_mm: float) -> Verdict:
     """Number of measured LEDs, their error, and number of faults."""
     faults = len(fault_rows(statistics["faults"]))
     text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(
@@ -142,7 +141,7 @@ def truth_blocks(statistics: Record) -> list[Block]:
     return [Text(text), Table(columns, rows)]
 
 
-def accuracy_table(statistics: Record, reached: Mapping[str, Any]) -> Table:
+def accuracy_table(statistics: Record, reached: Record) -> Table:
     """Errors: predicted by the plan, by the covariance, true, and predicted with the next attitudes."""
     predicted = statistics.get("predicted")
     after = statistics.get("led_mm_after")
@@ -281,11 +280,9 @@ PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
 VALUE_KEYS = ("what", "believed", "found", "sigma")
 
 
-def error_statistics(
-    stops: int, errors_rad: list[tuple[float, float]]
-) -> dict[str, float | int | None]:
+def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> Record:
     """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
-    statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
+    statistics: Record = {"stops": stops, "solved": len(errors_rad)}
     errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
     for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
         median = worst = None
@@ -298,7 +295,7 @@ def error_statistics(
 
 def compare_trackers(
     trackers: Mapping[str, factory.Estimator], frames: Iterable[tuple[Frame, Truth]]
-) -> dict[str, dict[str, float | int | None]]:
+) -> dict[str, Record]:
     """Statistics of each tracker on the same frames, by name."""
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in trackers}
     stops = 0
@@ -324,7 +321,7 @@ class LedErrors(NamedTuple):
     true_m: Floats
     before_m: Floats
     after_m: Floats
-    renamed: NDArray[np.bool_]
+    renamed: Mask
 
 
 def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:

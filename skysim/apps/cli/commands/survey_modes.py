@@ -233,7 +233,7 @@ def print_coverage(
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
     """Statistics of a coverage, with the attitudes to hold next and the accuracy predicted with them."""
 
-    margin_px = survey_prior.image_sizes(prior).margin_px
+    margin_px = prior.margin_px
     further = survey_findings.next_stops(
         request.scene, so_far, margin_px, request.next_stops, request.tilt_deg
     )
