@@ -365,11 +365,16 @@ def probability_section(statement: Statement) -> StatementSection:
 
 
 def quantile_section(statement: Statement) -> StatementSection:
-    """Quantiles of the errors."""
+    """Quantiles of the errors, how well the covariances fit them, and whether x and y have equal errors."""
+    found = statement.consistency
+    shares = ", ".join(
+        f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
+    )
     texts = [
         "Errors that a frame at rest stays below with the probability at the left, over independent frames"
         f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights.",
-        consistency_text(statement.consistency),
+        f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
+        f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}.",
     ]
     rows = [
         [
@@ -383,17 +388,6 @@ def quantile_section(statement: Statement) -> StatementSection:
         texts,
         ["probability", "boresight angle ″", "about ″"],
         rows,
-    )
-
-
-def consistency_text(found: Record) -> str:
-    """How well the covariances of the attitudes fit their errors, and whether x and y have equal errors."""
-    shares = ", ".join(
-        f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
-    )
-    return (
-        f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
-        f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}."
     )
 
 
@@ -446,13 +440,20 @@ def bracket_text(what: str, rows: list[Record], key: str) -> str:
 
 
 def rate_section(statement: Statement) -> StatementSection:
-    """Noise-equivalent angle, error and acquisition by rate."""
+    """Noise-equivalent angle, error and acquisition by rate.
+
+    The relative error of rms and NEA of F fields is 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one: for two
+    Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of the error.
+    """
+    fields = statement.sheet.size.fields
+    across, about = (100 / math.sqrt(axes * fields) for axes in (2, 1))
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ONE_UNIT})."
         " NEES: normalized error squared of this unit; over all units 3 where the tracker's own covariance is right."
         " Shares are of attitudes that are right in both frames."
-        f" {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known beyond"
+        f" NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ). Each row"
+        " holds at its rate, and nothing is known beyond"
         f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
         bracket_text("acquisition in rate", statement.rates, "rate_deg_s"),
     ]
@@ -462,16 +463,6 @@ def rate_section(statement: Statement) -> StatementSection:
     ]
     headers = ["rate °/s", "streak px", *PAIR_HEADERS]
     return StatementSection("By rate", texts, headers, rows, ["rates"])
-
-
-def precision_text(sheet: MeasuredFrames) -> str:
-    """Relative error of rms and NEA of F fields: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
-
-    This is for two Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of
-    the error.
-    """
-    across, about = (100 / math.sqrt(axes * sheet.size.fields) for axes in (2, 1))
-    return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."
 
 
 def acceleration_section(statement: Statement) -> StatementSection:
