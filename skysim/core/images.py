@@ -14,7 +14,7 @@ import re
 import tempfile
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -348,6 +348,37 @@ def image_suffix(name: str) -> str:
         key=len,
         default="",
     )
+
+
+def best_images(
+    folder: Path, rank: Callable[[Path], int], recursive: bool = False
+) -> dict[Path, Path]:
+    """The images of a folder by their path without suffix; of several formats, that of the least rank.
+
+    Raises
+    ------
+    InputError
+        If there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InputError(folder, "no such folder", "a folder of images")
+    best: dict[Path, Path] = {}
+    for path in sorted(folder.rglob("*") if recursive else folder.iterdir()):
+        suffix = image_suffix(path.name)
+        if suffix and not path.name.startswith("."):
+            stem = path.with_name(path.name[: -len(suffix)])
+            best[stem] = min(best.get(stem, path), path, key=rank)
+    return best
+
+
+def check_size(path: Path, pixels: NDArray, shape: tuple[int, int]) -> None:
+    """Raise InputError unless an image has the (height, width) of its camera."""
+    if pixels.shape != shape:
+        raise InputError(
+            path,
+            f"{pixels.shape[1]} x {pixels.shape[0]} pixels",
+            f"{shape[1]} x {shape[0]}, as the camera has them",
+        )
 
 
 def check_name(path: Path) -> None:

@@ -16,6 +16,9 @@ from skysim.core.jit import jit
 from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 

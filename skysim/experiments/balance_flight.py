@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,18 +27,16 @@ from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
-from skysim.simulation.flight import Flight, open_flight
+from skysim.simulation.flight import Flight, Progress, open_flight
 
 # The assumed vehicle before it is balanced, and its uncertainty.
 
 
 PARAMETERS = 17  # number of parameters, without the wheels' relative errors
-LAB_TORQUE_SHARE = (
-    0.05  # standard deviation of the constant lab torque, relative to the offset's torque
-)
-DRAG_RATE_RAD_S = (
-    0.1  # rate at which the drag's standard deviation equals that of the lab torque
-)
+# Standard deviation of the constant lab torque, relative to the offset's torque.
+LAB_TORQUE_SHARE = 0.05
+# Rate at which the drag's standard deviation equals that of the lab torque.
+DRAG_RATE_RAD_S = 0.1
 LEAST_TORQUE_NM = 1e-7  # rms of the random torque that is always assumed
 DEFAULT_CORRELATION_S = 2.0
 MAX_TACHO_RPM = 1000.0
@@ -53,8 +50,7 @@ RANGES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
+class Uncertainty(NamedTuple):
     """Standard deviations of the Gaussian errors of the assumed vehicle.
 
     Attributes
@@ -257,7 +253,6 @@ MAX_HZ = 0.1
 YAW_DEG_S = 5.0
 YAW_DEG_S2 = 1.0
 SWING_S = 150.0
-ProgressCallback = Callable[[float, float], None]
 
 
 class BalanceFlight(NamedTuple):
@@ -382,7 +377,7 @@ def fly(
     scene: Scene,
     assumptions: Assumptions,
     uncertainty: Uncertainty,
-    watch: ProgressCallback | None,
+    watch: Progress | None,
 ) -> BalanceFlight:
     """Simulate a flight, render and solve its frames, and return the measurements.
 
@@ -430,7 +425,7 @@ def fly(
 
 
 def measured_attitudes(
-    flight: Flight, watch: ProgressCallback | None
+    flight: Flight, watch: Progress | None
 ) -> list[tuple[float, Rotation, Floats, Floats]]:
     """Of each solved frame: time, attitude, covariances in body axes, and which LEDs it has used, 1 or 0.
 

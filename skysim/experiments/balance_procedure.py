@@ -9,7 +9,7 @@ bar.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +31,7 @@ from skysim.experiments.balance_flight import (
 )
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
+from skysim.simulation.flight import Progress
 
 CONFIDENCE = 2.0  # standard deviations by which the estimated torque must be below the bar
 MAX_SHRINK = 1e-6  # smallest eigenvalue of the trim axes' Gram matrix
@@ -82,24 +83,20 @@ class Bars(NamedTuple):
 
 def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
     """Parse the bars. Raises InputError if one is not a torque or length, or not positive."""
-    values: list[float | None] = []
-    for name, text, unit, what in (
-        ("torque", torque, "N m", "torque"),
-        ("offset_bar", offset, "m", "length"),
-    ):
+
+    def positive(name: str, text: str, unit: str, what: str, example: str) -> float:
         try:
-            value = (
-                None
-                if text is None
-                else quantity(unit, what, '"1 um"' if unit == "m" else '"5e-5 N m"')(text)
-            )
+            value = quantity(unit, what, example)(text)
         except InputError as error:
             raise error.under(f"balance.{name}") from None
-        if value is not None and not value > 0:
+        if not value > 0:
             raise InputError(f"balance.{name}", text, "above 0")
-        values.append(value)
-    torque_nm, offset_m = values
-    assert torque_nm is not None
+        return value
+
+    torque_nm = positive("torque", torque, "N m", "torque", '"5e-5 N m"')
+    offset_m = None
+    if offset is not None:
+        offset_m = positive("offset_bar", offset, "m", "length", '"1 um"')
     return Bars(torque_nm, inertia_percent / 100, offset_m)
 
 
@@ -142,11 +139,8 @@ class Iteration(NamedTuple):
         return float(self.gravity_m_s2 * mass.mass_kg * np.linalg.norm(mass.center_m))
 
 
-Watch = Callable[[float, float], None]
-
-
 def balance(
-    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Watch | None = None
+    scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, watch: Progress | None = None
 ) -> Iterator[Iteration]:
     """Yield each flight's iteration until the torque is below the bar, or max_flights are flown.
 

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
 from skysim.core import files
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
 from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
 from skysim.results.plots import bgr_image
@@ -34,9 +33,7 @@ INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
 MOMENT_NAMES = ("x", "y", "z")
 
 
-def statistics(
-    scene: str, plan: BalancePlan, iterations: Sequence[Iteration]
-) -> dict[str, Any]:
+def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> Record:
     """All numbers of a balance, SI except where a unit is in the name."""
     last = iterations[-1]
     return {
@@ -51,7 +48,7 @@ def statistics(
     }
 
 
-def flight_row(number: int, one: Iteration) -> dict[str, Any]:
+def flight_row(number: int, one: Iteration) -> Record:
     """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
     trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
@@ -84,7 +81,7 @@ def true_values(flight: BalanceFlight) -> Floats:
     return np.concatenate([inertia_six(inertia), moment])
 
 
-def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[dict[str, Any]]:
+def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[Record]:
     """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
     scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
     names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
@@ -102,27 +99,19 @@ def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
 
 
-def balance_figure(
-    iterations: Sequence[Iteration], torque_bar_nm: float
-) -> NDArray[np.uint8]:
-    """BGR image: gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
-    return bgr_image(lambda fig: draw_flights(fig, iterations, torque_bar_nm), (15, 4.5))
-
-
 def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float) -> None:
-    """Draw the three panels of `balance_figure`."""
+    """Draw gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
     torque, offset, motion = fig.subplots(1, 3)
     numbers = np.arange(1, len(iterations) + 1)
-    torque.semilogy(numbers, [one.torque_nm for one in iterations], "o-", label="estimate")
-    torque.semilogy(
-        numbers, [one.torque_bound_nm for one in iterations], "v--", label="bound"
-    )
-    torque.semilogy(
-        numbers, [one.true_torque_nm for one in iterations], "kx", label="simulated vehicle"
-    )
+    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
+    for key, style, label in (
+        ("torque_nm", "o-", "estimate"),
+        ("torque_bound_nm", "v--", "bound"),
+        ("true_torque_nm", "kx", "simulated vehicle"),
+    ):
+        torque.semilogy(numbers, [row[key] for row in rows], style, label=label)
     torque.axhline(torque_bar_nm, color="0.5", linestyle=":")
     torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
-    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
     for axis, name in enumerate(MOMENT_NAMES):
         values, sigma = (
             [row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um")
@@ -143,13 +132,13 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
         axes.legend(fontsize="small")
 
 
-def filter_rows(one: Iteration, assumptions: Assumptions) -> list[dict[str, Any]]:
+def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
     """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
     return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
 
 
-def balance_report(statistics: dict[str, Any], picture: bytes, command: str) -> Report:
-    """The report of a balance with the picture of `balance_figure` as PNG bytes."""
+def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
+    """The report of a balance with the picture of `draw_flights` as PNG bytes."""
     blocks = [
         verdict(statistics),
         Facts(
@@ -179,7 +168,7 @@ FLIGHTS = (
 )
 
 
-def verdict(statistics: dict[str, Any]) -> Verdict:
+def verdict(statistics: Record) -> Verdict:
     """Whether the vehicle is balanced, with the torque and its bound."""
     flights = statistics["flights"]
     last = flights[-1]
@@ -193,7 +182,7 @@ def verdict(statistics: dict[str, Any]) -> Verdict:
     )
 
 
-def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
+def flight_table(flights: Sequence[Record]) -> Table:
     """One row per flight."""
     columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
     columns += [
@@ -213,13 +202,13 @@ def flight_table(flights: Sequence[dict[str, Any]]) -> Table:
     return Table(columns, rows)
 
 
-def offset_text(flight: dict[str, Any]) -> str:
+def offset_text(flight: Record) -> str:
     """The center of mass with its standard deviations."""
     found = zip(flight["offset_um"], flight["offset_sigma_um"], strict=True)
     return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
 
 
-def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
+def mass_blocks(rows: Sequence[Record]) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's."""
     heads = ("estimate", "1σ", "simulated vehicle")
     columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
@@ -235,11 +224,13 @@ def mass_blocks(rows: Sequence[dict[str, Any]]) -> list[Block]:
 
 
 def write_all(
-    folder: Path, statistics: dict[str, Any], iterations: Sequence[Iteration], command: str
+    folder: Path, statistics: Record, iterations: Sequence[Iteration], command: str
 ) -> Report:
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
-    files.write_image(picture, balance_figure(iterations, statistics["torque_bar_nm"]))
+    bar_nm = statistics["torque_bar_nm"]
+    image = bgr_image(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
+    files.write_image(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))
     report = balance_report(statistics, picture.read_bytes(), command)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
 from skysim.core.random_streams import random_stream
+from skysim.core.types import Record
 from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
 from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
@@ -48,7 +49,7 @@ from skysim.experiments.study.plan import (
 
 KEYS = ("schema", "set", "trial", "factors", "hardware")  # sections of a file of variations
 # The factors if there are no variations.
-AS_IT_IS: dict[str, Any] = {"variation": {"levels": {"none": {}}}}
+AS_IT_IS: Record = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
@@ -85,7 +86,9 @@ class DatasetPlan:
         levels = {}
         settings = Settings()
         for n, (name, factor) in enumerate(self.factors.items()):
-            number = (0, frame) if is_of_frame(factor) else (1, shard)
+            # A factor that sets only keys of the trial is drawn in every frame.
+            of_frame = all(key.startswith(TRIAL) for key in keys_of(factor))
+            number = (0, frame) if of_frame else (1, shard)
             u = float(random_stream(self.spec.seed, DRAW, *number, n).random())
             levels[name], own = factor.value_at(u)
             settings |= own
@@ -95,7 +98,7 @@ class DatasetPlan:
         """The seed of a frame's attitude and noise."""
         return seed_of(self.spec, 0, frame)
 
-    def manifest(self) -> dict[str, Any]:
+    def manifest(self) -> Record:
         """The description of the dataset for `dataset.json`."""
         spec = self.spec
         return {
@@ -126,11 +129,6 @@ def keys_of(factor: Factor) -> set[str]:
     return {key for settings in options for key in settings}
 
 
-def is_of_frame(factor: Factor) -> bool:
-    """Whether a factor sets only keys of the trial, so that it is drawn in every frame."""
-    return all(key.startswith(TRIAL) for key in keys_of(factor))
-
-
 def load(
     scene: str,
     vary: Path | None,
@@ -157,7 +155,9 @@ def load(
         if name not in FORMATS:
             raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
     plan = study_plan(scene, vary, seed, overrides or {})
-    check_trial(plan, vary)
+    keys = set().union(*map(keys_of, plan.study.factors.values()))
+    if "tracked" in plan.spec.trial or TRACKED in keys:  # which only affects solving
+        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
     return DatasetPlan(
         plan.spec,
         dict(plan.study.factors),
@@ -165,15 +165,6 @@ def load(
         frames_per_shard,
         tuple(dict.fromkeys(formats)),
     )
-
-
-def check_trial(plan: Plan, vary: Path | None) -> None:
-    """Raise InputError for `trial.tracked`, which only affects solving."""
-    keys = {*(TRIAL + key for key in plan.spec.trial)}.union(
-        *map(keys_of, plan.study.factors.values())
-    )
-    if TRACKED in keys:
-        raise InputError(vary, f"{TRACKED}: no effect on single frames", "studies")
 
 
 def study_plan(
@@ -265,7 +256,7 @@ class ShardQueue:
 
 def labelled_frames(
     plan: DatasetPlan, shard: int
-) -> Iterator[tuple[int, dict[str, Any], TrialSetup, LabelledFrame]]:
+) -> Iterator[tuple[int, Record, TrialSetup, LabelledFrame]]:
     """The frames of a shard: number, level of each factor, lab, frame with labels."""
     known = None  # settings of the previous frame
     for frame in plan.frames_of(shard):
@@ -282,7 +273,7 @@ def labelled_frames(
 def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     """Render a shard's frames and write all of its files, the index last."""
     frames = plan.frames_of(shard)
-    rows = list[dict[str, Any]]()
+    rows = list[Record]()
     sources = []
     images = []
     coco = []
@@ -360,7 +351,7 @@ def folders_of(plan: DatasetPlan) -> tuple[str, ...]:
     )
 
 
-def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
+def check_manifest(storage: Storage, own: Record) -> None:
     """Raise InputError if the existing dataset is another one, or of another version."""
     try:
         stored = json.loads(storage.read_text(MANIFEST))
@@ -389,16 +380,6 @@ def check_manifest(storage: Storage, own: dict[str, Any]) -> None:
         )
 
 
-def missing_shards(plan: DatasetPlan, storage: Storage) -> list[int]:
-    """The shards without an index."""
-    there = storage.names(INDEX)
-    return [
-        shard
-        for shard in range(plan.shards)
-        if shard_name("", shard, "parquet")[1:] not in there
-    ]
-
-
 def run(
     plan: DatasetPlan,
     url: str,
@@ -408,7 +389,12 @@ def run(
     """Make the missing shards. Progress counts frames; frames of shards that killed their workers count as failed."""
     storage = Storage(url)
     prepare(plan, storage)
-    missing = missing_shards(plan, storage)
+    there = storage.names(INDEX)
+    missing = [
+        shard
+        for shard in range(plan.shards)
+        if shard_name("", shard, "parquet")[1:] not in there
+    ]
     left = sum(len(plan.frames_of(shard)) for shard in missing)
     progress = Progress(plan.frames, plan.frames - left, began=time.perf_counter())
     for results in engine.run(DatasetJob(plan, url), ShardQueue(missing)) if missing else ():

@@ -19,7 +19,7 @@ from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.jit import jit
-from skysim.core.types import ATTITUDES, Floats
+from skysim.core.types import ATTITUDES, Floats, Record
 from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -172,7 +172,7 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
     return f"{folder}/{shard:06d}.{suffix}"
 
 
-def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str, Any]) -> int:
+def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: Record) -> int:
     """Append a frame with its labels; return the position of its first pixel."""
     key = key_of(number)
     image = np.ascontiguousarray(one.frame.image_dn)
@@ -191,7 +191,7 @@ def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: dict[str,
     return position
 
 
-def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> dict[str, Any]:
+def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
     """The scalar labels of a frame, by column of the index; `numbers` come first."""
     truth = one.truth
     frame = one.frame
@@ -220,7 +220,7 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: dict[str, Any]) -> d
 # COCO.
 
 
-def coco_image(labels: dict[str, Any]) -> dict[str, Any]:
+def coco_image(labels: Record) -> Record:
     """The entry of an image; its file is in the tar of the shard."""
     name = (
         f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
@@ -351,7 +351,7 @@ def mask_box(counts: list[int], height: int) -> list[float]:
     return [float(x0), float(y0), float(x1 - x0 + 1), float(y1 - y0 + 1)]
 
 
-def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
+def coco_file(images: list[Record], annotations: list[bytes]) -> bytes:
     """A COCO file of one shard, from the annotations of each frame."""
     categories = json.dumps(
         [{"id": n, "name": name} for n, name in enumerate(CATEGORIES, 1)]
@@ -363,7 +363,7 @@ def coco_file(images: list[dict[str, Any]], annotations: list[bytes]) -> bytes:
 # Tables.
 
 
-def parquet(columns: dict[str, Any]) -> bytes:
+def parquet(columns: Record) -> bytes:
     """A Parquet file of some columns, the same bytes for the same columns. Raises InputError without pyarrow."""
     try:
         import pyarrow
@@ -375,7 +375,7 @@ def parquet(columns: dict[str, Any]) -> bytes:
     return bytes(sink.getvalue())
 
 
-def index_table(rows: list[dict[str, Any]]) -> bytes:
+def index_table(rows: list[Record]) -> bytes:
     """The index of a shard: a row for each frame."""
     return parquet({name: [row[name] for row in rows] for name in rows[0]})
 

@@ -45,7 +45,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints, Mask, Record
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -59,13 +59,11 @@ from skysim.tracking import onboard_model
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 SAME_STOP_DEG = 0.5  # frames of a stop differ by less, two stops in a row by more
-STILL_DEG = (
-    0.05  # a frame whose attitude differs by more from the frame before is taken in motion
-)
+# A frame whose attitude differs by more from the frame before is taken in motion.
+STILL_DEG = 0.05
 CLICKS = 4
-DISTINCT_ARCSEC = (
-    100.0  # angles with a larger gap are distinct: a bucket of the thesis's pair catalog
-)
+# Angles with a larger gap are distinct: a bucket of the thesis's pair catalog.
+DISTINCT_ARCSEC = 100.0
 QUEST_LEDS = 2
 
 
@@ -99,8 +97,8 @@ class Calibration(NamedTuple):
 
     camera: Camera
     catalog: HomeCatalog
-    led: NDArray[np.int64]
-    stop: NDArray[np.int64]
+    led: Ints
+    stop: Ints
     magnitude: Floats
     body_m: Floats
     lab_m: Floats
@@ -284,8 +282,9 @@ def calibrated(
     imu = Rotation.concatenate([common[n].body_from_lab.inv() for n in first])
     brightness = np.array([one.brightness for one in common])
     brightest = np.argsort(-brightness[0])[:QUEST_LEDS]
+    at_home = unit(lab_m[0, brightest])
     algorithm_deg = [
-        euler_deg(quest_attitude(body_m[n, brightest], lab_m[0, brightest]))
+        euler_deg(quest(at_home, unit(body_m[n, brightest]), np.ones(len(brightest))))
         if np.array_equal(common[n].led, common[0].led)
         else np.full(3, np.nan)
         for n in first
@@ -346,15 +345,10 @@ def pair_angles_rad(body_m: Floats) -> Floats:
     return separation_rad(directions[..., a, :], directions[..., b, :])
 
 
-def quest_attitude(body_m: Floats, lab_m: Floats) -> Rotation:
-    """lab_from_body by QUEST from N points in both frames."""
-    return quest(unit(lab_m), unit(body_m), np.ones(len(body_m)))
-
-
 # Numbers and pages.
 
 
-def statistics(found: Calibration) -> dict[str, Any]:
+def statistics(found: Calibration) -> Record:
     """The numbers of `skysim calibrate --json`: LEDs by their brightness, pairs by their angle, stops in order."""
     order = np.argsort(-found.magnitude.mean(axis=0), kind="stable")
     ranked = -np.sort(-found.magnitude, axis=1)
@@ -413,7 +407,7 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     }
 
 
-def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
+def spread(values: Floats, sets: Sequence[Mask]) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
     return {
         "mean": float(values.mean()),
@@ -429,7 +423,7 @@ def spread(values: Floats, sets: Sequence[NDArray[np.bool_]]) -> dict[str, Any]:
 
 
 def calibration_report(
-    title: str, command: str, found: Calibration, numbers: dict[str, Any]
+    title: str, command: str, found: Calibration, numbers: Record
 ) -> Report:
     """The report of `statistics`: histograms as in the thesis's appendix A, the tables, and the epsilons."""
     epsilon = numbers["epsilon"]
@@ -439,18 +433,12 @@ def calibration_report(
         f" position, {epsilon['separation_arcsec']:.3g}″ of an angle"
     )
     figures = [
-        Figure(
-            png(partial(draw_magnitudes, found), (7.4, 4.2)),
-            "Magnitudes by LED, a color for each stop.",
-        ),
-        Figure(
-            png(partial(draw_angles, found), (7.4, 3.2)),
-            "Angles of all pairs about the bearing.",
-        ),
-        Figure(
-            png(partial(draw_places, found), (6.0, 4.6)),
-            "LEDs in the lab by the IMU, a color for each stop.",
-        ),
+        Figure(png(partial(draw, found), (width_in, height_in)), caption)
+        for draw, width_in, height_in, caption in (
+            (draw_magnitudes, 7.4, 4.2, "Magnitudes by LED, a color for each stop."),
+            (draw_angles, 7.4, 3.2, "Angles of all pairs about the bearing."),
+            (draw_places, 6.0, 4.6, "LEDs in the lab by the IMU, a color for each stop."),
+        )
     ]
     magnitude = Column("magnitude", "", ".2f")
     angle = Column("angle", "″", ".1f")
@@ -485,9 +473,7 @@ def calibration_report(
     return Report(title, [Verdict(text), *figures, *sections], command)
 
 
-def spread_table(
-    keys: Iterable[int], name: str, value: Column, rows: list[dict[str, Any]]
-) -> Table:
+def spread_table(keys: Iterable[int], name: str, value: Column, rows: list[Record]) -> Table:
     """Mean and deviation of the rows of `statistics`, over all frames, and the mean at each stop."""
     stops = max((len(one["stops"]) for one in rows), default=0)
     columns = [Column(name), value, value._replace(title="deviation", format=".2f")]
@@ -500,7 +486,7 @@ def spread_table(
 
 def write_results(
     folder: Path, known: Assumed, found: Calibration, command: str
-) -> tuple[dict[str, Any], Report]:
+) -> tuple[Record, Report]:
     """Write the report, and the catalog as a map for `tracker.map`; return what `--json` prints, and the report."""
     numbers = statistics(found)
     made = calibration_report(f"Calibration of {known.scene.name}", command, found, numbers)

@@ -11,6 +11,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
+from skysim.core.types import Record
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.frame_files import read_stack
@@ -22,6 +23,8 @@ from skysim.experiments.characterize.photon_transfer import (
     GAIN,
     LIGHT,
     Estimate,
+    by_level,
+    exposures_s,
     model,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
@@ -45,7 +48,7 @@ from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig
 
 
 def characterize_report(
-    statistics: dict[str, Any],
+    statistics: Record,
     config: CameraConfig,
     found: MeasuredSensor,
     night: Night | None,
@@ -76,7 +79,7 @@ def characterize_report(
     return Report(f"{statistics['camera']}, measured", blocks)
 
 
-def verdict(statistics: dict[str, Any], values: int) -> Verdict:
+def verdict(statistics: Record, values: int) -> Verdict:
     """How many values are known, and how well the law of photon transfer holds."""
     unknown = len(statistics["remarks"])
     misfit = statistics["misfit"]
@@ -84,7 +87,7 @@ def verdict(statistics: dict[str, Any], values: int) -> Verdict:
     return Verdict(f"{text} (1 if the law holds).", "warning" if unknown else "good")
 
 
-def facts(statistics: dict[str, Any]) -> Facts:
+def facts(statistics: Record) -> Facts:
     """The preset, and the conditions of the values."""
     celsius = statistics["temperature_c"]
     night = statistics["night"]
@@ -112,7 +115,7 @@ def facts(statistics: dict[str, Any]) -> Facts:
     return Facts(rows)
 
 
-def value_table(statistics: dict[str, Any]) -> Table:
+def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
     columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
@@ -156,8 +159,8 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
         ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
     )
     for name, points, colors in groups:
-        signal = np.array([one.moments.mean_dn for one in points]) - black
-        variance = np.array([one.moments.variance_dn2 for one in points])
+        signal = by_level(points, "mean_dn") - black
+        variance = by_level(points, "variance_dn2")
         shown = np.maximum(signal, 0.1), np.maximum(variance, 0.05)
         curve.scatter(*shown, 18, label=name, **colors)
     expected_mean, expected_variance = model(fitted, transfer.values)
@@ -170,8 +173,8 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     curve.legend()
     plain_labels(curve.xaxis, curve.yaxis)
     flats = [one for one in fitted if one.lit] + beyond
-    time_s = np.array([one.exposure_s for one in flats])
-    signal = np.array([one.moments.mean_dn for one in flats]) - black
+    time_s = exposures_s(flats)
+    signal = by_level(flats, "mean_dn") - black
     linear = (transfer.values[LIGHT] + transfer.values[FIRST_DARK + flats[0].dark]) * time_s
     inside = signal < 0.98 * signal.max()
     line.scatter(linear[inside], 100 * (signal / linear - 1)[inside], 18, color=INK[0])
@@ -234,10 +237,11 @@ def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
 
 
 DIGITS = 6
+Stated = dict[str, tuple[Any, str]]  # value and comment by key
 
 
 def preset_text(
-    camera: Mapping[str, Any],
+    camera: Record,
     config: CameraConfig,
     sensor: MeasuredSensor,
     night: Night | None,
@@ -258,12 +262,12 @@ def preset_text(
     return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
 
 
-def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
+def measured(sensor: MeasuredSensor) -> Stated:
     """Value and comment by key of the section camera; an estimate below 0 becomes 0."""
-    found: dict[str, tuple[Any, str]] = {}
-    for key, one in sensor.estimates.items():
-        value = max(one.value, 0.0)
-        found[f"detector.{key}"] = (rounded(value), comment(one))
+    found = {
+        f"detector.{key}": stated(one._replace(value=max(one.value, 0.0)))
+        for key, one in sensor.estimates.items()
+    }
     if sensor.dark_temperature_c is not None:
         celsius = rounded(sensor.dark_temperature_c)
         found["detector.dark_temperature_c"] = (celsius, "[M] of the darks")
@@ -274,16 +278,13 @@ def measured(sensor: MeasuredSensor) -> dict[str, tuple[Any, str]]:
     return found
 
 
-def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, str]]:
+def measured_lens(config: CameraConfig, night: Night) -> Stated:
     """Value and comment by key of the lens."""
     size = night.size
-    found: dict[str, tuple[Any, str]] = {
+    found: Stated = {
         "psf.kind": ("gaussian", "[M]"),
-        "psf.sigma_px": (rounded(size.sigma_px.value), comment(size.sigma_px)),
-        "psf.corner_sigma_px": (
-            rounded(size.corner_sigma_px.value),
-            comment(size.corner_sigma_px),
-        ),
+        "psf.sigma_px": stated(size.sigma_px),
+        "psf.corner_sigma_px": stated(size.corner_sigma_px),
     }
     if night.lens is None:
         return found
@@ -304,6 +305,11 @@ def measured_lens(config: CameraConfig, night: Night) -> dict[str, tuple[Any, st
     }
 
 
+def stated(one: Estimate) -> tuple[Any, str]:
+    """An estimate's value and comment."""
+    return rounded(one.value), comment(one)
+
+
 def comment(one: Estimate) -> str:
     return f"[M] {one.low:.5g} to {one.high:.5g}"
 
@@ -313,9 +319,7 @@ def rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def lines(
-    camera: Mapping[str, Any], found: Mapping[str, tuple[Any, str]]
-) -> Iterator[SheetLine]:
+def lines(camera: Record, found: Stated) -> Iterator[SheetLine]:
     """The lines of the section, with measured values in place of the camera's own; subsections come last."""
     tree = copy.deepcopy(dict(camera))
     if "psf.kind" in found:
@@ -327,7 +331,7 @@ def lines(
 
 
 def section_lines(
-    section: Mapping[str, Any], prefix: str, sources: Mapping[str, str]
+    section: Record, prefix: str, sources: Mapping[str, str]
 ) -> Iterator[SheetLine]:
     """The lines of a section: its values, then its subsections."""
     for key, value in section.items():
@@ -338,13 +342,6 @@ def section_lines(
     for key, value in section.items():
         if isinstance(value, dict):
             yield from section_lines(value, f"{prefix}{key}.", sources)
-
-
-def write(path: Path, contents: str) -> None:
-    """Write the file and read it as a scene would. Raises InputError if it is not a valid camera."""
-    files.make_folder(path.parent)
-    files.write_text(path, contents)
-    loader.load_camera(path, PLACEHOLDER_LENS)
 
 
 UNITS = {
@@ -364,7 +361,7 @@ UNITS = {
 }
 
 
-def read_camera(name: str) -> tuple[CameraConfig, dict[str, Any]]:
+def read_camera(name: str) -> tuple[CameraConfig, Record]:
     """The camera of a preset, a camera file or a scene, and its raw section. Raises InputError."""
     path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
     camera = loader.load_camera(path, PLACEHOLDER_LENS)
@@ -388,7 +385,7 @@ def measure_sensor(
 
 
 def measure_night(
-    config: CameraConfig, raw: dict[str, Any], folder: Path, found: MeasuredSensor
+    config: CameraConfig, raw: Record, folder: Path, found: MeasuredSensor
 ) -> Night:
     """The lens from a folder of night frames. Raises InputError for a camera without a lens, or unusable frames."""
     if "focal_length" not in raw:
@@ -403,14 +400,21 @@ def measure_night(
 def write_results(
     folder: Path,
     config: CameraConfig,
-    raw: dict[str, Any],
+    raw: Record,
     found: MeasuredSensor,
     night: Night | None,
     name: str,
-) -> tuple[dict[str, Any], Report]:
-    """Write preset, report and `characterize.json`; return the statistics in it, and the report."""
-    path = folder / "camera.yaml"
-    write(path, preset_text(raw, config, found, night, name))
+) -> tuple[Record, Report]:
+    """Write preset, report and `characterize.json`; return the statistics in it, and the report.
+
+    Raises
+    ------
+    InputError
+        If the preset is not a valid camera.
+    """
+    path = files.make_folder(folder) / "camera.yaml"
+    files.write_text(path, preset_text(raw, config, found, night, name))
+    loader.load_camera(path, PLACEHOLDER_LENS)  # as a scene reads it
     statistics = {
         "camera": name,
         "preset": str(path),
@@ -432,7 +436,7 @@ def write_results(
     return statistics, report
 
 
-def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
+def night_statistics(config: CameraConfig, night: Night) -> Record:
     """Rows of the lens, and the numbers of frames and stars that were used."""
     psf = config.psf if isinstance(config.psf, GaussianPsfConfig) else None
     rows = [
@@ -455,7 +459,7 @@ def night_statistics(config: CameraConfig, night: Night) -> dict[str, Any]:
     }
 
 
-def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
+def row(key: str, one: Estimate, before: object) -> Record:
     """A row of the table: name, value, interval, unit, and the value of the camera's file."""
     return {
         "what": key,
@@ -469,14 +473,10 @@ def row(key: str, one: Estimate, before: object) -> dict[str, Any]:
 
 def check_folders(darks: Path | None, flats: Path | None) -> tuple[Path, Path]:
     """Both folders. Raises InputError if one is missing."""
-
-    def required(folder: Path | None, name: str, unknown: str) -> Path:
-        if folder is None:
-            problem = f"missing: without them {unknown} are unknown"
-            raise InputError(f"characterize.{name}", problem, f"a folder of {name}")
-        return folder
-
-    return (
-        required(darks, "darks", "dark current and black level"),
-        required(flats, "flats", "gain and full well"),
-    )
+    if darks and flats:
+        return darks, flats
+    name, unknown = ("flats", "gain and full well")
+    if not darks:
+        name, unknown = ("darks", "dark current and black level")
+    problem = f"missing: without them {unknown} are unknown"
+    raise InputError(f"characterize.{name}", problem, f"a folder of {name}")

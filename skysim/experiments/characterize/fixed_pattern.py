@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mask
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     Estimate,
     Level,
-    Mask,
     Transfer,
+    exposures_s,
+    median_and_spread,
 )
 from skysim.results import metrics
 
@@ -46,9 +46,8 @@ CONVERGED = 1e-3  # length of the last step, in standard deviations
 DIFFERENCE = 1e-4  # step of the numerical derivatives
 RESOLVED = 5.0  # standard errors by which a scatter must exceed the noise
 MEDIAN_COST = 1.65  # ratio of the standard errors of a variance from medians and from squares
-HOT_SIGMAS = (
-    8.0  # core widths above the median beyond which pixels are hot, at the start of the fit
-)
+# Core widths above the median beyond which pixels are hot, at the start of the fit.
+HOT_SIGMAS = 8.0
 
 
 class RateNoise(NamedTuple):
@@ -146,12 +145,6 @@ def hot_tail(
     share = hot.size / rates.size * math.exp(depth)
     sigma = share * math.sqrt(1 / hot.size + depth**2 / below)
     return Estimate.lognormal(share, sigma), Estimate.lognormal(mean, mean / math.sqrt(below))
-
-
-def median_and_spread(values: Floats) -> tuple[float, float]:
-    """Median and robust standard deviation."""
-    median = float(np.median(values))
-    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
 def bin_edges(rates: Floats, greatest: float) -> Floats:
@@ -261,7 +254,7 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
     half
         first_dn or second_dn
     """
-    times = np.array([one.exposure_s for one in darks])
+    times = exposures_s(darks)
     every = np.ones(darks[0].first_dn.shape, bool)
     weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
     weight /= weight.sum()
@@ -321,7 +314,7 @@ def light_rate(
 ) -> Floats:
     """Rate of every pixel in the light, DN/s, by weighted least squares through 0, without black level and dark."""
     base, rate, _ = dark
-    times = np.array([one.exposure_s for one in flats])
+    times = exposures_s(flats)
     weight = np.array([one.count / one.variance_dn2.mean(dtype=np.float64) for one in flats])
     weight = weight * times / np.sum(weight * times**2)
     total = np.zeros(base.shape)

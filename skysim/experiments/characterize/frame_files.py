@@ -21,17 +21,16 @@ from scipy import ndimage
 from skysim.camera import detector
 from skysim.camera.detector import Detector
 from skysim.core import images
-from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mask
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
     LevelBuilder,
-    Mask,
+    median_and_spread,
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
@@ -39,9 +38,8 @@ TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
 TEMPERATURE = re.compile(r"(?:^|[_\- ])([-+]?\d+(?:\.\d+)?)C(?=$|[_\- ])")
-TEMPERATURE_STEP_C = (
-    0.5  # temperatures are rounded to it: a cooled chip is held to a tenth of a degree
-)
+# Temperatures are rounded to it: a cooled chip is held to a tenth of a degree.
+TEMPERATURE_STEP_C = 0.5
 
 
 class Setting(NamedTuple):
@@ -63,19 +61,10 @@ class Stack:
 
 def image_files(folder: Path) -> list[Path]:
     """The images of a folder and its subfolders by name; FITS if one name has several formats. Raises InputError."""
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of images")
-    best: dict[Path, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if (suffix := images.image_suffix(path.name)) and path.name[0] != ".":
-            stem = path.with_name(path.name[: -len(suffix)])
-            best[stem] = min(
-                best.get(stem, path), path, key=lambda one: not images.is_fits(one)
-            )
-    found = list(best.values())
+    found = images.best_images(folder, lambda path: not images.is_fits(path), recursive=True)
     if not found:
         raise InputError(folder, "no images", ", ".join(images.IMAGE_SUFFIXES))
-    return found
+    return list(found.values())
 
 
 def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
@@ -175,9 +164,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     stack = Stack(folder)
     shift = None
     for path, setting, frame in read_frames(folder):
-        if frame.shape != shape:
-            size = f"{frame.shape[1]} x {frame.shape[0]} pixels"
-            raise InputError(path, size, f"{shape[1]} x {shape[0]}, as the camera has them")
+        images.check_size(path, frame, shape)
         shift = padding_bits(frame, bits) if shift is None else shift
         numbers = np.right_shift(frame, np.uint16(shift))
         if numbers.max() >= 2**bits:
@@ -284,7 +271,7 @@ def frames_of(
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
     made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
     key = (
-        shot.kind == "flats",
+        int(shot.kind == "flats"),
         round(1e6 * shot.exposure_s),
         round(10 * (shot.temperature_c + 300)),
     )
@@ -293,9 +280,7 @@ def frames_of(
             (camera.height_px, camera.width_px), shot.light_e_s * shot.exposure_s, np.float32
         )
         detector.smear(light_e, max(shot.exposure_s, 1e-9), camera.shutter)
-        yield detector.expose(
-            light_e, shot.exposure_s, made, random_stream(seed, *map(int, key), n)
-        )
+        yield detector.expose(light_e, shot.exposure_s, made, random_stream(seed, *key, n))
 
 
 def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path]:
@@ -304,9 +289,7 @@ def write_frames(camera: CameraConfig, folder: Path, seed: int) -> Iterator[Path
 
     for shot in shots(camera.detector):
         parent = make_folder(folder / shot.kind)
-        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C".replace(
-            "/", ""
-        )
+        name = f"{shot.kind[:-1]}_{shot.exposure_s:g}s_{shot.temperature_c:g}C"
         for n, frame in enumerate(frames_of(camera, shot, seed)):
             header = fits.Header([images.TOP_DOWN_CARD])
             header["EXPTIME"] = (shot.exposure_s, "exposure [s]")
@@ -329,25 +312,16 @@ LEAST_LEVELS = 4  # least levels of flats below saturation: for three rates and 
 MEDIAN_SIGMAS = 0.5  # greatest difference of a dark's median from the others, in standard deviations of a pixel
 MAX_ZEROS = 1e-3  # greatest fraction of a dark's pixels that are 0
 BLOCK = 32  # side in pixels of the blocks whose medians show structure
-MAX_DARK_RANGE = (
-    2.0  # greatest range of the blocks' medians in a dark, in standard deviations of a pixel
-)
+# Greatest range of the blocks' medians in a dark, in standard deviations of a pixel.
+MAX_DARK_RANGE = 2.0
 MAX_FLAT_RANGE = 0.3  # greatest range of the light over a flat, relative to its mean
 BRIGHT = 0.2  # signal, relative to the brightest flat, above which a flat must be flat
 MAX_PAIR_CHANGE = 0.03  # greatest relative change of the light from frame to frame
 SPOT_SIGMAS = 12.0  # standard deviations above which a pixel is bright
 SPOT_PIXELS = 4  # least number of touching bright pixels of a spot
 MAX_SPOTS = 3  # greatest number of spots beyond those expected by chance
-POLYPLETS = (
-    110  # figures of four squares that touch by sides or corners, fixed (OEIS A006770)
-)
-
-
-class BrightSpots(NamedTuple):
-    """Where a frame is brightest and darkest, in words."""
-
-    brightest: str
-    darkest: str
+# Figures of four squares that touch by sides or corners, fixed (OEIS A006770).
+POLYPLETS = 110
 
 
 def check_darks(darks: Stack) -> None:
@@ -402,17 +376,16 @@ def check_dark(darks: Stack, level: Level) -> None:
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
     if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
-        place = extremes(medians)
         raise InputError(
             folder,
-            f"{which} are not dark: {extent:.3g} DN brighter at the {place.brightest} than at the {place.darkest}",
+            f"{which} are not dark: {extent:.3g} DN brighter at {extremes(medians)}",
             f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
     both = np.minimum(level.first_dn, level.second_dn)
     bright = both > np.median(mean) + SPOT_SIGMAS * max(
-        spread(mean), noise_dn / math.sqrt(level.count)
+        median_and_spread(mean)[1], noise_dn / math.sqrt(level.count)
     )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))
     sizes = np.bincount(labels.ravel())[1:]
@@ -471,17 +444,11 @@ def check_flat(folder: Path, which: str, medians: Floats) -> None:
     """Raise InputError for a flat whose blocks' medians differ too much."""
     extent = float(np.ptp(medians) / medians.mean())
     if extent > MAX_FLAT_RANGE:
-        place = extremes(medians)
         raise InputError(
             folder,
-            f"{which} are not flat: {100 * extent:.0f} % brighter at the {place.brightest} than at the {place.darkest}",
+            f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
             f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
         )
-
-
-def spread(image: Floats) -> float:
-    """Robust standard deviation of the pixels."""
-    return float(np.median(np.abs(image - np.median(image)))) / MAD_PER_SIGMA
 
 
 def block_medians(image: Floats) -> Floats:
@@ -492,7 +459,7 @@ def block_medians(image: Floats) -> Floats:
     return np.median(blocks, axis=(1, 3))
 
 
-def extremes(medians: Floats) -> BrightSpots:
+def extremes(medians: Floats) -> str:
     """The places of the greatest and of the least block, in words."""
 
     def word(index: int) -> str:
@@ -505,4 +472,4 @@ def extremes(medians: Floats) -> BrightSpots:
             else f"{vertical} {horizontal}"
         )
 
-    return BrightSpots(word(int(np.argmax(medians))), word(int(np.argmin(medians))))
+    return f"the {word(int(np.argmax(medians)))} than at the {word(int(np.argmin(medians)))}"

@@ -328,11 +328,7 @@ def read_frame(
     numbers = raw_numbers(path, picture.pixels)
     if as_stored and not picture.row_order_known:
         numbers = np.ascontiguousarray(numbers[::-1])
-    if numbers.shape != (config.height_px, config.width_px):
-        size = f"{numbers.shape[1]} x {numbers.shape[0]} pixels"
-        raise InputError(
-            path, size, f"{config.width_px} x {config.height_px}, as the camera has them"
-        )
+    images.check_size(path, numbers, (config.height_px, config.width_px))
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
     try:
         centroids = detect_and_centroid(

@@ -20,7 +20,7 @@ saturated level the variance collapses: it grows up to the turnover and falls to
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.optimize import brentq, least_squares
 
-from skysim.core.types import Floats
+from skysim.core.constants import MAD_PER_SIGMA
+from skysim.core.types import Floats, Mask
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -89,10 +90,15 @@ def propagate(
     return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 
+def median_and_spread(values: Floats) -> tuple[float, float]:
+    """Median and robust standard deviation."""
+    median = float(np.median(values))
+    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
+
+
 # Frames of one exposure, reduced to two mean frames and the temporal variance of every pixel.
 
 
-Mask = NDArray[np.bool_]
 TRIM = 5.0  # interquartile ranges from the median within which pixels are averaged
 SAMPLES = 100_000  # number of pixels from which the quartiles are computed
 
@@ -210,14 +216,6 @@ def trimmed_mean(difference: NDArray[np.float32]) -> float:
     return float(difference[inside].mean(dtype=np.float64))
 
 
-def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
-    """The level of two frames or more."""
-    builder = LevelBuilder()
-    for frame in frames:
-        builder.add(frame)
-    return builder.level(exposure_s, temperature_c)
-
-
 ROUNDING_DN2 = 1 / 12  # variance of a rounding error, uniform over one number
 FIT_RANGE = 0.7
 SIGNIFICANT = 2.0  # standard errors above which flicker and drift are significant
@@ -241,6 +239,16 @@ class TransferPoint(NamedTuple):
     lit: int
     dark: int
     moments: Moments
+
+
+def exposures_s(levels: Sequence[Level | TransferPoint]) -> Floats:
+    """(L,) exposure times."""
+    return np.array([one.exposure_s for one in levels])
+
+
+def by_level(points: Sequence[TransferPoint], name: str) -> Floats:
+    """(L,) one of the moments of each level."""
+    return np.array([getattr(one.moments, name) for one in points])
 
 
 class Transfer(NamedTuple):
@@ -288,13 +296,6 @@ class Transfer(NamedTuple):
     def offset_dn(self) -> Estimate:
         return Estimate.normal(self.values[BLACK], math.sqrt(self.covariance[BLACK, BLACK]))
 
-    @property
-    def light_e_s(self) -> Estimate:
-        """Electrons that the lamp gives a pixel in a second."""
-        return Estimate.normal(
-            *propagate(lambda p: p[LIGHT] / p[GAIN], self.values, self.covariance)
-        )
-
     def linear_dn(self, signal_dn: Floats) -> Floats:
         """The signal x that a linear amplifier would give, from the measured x (1 - c x)."""
         return linear_dn(signal_dn, float(self.values[CURVATURE]))
@@ -310,7 +311,7 @@ def model(
     points: Sequence[TransferPoint], values: Floats, light: Floats | float = 1.0
 ) -> tuple[Floats, Floats]:
     """Means and variances of the levels. `light`: that of each level, relative to the lamp's mean."""
-    t_s = np.array([one.exposure_s for one in points])
+    t_s = exposures_s(points)
     lit = np.array([one.lit for one in points])
     rate = (
         lit * light * values[LIGHT]
@@ -390,10 +391,7 @@ def fit_levels(
 
 def start_values(points: Sequence[TransferPoint]) -> Floats:
     """Start values: slope of the variance against the mean over all levels, and rates from the longest exposures."""
-    mean, variance = (
-        np.array([getattr(one.moments, name) for one in points])
-        for name in ("mean_dn", "variance_dn2")
-    )
+    mean, variance = (by_level(points, name) for name in ("mean_dn", "variance_dn2"))
     darkest = int(np.argmin(mean))
     brightest = int(np.argmax(mean))
     gain = (variance[brightest] - variance[darkest]) / max(
@@ -421,11 +419,8 @@ def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
 
 def saturated(points: Sequence[TransferPoint]) -> list[bool]:
     """Whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
-    variance = np.array([one.moments.variance_dn2 for one in points])
-    brighter = (
-        np.array([one.exposure_s for one in points])
-        > points[int(np.argmax(variance))].exposure_s
-    )
+    variance = by_level(points, "variance_dn2")
+    brighter = exposures_s(points) > points[int(np.argmax(variance))].exposure_s
     return [bool(one) for one in brighter & (variance < COLLAPSED * variance.max())]
 
 
@@ -441,8 +436,8 @@ def lamp_flicker(
     A flicker that is not above its own error by SIGNIFICANT sigmas is set to 0: otherwise half of all steady lamps
     would have one.
     """
-    signal = np.array([one.moments.mean_dn for one in points]) - black_dn
-    noise = 2 * np.array([one.moments.variance_dn2 for one in points]) / pixels
+    signal = by_level(points, "mean_dn") - black_dn
+    noise = 2 * by_level(points, "variance_dn2") / pixels
     excess = (np.array(difference_dn2) - noise) / (2 * signal**2)
     chance = math.sqrt(2 / len(points)) * math.sqrt(np.mean((noise / (2 * signal**2)) ** 2))
     mean = float(np.mean(excess))

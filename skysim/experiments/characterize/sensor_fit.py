@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mask
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
 from skysim.experiments.characterize.photon_transfer import (
@@ -21,15 +20,16 @@ from skysim.experiments.characterize.photon_transfer import (
     ROUNDING_DN2,
     Estimate,
     Level,
-    Mask,
     Transfer,
     TransferPoint,
+    by_level,
+    exposures_s,
+    median_and_spread,
     propagate,
 )
 
-HOT_SIGMAS = (
-    20.0  # above the median dark, beyond which pixels are left out of the photon transfer
-)
+# Standard deviations above the median dark, beyond which pixels are left out of the photon transfer.
+HOT_SIGMAS = 20.0
 HIT_SIGMAS = 8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
 
 
@@ -106,7 +106,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     first, second = (
         fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
     )
-    ratio = rate_ratio(transfer, own, chosen)
+    rates = transfer.values[FIRST_DARK:]
+    # Of the dark currents of the same pixels at the two temperatures.
+    ratio = 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
     dark = dark_parameters(found, at_it, first, second, own, ratio)
     doubling(found, temperatures)
     estimates = found.estimates
@@ -125,7 +127,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
             " differ; drift and a nonlinearity of another law look alike; allowed: a steadier lamp, or more flats"
         )
     error = linearity_error(flat_points, transfer)
-    saturation_dn = max(one.moments.mean_dn for one in flat_points)
+    saturation_dn = float(by_level(flat_points, "mean_dn").max())
     return MeasuredSensor(
         estimates,
         found.remarks,
@@ -138,12 +140,6 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     )
 
 
-def rate_ratio(transfer: Transfer, own: int, chosen: int) -> float:
-    """Ratio of the dark currents of the same pixels at two temperatures, `own` to `chosen`."""
-    rates = transfer.values[FIRST_DARK:]
-    return 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
-
-
 def usable_pixels(darks: Sequence[Level]) -> Mask:
     """Pixels that no particle has hit, and that are not hot in any dark.
 
@@ -152,9 +148,8 @@ def usable_pixels(darks: Sequence[Level]) -> Mask:
     usable = np.ones(darks[0].first_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
-        median = np.median(mean)
-        spread = max(np.median(np.abs(mean - median)) / MAD_PER_SIGMA, 0.5)
-        usable &= (mean < median + HOT_SIGMAS * spread) & steady_pixels(
+        median, spread = median_and_spread(mean)
+        usable &= (mean < median + HOT_SIGMAS * max(spread, 0.5)) & steady_pixels(
             one, float(np.median(one.variance_dn2))
         )
     return usable
@@ -209,7 +204,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
     full = [one for one, chosen in zip(flats, is_full, strict=True) if chosen]
     brightest = max(flats, key=lambda one: one.moments.mean_dn)
     if full:
-        level_dn = float(np.mean([one.moments.mean_dn for one in full]))
+        level_dn = float(by_level(full, "mean_dn").mean())
         sigma_dn = math.sqrt(np.mean([one.moments.mean_sigma_dn**2 for one in full]))
     else:
         level_dn = brightest.moments.mean_dn
@@ -260,7 +255,7 @@ def dark_parameters(
         )
     rates = ((first[1] + second[1]) / 2)[steady]
     counts = np.array([one.count for one in darks])
-    times = np.array([one.exposure_s for one in darks])
+    times = exposures_s(darks)
     noise = RateNoise(
         float(np.sum(weights**2 * read / counts)),
         float(np.sum(weights**2 * gain * times / counts)),
@@ -355,8 +350,8 @@ def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float
     The line is fitted with relative weights (EMVA 1288, release 4.0 Linear: the linearity error LE).
     """
     black = transfer.values[BLACK]
-    signal = np.array([one.moments.mean_dn for one in flats]) - black
-    time_s = np.array([one.exposure_s for one in flats])
+    signal = by_level(flats, "mean_dn") - black
+    time_s = exposures_s(flats)
     inside = (signal > 0.05 * signal.max()) & (signal < 0.95 * signal.max())
     if inside.sum() < 3:
         return math.nan

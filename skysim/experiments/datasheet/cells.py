@@ -21,7 +21,7 @@ from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mask, Record
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
@@ -96,7 +96,7 @@ class DatasheetCell(NamedTuple):
     """One cell: its experiment, its levels there, and its settings."""
 
     experiment: str
-    levels: dict[str, Any]
+    levels: Record
     settings: Settings
 
     @property
@@ -259,12 +259,22 @@ class Designer:
         per_px = self.pixel_deg / self.scene.exposure.time_s
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
+    def accelerations_deg_s2(self, bends_px: Sequence[float], time_s: float) -> list[float]:
+        """Accelerations that bend a path by these lengths in a time, to two digits."""
+        return [float(f"{bend * self.pixel_deg / time_s**2:.2g}") for bend in bends_px]
+
+    def pair(
+        self, experiment: str, name: str, level: float, change: Settings
+    ) -> Iterator[DatasheetCell]:
+        """Two frames of each attitude with a change, which differ only in their noise."""
+        for frame in range(2):
+            settings = self.settings(Draw()) | change
+            yield DatasheetCell(experiment, {name: level, "frame": frame}, settings)
+
     def rates(self) -> Iterator[DatasheetCell]:
-        """At each rate two frames of each attitude that differ only in their noise."""
+        """Pairs of frames at each rate."""
         for rate in self.rates_deg_s(STREAKS_PX):
-            for frame in range(2):
-                settings = self.settings(Draw()) | {"trial.rate_deg_s": rate}
-                yield DatasheetCell("rate", {"rate_deg_s": rate, "frame": frame}, settings)
+            yield from self.pair("rate", "rate_deg_s", rate, {"trial.rate_deg_s": rate})
 
     def sequences(self) -> Iterator[DatasheetCell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
@@ -275,18 +285,13 @@ class Designer:
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
     def accelerations(self) -> Iterator[DatasheetCell]:
-        """Two frames of each attitude at accelerations, with a rate of zero at mid-exposure."""
-        for bend in BENDS_PX:
-            acceleration = float(
-                f"{bend * self.pixel_deg / self.scene.exposure.time_s**2:.2g}"
-            )
-            change = {"trial.acceleration_deg_s2": acceleration}
-            for frame in range(2):
-                levels = {"acceleration_deg_s2": acceleration, "frame": frame}
-                yield DatasheetCell("acceleration", levels, self.settings(Draw()) | change)
+        """Pairs of frames at accelerations, with a rate of zero at mid-exposure."""
+        key = "acceleration_deg_s2"
+        for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
+            yield from self.pair("acceleration", key, bend, {f"trial.{key}": bend})
 
     def tracked(self) -> Iterator[DatasheetCell]:
-        """Two frames of each attitude in tracking mode, at constant rates and at accelerations; none without the mode.
+        """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
 
         The prediction extrapolates the mean rate between the last two frames, so an acceleration a displaces the next
         one, t later, by a t^2 from it.
@@ -294,19 +299,14 @@ class Designer:
         if not tracks(self.scene):
             return
         between_s = 1 / self.scene.exposure.rate_hz
-        bends = [
-            float(f"{missed * self.pixel_deg / between_s**2:.2g}") for missed in MISSED_PX
-        ]
-        motions = [("rate_deg_s", rate) for rate in self.rates_deg_s(TRACKED_STREAKS_PX)]
-        motions += [("acceleration_deg_s2", bend) for bend in bends]
-        for key, value in motions:
-            for frame in range(2):
+        motions = {
+            "rate_deg_s": self.rates_deg_s(TRACKED_STREAKS_PX),
+            "acceleration_deg_s2": self.accelerations_deg_s2(MISSED_PX, between_s),
+        }
+        for key, values in motions.items():
+            for value in values:
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
-                yield DatasheetCell(
-                    f"tracked {key}",
-                    {key: value, "frame": frame},
-                    self.settings(Draw()) | change,
-                )
+                yield from self.pair(f"tracked {key}", key, value, change)
 
     def magnitudes(self) -> Iterator[DatasheetCell]:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
@@ -314,23 +314,19 @@ class Designer:
             return
         for step in (0.0, *FAINTER):
             limit = self.scene.tracker.limit_mag + step
-            for frame in range(2):
-                settings = self.settings(Draw()) | {"tracker.limit_mag": limit}
-                yield DatasheetCell(
-                    "magnitude", {"limit_mag": limit, "frame": frame}, settings
-                )
+            change: Settings = {"tracker.limit_mag": limit}
+            yield from self.pair("magnitude", "limit_mag", limit, change)
 
     def causes(self) -> dict[str, Settings]:
         """Changes of the scene that would lower the error; those without effect on it are left out."""
         camera = self.scene.camera
-        chip = self.scene.camera.detector
+        chip = camera.detector
         survey = self.scene.tracker.survey
         exposure = self.scene.exposure
-        period_s = 1 / self.scene.exposure.rate_hz
         changes: dict[str, Settings] = {
             "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
         }
-        if 2 * exposure.time_s + exposure.trigger_jitter_s <= period_s:
+        if 2 * exposure.time_s + exposure.trigger_jitter_s <= 1 / exposure.rate_hz:
             changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
         if chip.read_noise_e:
             changes["half the read noise"] = {
@@ -450,11 +446,11 @@ class MeasuredFrames:
         """(cells, fields) values of a column in some cells."""
         return self.columns[name][rows]
 
-    def right(self, rows: list[int]) -> NDArray[np.bool_]:
+    def right(self, rows: list[int]) -> Mask:
         """(cells, fields) whether a frame was solved and is not false."""
         return (self.columns["solved"][rows] > 0) & ~self.false(rows)
 
-    def false(self, rows: list[int]) -> NDArray[np.bool_]:
+    def false(self, rows: list[int]) -> Mask:
         """(cells, fields) whether a frame has a false attitude."""
         return self.columns["wrong"][rows] > 0
 
@@ -470,7 +466,7 @@ def study_tree(
     overrides: Mapping[str, str],
     size: Size,
     cells: list[DatasheetCell],
-) -> dict[str, Any]:
+) -> Record:
     """The study file of the cells."""
     settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
     return {
@@ -492,7 +488,7 @@ def study_tree(
     }
 
 
-def attitudes(scene: Scene) -> dict[str, Any]:
+def attitudes(scene: Scene) -> Record:
     """Keys of the trial that bound the attitudes: under a dome, the tilt limit of the vehicle."""
     if scene.light.kind != "dome":
         return {}

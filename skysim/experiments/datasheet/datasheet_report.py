@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -39,15 +40,7 @@ from skysim.results.report_blocks import (
 # Figures of a datasheet.
 
 
-class DatasheetFigure(NamedTuple):
-    """A figure: its drawing function, size in inches, and caption."""
-
-    draw: Callable[[Any, Statement], None]
-    size_in: tuple[float, float]
-    caption: str
-
-
-def draw_terms(fig: Any, statement: Statement) -> None:
+def draw_terms(statement: Statement, fig: Any) -> None:
     """Terms as bars with their intervals, across and about the boresight."""
     shown = [
         name
@@ -66,7 +59,7 @@ def draw_terms(fig: Any, statement: Statement) -> None:
         axes.set_xlabel(f"{group} the boresight, 1 σ of one axis [″]")
 
 
-def draw_causes(fig: Any, statement: Statement) -> None:
+def draw_causes(statement: Statement, fig: Any) -> None:
     """Ratio of the mean square after each change to that before it."""
     axes = fig.subplots()
     for n, group in enumerate(GROUPS):
@@ -87,7 +80,7 @@ def draw_causes(fig: Any, statement: Statement) -> None:
     axes.legend()
 
 
-def draw_sky(fig: Any, statement: Statement) -> None:
+def draw_sky(statement: Statement, fig: Any) -> None:
     """Where frames are solved: boresights on the sky, or tilts of the vehicle."""
     sheet = statement.sheet
     rows = sheet.rows("sky")
@@ -118,60 +111,48 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
-        errors.plot(
-            x, [row[f"nea_{group}"] for row in rows], "o-", color=INK[n], label=f"NEA {group}"
-        )
-        errors.plot(
-            x,
-            [row[f"rms_{group}"] for row in rows],
-            "s--",
-            color=INK[n],
-            label=f"rms {group}",
-        )
+        for kind, style in (("NEA", "o-"), ("rms", "s--")):
+            values = [row[f"{kind.lower()}_{group}"] for row in rows]
+            errors.plot(x, values, style, color=INK[n], label=f"{kind} {group}")
     errors.set_yscale("log")
     errors.yaxis.set_major_formatter("{x:g}")
     errors.set_ylabel("one axis [″]")
     errors.legend()
     found = [row["counts"].share("right") for row in rows]
-    values = np.array([one.value for one in found])
+    right = np.array([one.value for one in found])
     ends = np.array([[one.value - one.low, one.high - one.value] for one in found]).T
-    share.errorbar(x, 100 * values, 100 * ends, fmt="o-", color=INK[2])
+    share.errorbar(x, 100 * right, 100 * ends, fmt="o-", color=INK[2])
     share.set_ylabel("right attitudes [%]")
     for axes in (errors, share):
         axes.set_xlabel(label)
 
 
-def draw_rates(fig: Any, statement: Statement) -> None:
-    """Noise and error by rate."""
-    draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]")
-
-
-def draw_magnitudes(fig: Any, statement: Statement) -> None:
-    """Noise and error by the catalog's limit."""
-    draw_by(fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]")
-
-
-FIGURES = {
-    "terms": DatasheetFigure(
+# Drawing function, size in inches, and caption.
+FIGURES: dict[str, tuple[Callable[[Statement, Any], None], tuple[float, float], str]] = {
+    "terms": (
         draw_terms,
         (9, 2.6),
         "The terms of the error, with 95 % intervals over the fields (ensemble).",
     ),
-    "causes": DatasheetFigure(
+    "causes": (
         draw_causes,
         (9, 3.4),
         "What each change of the scene leaves of the error's mean square (ensemble).",
     ),
-    "sky": DatasheetFigure(
-        draw_sky, (7, 3.6), "Where the frames are solved lost in space, at rest (ensemble)."
+    "sky": (
+        draw_sky,
+        (7, 3.6),
+        "Where the frames are solved lost in space, at rest (ensemble).",
     ),
-    "rates": DatasheetFigure(
-        draw_rates,
+    "rates": (
+        lambda statement, fig: draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]"),
         (9, 3),
         "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
     ),
-    "magnitudes": DatasheetFigure(
-        draw_magnitudes,
+    "magnitudes": (
+        lambda statement, fig: draw_by(
+            fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]"
+        ),
         (9, 3),
         "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
     ),
@@ -237,21 +218,15 @@ def verdict(statement: Statement) -> Verdict:
 def section_blocks(section: StatementSection, statement: Statement) -> list[Block]:
     """A section's texts, figures and table."""
     texts = [Text(text) for text in section.texts]
-    figures = [
-        Figure(figure_png(name, statement), FIGURES[name].caption, name=name)
-        for name in section.figures
-    ]
+    figures = []
+    for name in section.figures:
+        draw, size_in, caption = FIGURES[name]
+        figures.append(Figure(png(partial(draw, statement), size_in), caption, name=name))
     first, *others = section.headers
     columns = [
         Column(head, kind="aside" if head == "what it is" else "number") for head in others
     ]
     return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]
-
-
-def figure_png(name: str, statement: Statement) -> bytes:
-    """A figure as PNG."""
-    drawing = FIGURES[name]
-    return png(lambda fig: drawing.draw(fig, statement), drawing.size_in)
 
 
 def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, Path]:

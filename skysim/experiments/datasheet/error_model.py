@@ -62,16 +62,19 @@ class ErrorModel:
     """
 
     def __init__(self, constants: dict[str, Any]) -> None:
+        def array(name: str) -> Any:
+            return np.array(constants[name], dtype=float)
+
         self.constants = constants
-        self.mean = np.array(constants["mean"], dtype=float)
-        self.unit = np.array(constants["unit"], dtype=float)
-        self.thermal = np.array(constants["thermal"], dtype=float)
-        self.field = np.array(constants["field"], dtype=float)
-        self.pixel = np.array(constants["pixel"], dtype=float)
-        self.scale = np.array(constants["scale"], dtype=float)
-        self.rates_deg_s = np.array(constants["rates_deg_s"], dtype=float)
-        self.noise = np.array(constants["noise"], dtype=float)
-        self.along = np.array(constants["along"], dtype=float)
+        self.mean = array("mean")
+        self.unit = array("unit")
+        self.thermal = array("thermal")
+        self.field = array("field")
+        self.pixel = array("pixel")
+        self.scale = array("scale")
+        self.rates_deg_s = array("rates_deg_s")
+        self.noise = array("noise")
+        self.along = array("along")
 
     @classmethod
     def read(cls, path: Any) -> ErrorModel:

@@ -15,7 +15,7 @@ from scipy import stats
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, to_json, write_text
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet.cells import MIN_FIELDS, MODEL_FIELDS, MeasuredFrames
 from skysim.experiments.datasheet.error_model import AXES, ErrorModel
 from skysim.experiments.datasheet.variance_components import (
@@ -31,7 +31,7 @@ GRID = 60  # number of correlation angles that are tried
 LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
 
 
-def constants(sheet: MeasuredFrames) -> dict[str, Any]:
+def constants(sheet: MeasuredFrames) -> Record:
     """The constants of `error_model.ErrorModel` for the scene of a datasheet."""
     errors, _ = term_errors(sheet)
     terms = contributions(errors)
@@ -326,7 +326,7 @@ CONSTANTS = "tracker_error.json"
 HERE = Path(__file__).parent
 
 
-def write_model(folder: Path, constants: dict[str, Any]) -> list[Path]:
+def write_model(folder: Path, constants: Record) -> list[Path]:
     """Write the module and its constants to a folder; return their paths."""
     paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
     write_text(paths[0], (HERE / "error_model.py").read_text(encoding="utf-8"))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
@@ -65,7 +65,7 @@ def tally(right: Any, false: Any) -> Counts:
     )
 
 
-def claims(found: Counts) -> list[dict[str, Any]]:
+def claims(found: Counts) -> list[Record]:
     """Which of CLAIMS the frames show, and how many more frames each needs if none of them fails."""
     failures = found.frames - found.right
     return [
@@ -81,7 +81,7 @@ def claims(found: Counts) -> list[dict[str, Any]]:
     ]
 
 
-def quantiles(sheet: MeasuredFrames) -> list[dict[str, Any]]:
+def quantiles(sheet: MeasuredFrames) -> list[Record]:
     """Quantiles of the errors' magnitude over independent frames, with intervals between order statistics."""
     errors = sheet.errors(sheet.rows("sky")).reshape(3, -1)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
@@ -95,7 +95,7 @@ def quantiles(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     ]
 
 
-def consistency(sheet: MeasuredFrames) -> dict[str, Any]:
+def consistency(sheet: MeasuredFrames) -> Record:
     """How well the tracker's covariance P and the assumption of equal axes fit the errors e of independent frames.
 
     If P is right, the normalized error squared e^T P^-1 e has the chi-square distribution with three degrees of
@@ -121,7 +121,7 @@ def noise_equivalent_angle(first: Floats, second: Floats) -> float:
     return math.sqrt(mean_known((first - second) ** 2) / 2)
 
 
-def pair_row(sheet: MeasuredFrames, rows: list[int]) -> dict[str, Any]:
+def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     return {
@@ -147,7 +147,7 @@ def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
     return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
 
 
-def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
+def by_rate(sheet: MeasuredFrames) -> list[Record]:
     """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude."""
     rest = sheet.rows("terms", unit=0, state=0, attitude=0)
     rates = sheet.levels("rate", "rate_deg_s")
@@ -159,7 +159,7 @@ def by_rate(sheet: MeasuredFrames) -> list[dict[str, Any]]:
     return found
 
 
-def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str, Any]]:
+def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[Record]:
     """Noise-equivalent angle, error and outcomes by the levels of a key, ascending; empty without the experiment."""
     return [
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
@@ -167,7 +167,7 @@ def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[dict[str,
     ]
 
 
-def by_acceleration(sheet: MeasuredFrames) -> list[dict[str, Any]]:
+def by_acceleration(sheet: MeasuredFrames) -> list[Record]:
     """Error and outcomes by acceleration."""
     found = []
     for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
@@ -199,7 +199,7 @@ class Limit(NamedTuple):
     fields: int
 
 
-def bracket(rows: list[dict[str, Any]], key: str) -> Limit:
+def bracket(rows: list[Record], key: str) -> Limit:
     """The limit in a rate or an acceleration, from rows in ascending order of it."""
     fewest = min(row["counts"].frames for row in rows)
     share = next(
@@ -234,7 +234,7 @@ def solution_times_s(sheet: MeasuredFrames) -> Floats:
     return np.array(found[TIMED:])
 
 
-def disturbances(sheet: MeasuredFrames) -> list[dict[str, Any]]:
+def disturbances(sheet: MeasuredFrames) -> list[Record]:
     """Outcomes and errors under each disturbance, the undisturbed frames first."""
     undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
     cases = {"none": undisturbed}

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts, Limit
+from skysim.experiments.datasheet.performance import Counts
 from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -50,17 +51,17 @@ class Statement(NamedTuple):
     terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
-    causes: list[dict[str, Any]]
+    causes: list[Record]
     counts: Counts
-    claims: list[dict[str, Any]]
-    quantiles: list[dict[str, Any]]
-    consistency: dict[str, Any]
-    rates: list[dict[str, Any]]
-    accelerations: list[dict[str, Any]]
-    tracked_rates: list[dict[str, Any]]
-    tracked_accelerations: list[dict[str, Any]]
-    magnitudes: list[dict[str, Any]]
-    disturbances: list[dict[str, Any]]
+    claims: list[Record]
+    quantiles: list[Record]
+    consistency: Record
+    rates: list[Record]
+    accelerations: list[Record]
+    tracked_rates: list[Record]
+    tracked_accelerations: list[Record]
+    magnitudes: list[Record]
+    disturbances: list[Record]
     times_s: list[float]
 
 
@@ -133,7 +134,7 @@ def as_numbers(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def numbers(statement: Statement) -> dict[str, Any]:
+def numbers(statement: Statement) -> Record:
     """The statement for JSON; squares in arcsec^2 of one axis.
 
     Numbers outside `rates`, `accelerations` and those of tracking mode hold at `rate_deg_s`.
@@ -158,24 +159,21 @@ def numbers(statement: Statement) -> dict[str, Any]:
     return head | as_numbers(parts)
 
 
-def limits(statement: Statement) -> dict[str, Any]:
+def limits(statement: Statement) -> Record:
     """The limits of acquisition and of tracking in rate and acceleration."""
     measured = {
         "acquisition": (statement.rates, statement.accelerations),
         "tracking": (statement.tracked_rates, statement.tracked_accelerations),
     }
-    return as_numbers(
-        {
-            mode: {
-                key: performance.bracket(rows, key)
-                for key, rows in zip(
-                    ("rate_deg_s", "acceleration_deg_s2"), tables, strict=True
-                )
-            }
-            for mode, tables in measured.items()
-            if tables[0]
+    found = {
+        mode: {
+            key: performance.bracket(rows, key)
+            for key, rows in zip(UNITS, tables, strict=True)
         }
-    )
+        for mode, tables in measured.items()
+        if tables[0]
+    }
+    return as_numbers(found)
 
 
 # As sections.
@@ -367,11 +365,16 @@ def probability_section(statement: Statement) -> StatementSection:
 
 
 def quantile_section(statement: Statement) -> StatementSection:
-    """Quantiles of the errors."""
+    """Quantiles of the errors, how well the covariances fit them, and whether x and y have equal errors."""
+    found = statement.consistency
+    shares = ", ".join(
+        f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
+    )
     texts = [
         "Errors that a frame at rest stays below with the probability at the left, over independent frames"
         f" ({ENSEMBLE}), with 95 % intervals between order statistics; across is the angle between the boresights.",
-        consistency_text(statement.consistency),
+        f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
+        f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}.",
     ]
     rows = [
         [
@@ -388,17 +391,6 @@ def quantile_section(statement: Statement) -> StatementSection:
     )
 
 
-def consistency_text(found: dict[str, Any]) -> str:
-    """How well the covariances of the attitudes fit their errors, and whether x and y have equal errors."""
-    shares = ", ".join(
-        f"{percent(one['share'])} % of {100 * one['level']:g} %" for one in found["within"]
-    )
-    return (
-        f"The tracker's own covariance: normalized error squared {bounded(found['nees'])}, 3 where it is right;"
-        f" within its ellipsoids {shares}. Mean square of y over that of x: {bounded(found['y_over_x'])}."
-    )
-
-
 def quantile_text(found: Summary) -> str:
     """A quantile with its interval, or the number of further frames that it needs to have one."""
     if math.isnan(found.low):
@@ -406,7 +398,7 @@ def quantile_text(found: Summary) -> str:
     return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
 
 
-def outcome_cells(row: dict[str, Any]) -> list[str]:
+def outcome_cells(row: Record) -> list[str]:
     """Cells of a row's outcomes."""
     return [
         percent(row["counts"].share("right")),
@@ -415,23 +407,27 @@ def outcome_cells(row: dict[str, Any]) -> list[str]:
     ]
 
 
-def pair_cells(row: dict[str, Any]) -> list[str]:
-    """Cells of a pair of frames: noise-equivalent angle and error, and the normalized error squared."""
+def pair_cells(row: Record) -> list[str]:
+    """Cells of a pair of frames: noise-equivalent angle and error, the normalized error squared, and outcomes."""
     errors = [
         arcsec(row[f"{kind}_{name}"])
         for name in variance_components.GROUPS
         for kind in ("nea", "rms")
     ]
-    return [*errors, bounded(row["nees"])]
+    return [*errors, bounded(row["nees"]), *outcome_cells(row)]
 
 
-PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
 OUTCOME_HEADERS = ["right %", "refused", "false"]
 FIELD_HEADERS = ["both right %", "one refused", "one false"]
+PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
+PAIR_HEADERS += FIELD_HEADERS
+UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²"}
 
 
-def bracket_text(what: str, limit: Limit, unit: str) -> str:
+def bracket_text(what: str, rows: list[Record], key: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
+    limit = performance.bracket(rows, key)
+    unit = UNITS[key]
     needed = metrics.trials_needed(1 - limit.share)
     if limit.fields < needed:
         return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
@@ -444,39 +440,29 @@ def bracket_text(what: str, limit: Limit, unit: str) -> str:
 
 
 def rate_section(statement: Statement) -> StatementSection:
-    """Noise-equivalent angle, error and acquisition by rate."""
+    """Noise-equivalent angle, error and acquisition by rate.
+
+    The relative error of rms and NEA of F fields is 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one: for two
+    Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of the error.
+    """
+    fields = statement.sheet.size.fields
+    across, about = (100 / math.sqrt(axes * fields) for axes in (2, 1))
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ONE_UNIT})."
         " NEES: normalized error squared of this unit; over all units 3 where the tracker's own covariance is right."
         " Shares are of attitudes that are right in both frames."
-        f" {precision_text(statement.sheet)} Each row holds at its rate, and nothing is known beyond"
+        f" NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ). Each row"
+        " holds at its rate, and nothing is known beyond"
         f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
-        bracket_text(
-            "acquisition in rate", performance.bracket(statement.rates, "rate_deg_s"), "°/s"
-        ),
+        bracket_text("acquisition in rate", statement.rates, "rate_deg_s"),
     ]
     rows = [
-        [
-            f"{row['rate_deg_s']:g}",
-            f"{row['streak_px']:.2g}",
-            *pair_cells(row),
-            *outcome_cells(row),
-        ]
+        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row)]
         for row in statement.rates
     ]
-    headers = ["rate °/s", "streak px", *PAIR_HEADERS, *FIELD_HEADERS]
+    headers = ["rate °/s", "streak px", *PAIR_HEADERS]
     return StatementSection("By rate", texts, headers, rows, ["rates"])
-
-
-def precision_text(sheet: MeasuredFrames) -> str:
-    """Relative error of rms and NEA of F fields: 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one.
-
-    This is for two Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of
-    the error.
-    """
-    across, about = (100 / math.sqrt(axes * sheet.size.fields) for axes in (2, 1))
-    return f"NEA and rms are known to about {across:.0f} % across and {about:.0f} % about the boresight (1 σ)."
 
 
 def acceleration_section(statement: Statement) -> StatementSection:
@@ -486,9 +472,7 @@ def acceleration_section(statement: Statement) -> StatementSection:
         f" ({ONE_UNIT}). Errors are relative to the mean attitude over the exposure, which is a T² / 24 from that at"
         " mid-exposure.",
         bracket_text(
-            "acquisition in acceleration",
-            performance.bracket(statement.accelerations, "acceleration_deg_s2"),
-            "°/s²",
+            "acquisition in acceleration", statement.accelerations, "acceleration_deg_s2"
         ),
     ]
     rows = [
@@ -520,24 +504,17 @@ def tracking_section(statement: Statement) -> StatementSection:
         " same motion, without a gyro: stars are detected in windows of 8 pixels around their predicted places. A frame"
         " that only the lost-in-space search would solve counts as refused. The prediction extrapolates the rate"
         " between the last two frames, so an acceleration a misses by a t².",
-        bracket_text("tracking in rate", performance.bracket(rates, "rate_deg_s"), "°/s"),
-        bracket_text(
-            "tracking in acceleration",
-            performance.bracket(accelerations, "acceleration_deg_s2"),
-            "°/s²",
-        ),
+        bracket_text("tracking in rate", rates, "rate_deg_s"),
+        bracket_text("tracking in acceleration", accelerations, "acceleration_deg_s2"),
     ]
-    rows = [
-        [f"{row['rate_deg_s']:g}", "", *pair_cells(row), *outcome_cells(row)] for row in rates
-    ]
+    rows = [[f"{row['rate_deg_s']:g}", "", *pair_cells(row)] for row in rates]
     rows += [
-        ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row), *outcome_cells(row)]
-        for row in accelerations
+        ["", f"{row['acceleration_deg_s2']:g}", *pair_cells(row)] for row in accelerations
     ]
     return StatementSection(
         "In tracking mode",
         texts,
-        ["rate °/s", "acceleration °/s²", *PAIR_HEADERS, *FIELD_HEADERS],
+        ["rate °/s", "acceleration °/s²", *PAIR_HEADERS],
         rows,
     )
 
@@ -553,14 +530,13 @@ def magnitude_section(statement: Statement) -> StatementSection:
         [
             f"{row['limit_mag']:g}{' (of the scene)' * (row['limit_mag'] == own)}",
             *pair_cells(row),
-            *outcome_cells(row),
         ]
         for row in statement.magnitudes
     ]
     return StatementSection(
         "By magnitude limit",
         texts,
-        ["limit V", *PAIR_HEADERS, *FIELD_HEADERS],
+        ["limit V", *PAIR_HEADERS],
         rows,
         ["magnitudes"],
     )

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet.cells import MIN_FIELDS, MeasuredFrames, require_fields
 from skysim.results.metrics import CONFIDENCE
 
@@ -238,7 +238,7 @@ def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Flo
     return mean_known(sheet.errors(rows)[axes] ** 2, (0, 1))
 
 
-def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
+def causes(sheet: MeasuredFrames) -> list[Record]:
     """Each change of the scene with the ratio of the mean square after it to that of the unchanged scene.
 
     Across and about the boresight.
@@ -248,7 +248,7 @@ def causes(sheet: MeasuredFrames) -> list[dict[str, Any]]:
         rows = sheet.rows("cause", cause=name)
         draws = sheet.rows("total")
         before = [draw for draw in draws if sheet.cells[draw].levels["draw"] < len(rows)]
-        row: dict[str, Any] = {"cause": name}
+        row: Record = {"cause": name}
         for group, axes in GROUPS.items():
             squares = squares_by_field(sheet, rows, axes)
             row[group] = mean_square_ratio(squares, squares_by_field(sheet, before, axes))

@@ -11,11 +11,10 @@ were found. The result is a `DomeMap`, the file that `tracker.map` reads.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.attitude.dome_map import LedMap
 from estimator.calibration import dome_survey, survey_faults, survey_subset
@@ -23,7 +22,7 @@ from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
 from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Mask
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
@@ -42,16 +41,15 @@ from skysim.experiments.dome_survey.survey_prior import (
     SurveyUncertainty,
     assumed,
 )
+from skysim.simulation.flight import Progress
 from skysim.tracking.dome_map_file import DomeMap
 
-MIN_SHARED_LEDS = (
-    3  # least number of LEDs that a frame shares with others: two determine its attitude
-)
+# Least number of LEDs that a frame shares with others: two determine its attitude.
+MIN_SHARED_LEDS = 3
 MAX_UNCONNECTED = 0.5  # greatest fraction of the frames that is left out at a time
 
-ROUNDS = (
-    3  # rounds of identification and adjustment; from the second on with the adjusted values
-)
+# Rounds of identification and adjustment; from the second on with the adjusted values.
+ROUNDS = 3
 MOVED_ROUNDS = 2  # further rounds if LEDs are far from their places in the list
 
 # Least fraction of a frame's lights that are matched, and of these that fit the adjustment; far fewer do by chance.
@@ -73,7 +71,7 @@ def run_survey(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
-    watch: Callable[[float, float], None] | None = None,
+    watch: Progress | None = None,
 ) -> SurveyRun:
     """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
 
@@ -88,15 +86,13 @@ def run_survey(
         If the frames do not determine the unknowns, the result contradicts the prior, or the lens has a distortion that
         the prior lacks.
     """
-    refusal = None
     try:
         run = survey_in_rounds(frames, prior, uncertainty, watch)
-    except InputError as error:
-        refusal = error
-    if refusal or run.survey.noise_scale > MAX_NOISE_SCALE:
+    except InputError:
         check_lens(frames, prior, uncertainty)
-    if refusal:
-        raise refusal
+        raise
+    if run.survey.noise_scale > MAX_NOISE_SCALE:
+        check_lens(frames, prior, uncertainty)
     return run
 
 
@@ -129,7 +125,7 @@ def survey_in_rounds(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
-    watch: Callable[[float, float], None] | None = None,
+    watch: Progress | None = None,
 ) -> SurveyRun:
     """As `run_survey`, with the lens model as it is."""
 
@@ -179,28 +175,15 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
     """
     found = run.survey
     accuracy = run.accuracy
-    lever = zip(
-        before.camera_body_m,
-        found.lever.camera_body_m,
-        accuracy.lever_sigma_m,
-        "xyz",
-        strict=True,
-    )
     lever_sigma_m, focal_sigma_px = before.weight[2:] ** -0.5
-    rows = [
-        (
-            before.focal_px,
-            found.camera.focal_px,
-            accuracy.lens_sigma[0],
-            focal_sigma_px,
-            "focal px",
-        )
-    ]
-    rows += [
-        (1e3 * then, 1e3 * now, 1e3 * sigma, 1e3 * lever_sigma_m, f"lever {axis} mm")
-        for then, now, sigma, axis in lever
-    ]
-    for then, now, sigma, known, name in rows:
+    columns = (
+        [before.focal_px, *(1e3 * before.camera_body_m)],
+        [found.camera.focal_px, *(1e3 * found.lever.camera_body_m)],
+        [accuracy.lens_sigma[0], *(1e3 * accuracy.lever_sigma_m)],
+        [focal_sigma_px, *[1e3 * lever_sigma_m] * 3],
+        ["focal px", *(f"lever {axis} mm" for axis in "xyz")],
+    )
+    for then, now, sigma, known, name in zip(*columns, strict=True):
         if abs(now - then) > PLAUSIBLE * math.sqrt(
             max(known**2 - sigma**2, (LEAST_SHARE * known) ** 2)
         ):
@@ -391,7 +374,7 @@ def adjust_connected(
 
 def led_visibility(
     pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior
-) -> NDArray[np.bool_]:
+) -> Mask:
     """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
 
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
@@ -407,7 +390,7 @@ def led_visibility(
     return visible & (angle_rad > survey_subset.CONNECTING_RAD)
 
 
-def largest_connected_group(visible: NDArray[np.bool_], min_shared: int) -> list[int]:
+def largest_connected_group(visible: Mask, min_shared: int) -> list[int]:
     """Indices of the largest group of frames connected by shared LEDs.
 
     Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group

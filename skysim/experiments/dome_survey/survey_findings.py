@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,19 +15,17 @@ from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import (
     GATE_SIGMAS,
     Correspondences,
-    Ints,
     SurveyFrame,
     match_by_imu,
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
     SurveyUncertainty,
-    image_sizes,
     survey_model,
 )
 from skysim.results.telemetry_report import euler_deg
@@ -37,9 +35,8 @@ from skysim.scene.scene import Scene
 
 
 STRAY_SIGMA_PX = 0.3  # error of a ray to a stray light, from the attitude and from blends
-STRAY_REACH_M = (
-    0.005  # greatest distance on the dome between stray lights of two frames that may be one
-)
+# Greatest distance on the dome between stray lights of two frames that may be one.
+STRAY_REACH_M = 0.005
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,9 +178,10 @@ def light_table(run: SurveyRun) -> LightTable:
 
 def margins(run: SurveyRun) -> tuple[Floats, float]:
     """Margin of the chip for each LED, and least distance between LEDs, including the errors of their places."""
-    sizes = image_sizes(run.prior)
+    margin_px = run.prior.margin_px
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
-    return sizes.margin_px + GATE_SIGMAS * place_px, sizes.apart_px
+    # Two images do not merge at twice the reach of one.
+    return margin_px + GATE_SIGMAS * place_px, 2 * margin_px
 
 
 def light_at_unit_distance(run: SurveyRun) -> Floats:
@@ -356,7 +354,7 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     )
 
 
-def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
+def fault_lines(faults: Record) -> Iterator[str]:
     """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
     for led in faults["dark"]:
         yield f"LED {led} is dark"
@@ -389,7 +387,7 @@ def fault_lines(faults: Mapping[str, Any]) -> Iterator[str]:
 # --- as numbers ---------------------------------------------------------------------------------------------
 
 
-def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
+def coverage_statistics(so_far: Coverage) -> Record:
     """Counts and errors of a coverage, one row for each LED."""
     frames = so_far.seen.sum(axis=0)
     measured = so_far.measured
@@ -410,7 +408,7 @@ def coverage_statistics(so_far: Coverage) -> dict[str, Any]:
     }
 
 
-def accuracy_statistics(accuracy: SurveyAccuracy | None) -> dict[str, float | int | None]:
+def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
     """Number of measured LEDs, rms errors of LEDs and lever in mm, and of focal length in px; None if undetermined."""
     if accuracy is None:
         return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
@@ -433,9 +431,3 @@ def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | in
     )
     keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
     return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
-
-
-def rows_of(numbers: Sequence[int], ids: Ints) -> Ints:
-    """Rows of LEDs by their numbers."""
-    order = np.argsort(ids)
-    return order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))]

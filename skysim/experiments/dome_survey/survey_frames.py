@@ -21,7 +21,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Truth
+from skysim.core.types import Floats, Frame, Ints, Truth
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
@@ -199,11 +199,9 @@ def detect_lights(settings: Settings, camera: Camera, image_dn: NDArray[Any]) ->
 # Identification of the LEDs in the frames.
 
 
-Ints = NDArray[np.int64]
 GATE_SIGMAS = 3.5  # gate of a two-dimensional error; Gaussian noise exceeds it once in 450
-ANCHOR_LIGHTS = (
-    10  # number of central lights that are paired with every LED to find the common shift
-)
+# Number of central lights that are paired with every LED to find the common shift.
+ANCHOR_LIGHTS = 10
 
 
 class Correspondences(NamedTuple):

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -27,6 +26,7 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 from skysim.core.text import excerpt, read_named_rows
+from skysim.core.types import Ints
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
@@ -60,21 +60,12 @@ def image_files(folder: Path) -> list[Path]:
 
 def best_images(folder: Path) -> list[Path]:
     """The images of a folder by name; of one stem, that of the first of FORMATS. Raises InputError for no folder."""
-    if not folder.is_dir():
-        raise InputError(folder, "no such folder", "a folder of images")
-    best: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+
+    def rank(path: Path) -> int:
         suffix = images.image_suffix(path.name)
-        if suffix and not path.name.startswith("."):
-            stem = path.name[: -len(suffix)]
-            if stem not in best or rank(suffix) < rank(images.image_suffix(best[stem].name)):
-                best[stem] = path
-    return [best[stem] for stem in sorted(best)]
+        return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
 
-
-def rank(suffix: str) -> int:
-    """Rank of an image format among images of one name."""
-    return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
+    return [path for _, path in sorted(images.best_images(folder, rank).items())]
 
 
 def read_images(folder: Path, camera: Camera, settings: Settings) -> Iterator[SurveyImage]:
@@ -99,12 +90,7 @@ def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
 def pixels_of(path: Path, camera: Camera) -> NDArray:
     """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
     pixels = images.monochrome(images.read_image(path))
-    if pixels.shape != (camera.height_px, camera.width_px):
-        raise InputError(
-            path,
-            f"{pixels.shape[1]} x {pixels.shape[0]} pixels",
-            f"{camera.width_px} x {camera.height_px}, as the camera has them",
-        )
+    images.check_size(path, pixels, (camera.height_px, camera.width_px))
     return pixels
 
 
@@ -121,7 +107,7 @@ def write_attitudes(
     path: Path,
     names: Sequence[str],
     lab_from_body: Rotation,
-    leds: NDArray[np.int64] | None = None,
+    leds: Ints | None = None,
 ) -> None:
     """Write attitudes as `read_attitudes` reads them.
 
@@ -244,20 +230,17 @@ class WatchedFolder:
             if stamp != before or stamp == self._done.get(path.name):
                 continue
             try:
-                self._read(path)
+                if path.name == ATTITUDES:
+                    self._attitudes = read_attitudes(path)
+                else:
+                    self._lights.pop(path.name, None)
+                    self._lights[path.name] = lights_of(path, self.camera, self.settings)
             except InputError as error:
                 news.complaints.append(error)
             else:
                 news.read.append(path.name)
             self._done[path.name] = stamp
         return news
-
-    def _read(self, path: Path) -> None:
-        if path.name == ATTITUDES:
-            self._attitudes = read_attitudes(path)
-        else:
-            self._lights.pop(path.name, None)
-            self._lights[path.name] = lights_of(path, self.camera, self.settings)
 
 
 def stamp_of(path: Path) -> Stamp | None:

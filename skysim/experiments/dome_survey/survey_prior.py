@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -16,7 +15,7 @@ from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.led_codes import LedCode
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.core.units import quantities_within
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
@@ -27,7 +26,6 @@ from skysim.sources.dome import surface
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.tracking import onboard_model
 
-Ints = NDArray[np.int64]
 BLUR_PX = 3.0  # width of an image's blurred edge
 
 # Options: unit, quantity, example, minimum and maximum. The LED error must be > 0, because it weights the map.
@@ -112,6 +110,11 @@ class CalibrationPrior:
             self.camera.focal_px / (self.nearest_m - np.linalg.norm(self.lever.camera_body_m))
         )
 
+    @property
+    def margin_px(self) -> float:
+        """Margin from the chip's edge for a complete image: its radius at the least distance, and BLUR_PX of blur."""
+        return self.disk_m / 2 * self.px_per_m + BLUR_PX
+
     def pixels(self, body_from_lab: Rotation) -> Floats:
         """(N, 2) pixel positions of the LEDs; far outside the image for LEDs behind the camera."""
         in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
@@ -153,8 +156,7 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     """The prior with these LEDs, their nominal brightness and code, and the tracker's assumed lever."""
     scene = lab.scene
     design = design_of(lab)
-    order = np.argsort(design.id)
-    levels = design.strength[order][np.searchsorted(design.id[order], leds.id)]
+    levels = design.strength[rows_of(leds.id, design.id)]
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = (
@@ -167,6 +169,12 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     return CalibrationPrior(
         camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
     )
+
+
+def rows_of(numbers: Sequence[int] | Ints, ids: Ints) -> Ints:
+    """Rows of LEDs by their numbers."""
+    order = np.argsort(ids)
+    return order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))]
 
 
 def design_of(lab: Lab) -> Sources:
@@ -202,19 +210,6 @@ def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
     return Assumed(
         arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
     )
-
-
-class ImageSizes(NamedTuple):
-    """Sizes of an LED's image: margin_px from the edge for a complete image; apart_px at which two do not merge."""
-
-    margin_px: float
-    apart_px: float
-
-
-def image_sizes(prior: CalibrationPrior) -> ImageSizes:
-    """The sizes of an LED's image at the least distance, with BLUR_PX of blur on every side."""
-    radius_px = prior.disk_m / 2 * prior.px_per_m
-    return ImageSizes(radius_px + BLUR_PX, 2 * (radius_px + BLUR_PX))
 
 
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
 from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
@@ -41,7 +41,6 @@ from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
     SurveyUncertainty,
     calibration_prior,
-    image_sizes,
     survey_model,
     with_survey_errors,
 )
@@ -49,6 +48,7 @@ from skysim.experiments.dome_survey.survey_report import led_errors
 from skysim.experiments.tracker_comparison import with_config
 from skysim.results.files import recording
 from skysim.scene.scene import Scene
+from skysim.simulation.flight import Progress
 from skysim.simulation.lab import Lab, build_lab
 
 PLANNED = "plan"
@@ -89,30 +89,25 @@ def plan_survey(
     tilt_deg: float,
     kind: str = PLANNED,
 ) -> tuple[Lab, CalibrationPrior, HeldAttitudes]:
-    """The lab whose onboard model has errors as before a survey, that model, and a plan."""
+    """The lab whose onboard model has errors as before a survey, that model, and the attitudes: planned, or random.
+
+    Raises
+    ------
+    InputError
+        For a tilt beyond the vehicle's stop.
+    """
     lab = build_lab(with_survey_errors(scene, uncertainty))
-    before = calibration_prior(lab)
-    return lab, before, make_plan(lab, before, uncertainty, count, tilt_deg, kind)
-
-
-def make_plan(
-    lab: Lab,
-    prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
-    count: int,
-    tilt_deg: float,
-    kind: str,
-) -> HeldAttitudes:
-    """The attitudes of a survey: by the plan, or random. Raises InputError for a tilt beyond the vehicle's stop."""
+    prior = calibration_prior(lab)
     random = survey_frames.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
     model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
-    margin_px = image_sizes(prior).margin_px
+    margin_px = prior.margin_px
     held = (
         random
         if kind == RANDOM
         else survey_frames.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
     )
-    return HeldAttitudes(held, model.visible(held.inv(), margin_px), model, margin_px)
+    shown = model.visible(held.inv(), margin_px)
+    return lab, prior, HeldAttitudes(held, shown, model, margin_px)
 
 
 def write_plan(path: Path, plan: HeldAttitudes) -> None:
@@ -146,7 +141,7 @@ def survey_images(
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
     settings: Settings,
-    watch: Callable[[float, float], None] | None = None,
+    watch: Progress | None = None,
 ) -> SurveyRun:
     """Survey from images. `frames` are those with an attitude; the others are identified with the LEDs so far.
 
@@ -240,7 +235,7 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
     )
 
 
-def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[str, Any]]:
+def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[Record]:
     """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
     rows = (
@@ -255,7 +250,7 @@ def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[dict[
     return [compared(*row) for row in rows]
 
 
-def compared(what: str, sigma: float | None, squares: Floats) -> dict[str, Any]:
+def compared(what: str, sigma: float | None, squares: Floats) -> Record:
     """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
     mean = float(squares.mean())
     simulated = math.sqrt(mean)

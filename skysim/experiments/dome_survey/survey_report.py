@@ -17,7 +17,7 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_plan import Mask
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Frame, Mount, Truth
+from skysim.core.types import Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -26,9 +26,8 @@ from skysim.experiments.dome_survey.survey_findings import (
     accuracy_statistics,
     fault_lines,
     residuals_px,
-    rows_of,
 )
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
 from skysim.results import metrics
 from skysim.results.plots import INK, bgr_image, png
 from skysim.results.report import Report
@@ -59,9 +58,13 @@ FIT = (
 FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "survey.json"))
 
 
-def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> Report:
+def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     """The report of a survey from the numbers of `survey.json`."""
     reached = accuracy_statistics(run.accuracy)
+    faults = statistics["faults"]
+    columns = [Column("LED"), text_column("fault"), text_column("details")]
+    # Their number, the error of the other places, and the exchanges that can be found.
+    *_, counts = fault_lines(faults)
     dome = Figure(
         Path(statistics["picture"]).read_bytes(),
         "The dome from above: LED errors, faults, next attitudes.",
@@ -79,12 +82,12 @@ def survey_report(statistics: dict[str, Any], run: SurveyRun, command: str) -> R
         Section("Truth and survey", truth_blocks(statistics)),
         Section("Predicted and reached", [accuracy_table(statistics, reached)]),
         Section("Coverage and next attitudes", coverage_blocks(statistics)),
-        Section("Faults", fault_blocks(statistics["faults"])),
+        Section("Faults", [Table(columns, fault_rows(faults)), Text(counts)]),
     ]
     return Report(f"Survey of {statistics['scene']}", blocks, command)
 
 
-def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
+def verdict(statistics: Record, led_mm: float) -> Verdict:
     """Number of measured LEDs, their error, and number of faults."""
     faults = len(fault_rows(statistics["faults"]))
     text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(
@@ -94,7 +97,7 @@ def verdict(statistics: Mapping[str, Any], led_mm: float) -> Verdict:
     return Verdict(text, "warning" if faults else "good")
 
 
-def value_table(statistics: dict[str, Any]) -> Table:
+def value_table(statistics: Record) -> Table:
     """Lens and lever before and after the survey, with the truth if it was simulated."""
     truth = statistics.get("truth")
     rows = []
@@ -109,7 +112,7 @@ def value_table(statistics: dict[str, Any]) -> Table:
     return Table([text_column(""), *map(Column, heads)], rows)
 
 
-def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
+def truth_blocks(statistics: Record) -> list[Block]:
     """The true errors of a simulated survey, and the tracker before and after it."""
     if not statistics.get("truth"):
         return []
@@ -138,7 +141,7 @@ def truth_blocks(statistics: dict[str, Any]) -> list[Block]:
     return [Text(text), Table(columns, rows)]
 
 
-def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Table:
+def accuracy_table(statistics: Record, reached: Record) -> Table:
     """Errors: predicted by the plan, by the covariance, true, and predicted with the next attitudes."""
     predicted = statistics.get("predicted")
     after = statistics.get("led_mm_after")
@@ -152,7 +155,7 @@ def accuracy_table(statistics: dict[str, Any], reached: Mapping[str, Any]) -> Ta
     return Table([text_column("1σ"), *(Column(head, format=".3g") for head in columns)], rows)
 
 
-def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
+def coverage_blocks(statistics: Record) -> list[Block]:
     """The measured LEDs, the attitudes to hold next, and the accuracy predicted with them."""
     counts = statistics["coverage"]
     reaches = statistics["next_reaches"]
@@ -167,7 +170,7 @@ def coverage_blocks(statistics: dict[str, Any]) -> list[Block]:
     return [Text(seen), stop_table(stops), Text(f"{with_them}.")]
 
 
-def stop_table(stops: list[dict[str, Any]]) -> Table:
+def stop_table(stops: list[Record]) -> Table:
     """Attitudes as roll, pitch and yaw, with tilt and number of LEDs."""
     names = ("roll", "pitch", "yaw", "tilt")
     rows = [
@@ -179,14 +182,7 @@ def stop_table(stops: list[dict[str, Any]]) -> Table:
     )
 
 
-def fault_blocks(faults: dict[str, Any]) -> list[Block]:
-    """The faults as a table, with their number, the error of the other places, and the exchanges that can be found."""
-    columns = [Column("LED"), text_column("fault"), text_column("details")]
-    *_, counts = fault_lines(faults)
-    return [Table(columns, fault_rows(faults)), Text(counts)]
-
-
-def fault_rows(faults: dict[str, Any]) -> list[tuple[str, str, str]]:
+def fault_rows(faults: Record) -> list[tuple[str, str, str]]:
     """LED, fault and details, one row per fault."""
     found = {led: f"at {coordinates(place_m)}" for led, place_m in faults["found_m"].items()}
     rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
@@ -284,11 +280,9 @@ PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
 VALUE_KEYS = ("what", "believed", "found", "sigma")
 
 
-def error_statistics(
-    stops: int, errors_rad: list[tuple[float, float]]
-) -> dict[str, float | int | None]:
+def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> Record:
     """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
-    statistics: dict[str, float | int | None] = {"stops": stops, "solved": len(errors_rad)}
+    statistics: Record = {"stops": stops, "solved": len(errors_rad)}
     errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
     for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
         median = worst = None
@@ -301,7 +295,7 @@ def error_statistics(
 
 def compare_trackers(
     trackers: Mapping[str, factory.Estimator], frames: Iterable[tuple[Frame, Truth]]
-) -> dict[str, dict[str, float | int | None]]:
+) -> dict[str, Record]:
     """Statistics of each tracker on the same frames, by name."""
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in trackers}
     stops = 0
@@ -327,7 +321,7 @@ class LedErrors(NamedTuple):
     true_m: Floats
     before_m: Floats
     after_m: Floats
-    renamed: NDArray[np.bool_]
+    renamed: Mask
 
 
 def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
@@ -340,7 +334,7 @@ def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErro
     return LedErrors(true_m[row], before_m, position_m - true_m[nearest], nearest != row)
 
 
-def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any]:
+def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
     """Statistics of a survey without the truth. `values` holds one row per lens and lever parameter that is fitted."""
     survey = run.survey
     sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
@@ -365,7 +359,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> dict[str, Any
     }
 
 
-def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> dict[str, Any]:
+def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> Record:
     """The errors of a simulated survey: of the LEDs before and after it, and the true parameters."""
     errors = led_errors(run.survey, before, lab)
     truth = parameters(lab.scene.camera, lab.camera.mount)
@@ -386,12 +380,14 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
 def survey_figure(
     so_far: Coverage,
     faults: DomeFaults,
-    further: Rotation | None,
+    further: Rotation,
     errors: LedErrors | None,
-    shifts: LedErrors,
+    run: SurveyRun,
 ) -> NDArray[np.uint8]:
     """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
-    panels = [("found minus list", shifts.true_m, -shifts.before_m)]
+    row = np.flatnonzero(run.survey.surveyed)
+    found_m = run.survey.leds.position_m[row]
+    panels = [("found minus list", found_m, found_m - run.listed.position_m[row])]
     if errors is not None:
         panels = [
             ("error before the survey", errors.true_m, errors.before_m),
@@ -407,9 +403,7 @@ def survey_figure(
     return bgr_image(draw, (7 * (1 + len(panels)), 6.5))
 
 
-def draw_coverage(
-    axes: Any, so_far: Coverage, faults: DomeFaults | None, further: Rotation | None
-) -> None:
+def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
     """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
     from matplotlib.colors import LogNorm
 
@@ -432,32 +426,26 @@ def draw_coverage(
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
-    if faults is not None:
-        marks = {
-            "dark": (faults.dark, "x", "black"),
-            "displaced": (list(faults.displaced), "D", "magenta"),
-            "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
-        }
-        for name, (numbers, marker, color) in marks.items():
-            rows = rows_of(numbers, leds.id)
-            colors = (
-                {"color": color}
-                if marker == "x"
-                else {"facecolor": "none", "edgecolor": color}
-            )
-            if len(rows):
-                axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
-            for row in rows:
-                text = {"textcoords": "offset points", "color": color}
-                axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
-    if further is not None:
-        lever = so_far.model.lever
-        toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(
-            -1, 3
+    marks = {
+        "dark": (faults.dark, "x", "black"),
+        "displaced": (list(faults.displaced), "D", "magenta"),
+        "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
+    }
+    for name, (numbers, marker, color) in marks.items():
+        rows = rows_of(numbers, leds.id)
+        colors = (
+            {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
         )
-        for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
-            at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
-            axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
+        if len(rows):
+            axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
+        for row in rows:
+            text = {"textcoords": "offset points", "color": color}
+            axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
+    lever = so_far.model.lever
+    toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+    for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
+        at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
+        axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")
     axes.legend(loc="upper left", fontsize="small")
     axes.set(
         xlabel="x [m]",
@@ -480,13 +468,3 @@ def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None
     axes.set_title(f"{title}: {rms_mm:.2g} mm rms an axis", loc="left")
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.figure.colorbar(arrows, ax=axes, label="z error [mm]", shrink=0.8)
-
-
-def list_shifts(run: SurveyRun) -> LedErrors:
-    """The measured LEDs as found, with the errors of the list relative to them."""
-    row = np.flatnonzero(run.survey.surveyed)
-    found_m = run.survey.leds.position_m[row]
-    none = np.zeros(len(row), dtype=bool)
-    return LedErrors(
-        found_m, run.listed.position_m[row] - found_m, np.zeros_like(found_m), none
-    )

@@ -113,19 +113,13 @@ def noise_draws() -> Floats:
     return random_stream(3).standard_normal((3, 9, 2, PHASES))
 
 
-class BlobMoments(NamedTuple):
-    """Of a light, by its level: mean and variance of area and of summed gray level, and their covariance."""
+def blob_moments(
+    full: float, noise: float, radius_px: float, blur_px: float
+) -> tuple[Floats, ...]:
+    """Moments of a light's image at the levels of a grid.
 
-    level: Floats
-    area: Floats
-    area_variance: Floats
-    total: Floats
-    total_variance: Floats
-    covariance: Floats
-
-
-def blob_moments(full: float, noise: float, radius_px: float, blur_px: float) -> BlobMoments:
-    """Moments of a light's image at the levels of a grid."""
+    The levels, mean and variance of the area and of the summed gray level, and their covariance.
+    """
     half_px = int(radius_px + 5 * blur_px + 3)
     side = np.arange(-half_px * OVERSAMPLING, half_px * OVERSAMPLING + 1) / OVERSAMPLING
     distance_px = np.hypot(side[:, None], side)
@@ -141,7 +135,7 @@ def blob_moments(full: float, noise: float, radius_px: float, blur_px: float) ->
     density = np.exp(-0.5 * above**2) / np.sqrt(2 * np.pi) * lit
     mean = gray * probability + noise * density
     square = (gray**2 + noise**2) * probability + noise * density * (gray + THRESHOLD_GRAY)
-    return BlobMoments(
+    return (
         level,
         probability.sum(axis=1),
         (probability * (1 - probability)).sum(axis=1),

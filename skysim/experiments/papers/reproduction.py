@@ -32,6 +32,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments import home_calibration
 from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
 from skysim.experiments.study import table as study_table
@@ -42,7 +43,7 @@ from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.metrics import SIGMAS
 from skysim.scene import loader
 from skysim.scene.scene import Scene
-from skysim.simulation.flight import open_flight
+from skysim.simulation.flight import Progress, open_flight
 
 Verdict = Literal["agrees", "undecided", "disagrees"]
 VERDICTS: tuple[Verdict, ...] = ("agrees", "undecided", "disagrees")
@@ -50,8 +51,7 @@ TERM = re.compile(r"\s*([\w.-]+?)\s*(?:\[(.*?)\])?\s*")
 BOTH = re.compile(r"^(.*?\S)\s+([-/])\s+(\S.*)$")
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
+class Options(NamedTuple):
     """Options of `skysim reproduce`.
 
     Attributes
@@ -66,7 +66,7 @@ class Options:
 
     quick: bool = False
     seed: int = 1
-    watch: Callable[[float, float], None] = lambda completed, total: None
+    watch: Progress = lambda completed, total: None
 
 
 class Ours(NamedTuple):
@@ -86,7 +86,7 @@ class Comparison(NamedTuple):
     ours: Ours
     verdict: Verdict
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Record:
         """For JSON. A bound is published as [least, most], an open end as null."""
         row = self.row
         bounds = [row.at_least, row.at_most]
@@ -163,6 +163,7 @@ Number = Callable[[str, str], Ours]  # of a path and the text in its brackets
 def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:
     """Run a scene with several seeds; a number is the mean of its values, of the runs in which it has one."""
     runs = experiment.quick_runs if options.quick else experiment.runs
+    clicks = home_calibration.CLICKS if experiment.clicks is None else experiment.clicks
     commands = []
     results = []
     for n in range(runs):
@@ -177,11 +178,12 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
             )
         )
         scene = loader.load(experiment.file, overrides)
-        results.append(
-            calibrate_result(scene, experiment)
-            if experiment.command == "calibrate"
-            else run_result(scene)
-        )
+        if experiment.command == "calibrate":
+            measured = home_calibration.measure_scene(scene)
+            found = home_calibration.calibrated(*measured, clicks)
+            results.append(home_calibration.statistics(found))
+        else:
+            results.append(run_result(scene))
         options.watch(n + 1, runs)
 
     def number(path: str, levels: str) -> Ours:
@@ -196,7 +198,7 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
     return commands, number
 
 
-def run_result(scene: Scene) -> dict[str, Any]:
+def run_result(scene: Scene) -> Record:
     """What `skysim run --json` prints of a flight, without the files."""
     with open_flight(scene) as flight:
         rows = [scoring.score(shot).row for shot in flight.shots()]
@@ -205,13 +207,6 @@ def run_result(scene: Scene) -> dict[str, Any]:
         "flight": motion,
         "rows": [asdict(row) for row in rows],
     }
-
-
-def calibrate_result(scene: Scene, experiment: Experiment) -> dict[str, Any]:
-    """What `skysim calibrate --json` prints."""
-    clicks = home_calibration.CLICKS if experiment.clicks is None else experiment.clicks
-    known, frames = home_calibration.measure_scene(scene)
-    return home_calibration.statistics(home_calibration.calibrated(known, frames, clicks))
 
 
 def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:

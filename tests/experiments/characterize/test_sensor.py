@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
 
 from skysim.camera import detector
@@ -21,9 +23,9 @@ from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
+    LevelBuilder,
     Moments,
     TransferPoint,
-    level,
     propagate,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
@@ -62,6 +64,14 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
     return CameraConfig.model_validate(
         lens | {"detector": CHIP | {"hardware_seed": seed} | changes}
     )
+
+
+def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
+    """The level of two frames or more."""
+    builder = LevelBuilder()
+    for frame in frames:
+        builder.add(frame)
+    return builder.level(exposure_s, temperature_c)
 
 
 def measured(
@@ -164,7 +174,7 @@ def test_the_fit_returns_the_law_of_its_points() -> None:
     assert found.read_noise_e.value == pytest.approx(read / gain, rel=2e-3)
     assert found.values[photon_transfer.CURVATURE] == pytest.approx(curvature, rel=5e-3)
     assert found.offset_dn.value == pytest.approx(black, abs=2e-3)
-    assert found.light_e_s.value == pytest.approx(2000, rel=2e-3)
+    assert found.values[photon_transfer.LIGHT] / gain == pytest.approx(2000, rel=2e-3)
     assert found.values[photon_transfer.FIRST_DARK] / gain == pytest.approx(3, rel=2e-3)
 
 

@@ -233,7 +233,7 @@ def print_coverage(
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
     """Statistics of a coverage, with the attitudes to hold next and the accuracy predicted with them."""
 
-    margin_px = survey_prior.image_sizes(prior).margin_px
+    margin_px = prior.margin_px
     further = survey_findings.next_stops(
         request.scene, so_far, margin_px, request.next_stops, request.tilt_deg
     )
@@ -268,10 +268,7 @@ def write_results(
     further = survey_frames.from_rows(statistics["next"])
     errors = survey_report.led_errors(run.survey, before, lab) if lab else None
     files.write_image(
-        picture,
-        survey_report.survey_figure(
-            so_far, faults, further, errors, survey_report.list_shifts(run)
-        ),
+        picture, survey_report.survey_figure(so_far, faults, further, errors, run)
     )
     return statistics
 

@@ -171,7 +171,7 @@ class Survey:
 
     def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
-        margin_px = survey_prior.image_sizes(self.before).margin_px
+        margin_px = self.before.margin_px
         further = survey_findings.next_stops(
             self.scene, so_far, margin_px, count, tilt_deg(self.scene)
         )
