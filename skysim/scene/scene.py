@@ -19,7 +19,17 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
-from skysim.core.units import ConfigModel, Length, Number, Spin, Time
+from skysim.core.units import (
+    ConfigModel,
+    Delay,
+    Position,
+    Positive,
+    PositiveInt,
+    Seed,
+    Spins,
+    Time,
+    Triple,
+)
 from skysim.core.yaml_reader import excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
@@ -52,10 +62,10 @@ class ExposureConfig(ConfigModel):
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
-    rate_hz: Annotated[Number, Field(gt=0)]
-    frames: Annotated[int, Field(ge=1)]
-    first_s: Annotated[Time, Field(ge=0)] = 0.0
-    trigger_jitter_s: Annotated[Time, Field(ge=0)] = 0.0
+    rate_hz: Positive
+    frames: PositiveInt
+    first_s: Delay = 0.0
+    trigger_jitter_s: Delay = 0.0
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
@@ -104,9 +114,9 @@ class HeadConfig(ConfigModel):
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
-    position_m: tuple[Length, Length, Length]
-    rotation_deg: tuple[Spin, Spin, Spin]
-    mount_error_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    position_m: Position
+    rotation_deg: Spins
+    mount_error_arcsec: Triple = (0.0, 0.0, 0.0)
     mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
@@ -133,7 +143,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     start_time: Annotated[datetime.datetime, AfterValidator(check_year)]
     site: SiteConfig = SiteConfig()
     orbit: Orbit | None = None

@@ -21,11 +21,15 @@ from skysim.core.paths import DATA
 from skysim.core.units import (
     Ascending,
     ConfigModel,
+    Duration,
     Fraction,
+    Fractions,
     Length,
     NotNegative,
     Number,
-    Time,
+    PositiveFraction,
+    Seed,
+    Temperature,
     check_table,
     quantity,
 )
@@ -118,7 +122,7 @@ class VignettingTableConfig(ConfigModel):
 
     kind: Literal["table"]
     angle_deg: Ascending
-    transmission: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+    transmission: Fractions
 
     @model_validator(mode="after")
     def check_columns(self) -> VignettingTableConfig:
@@ -224,7 +228,7 @@ class BaffleConfig(ConfigModel):
     """
 
     angle_deg: Ascending
-    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+    pst: Fractions
 
     @model_validator(mode="after")
     def check_columns(self) -> BaffleConfig:
@@ -244,21 +248,21 @@ class RollingShutterConfig(ConfigModel):
     """Each row opens and closes row_time after the one above it."""
 
     kind: Literal["rolling"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
 
 
 class FrameTransferConfig(ConfigModel):
     """Exposed charge is shifted into a covered store, row_time per row, so a pixel collects along its column."""
 
     kind: Literal["frame_transfer"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
 
 
 class InterlineConfig(ConfigModel):
     """The covered register is not opaque: it collects the fraction `leak` of the light of each row that it passes."""
 
     kind: Literal["interline"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
     leak: Fraction = 1e-4
 
 
@@ -310,7 +314,7 @@ class EfficiencyConfig(ConfigModel):
     """
 
     curve: Curve
-    peak: Annotated[Number, Field(gt=0, le=1)]
+    peak: PositiveFraction
 
 
 class ColorEfficiencyConfig(ConfigModel):
@@ -354,7 +358,7 @@ def curve_exists(value: str) -> str:
 
 
 Transmission = Annotated[
-    Annotated[Annotated[Number, Field(gt=0, le=1)], Tag("number")]
+    Annotated[PositiveFraction, Tag("number")]
     | Annotated[Annotated[str, AfterValidator(curve_exists)], Tag("curve")],
     Discriminator(transmission_tag),
 ]
@@ -403,12 +407,12 @@ class DetectorConfig(ConfigModel):
 
     quantum_efficiency: Efficiency
     bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
-    hardware_seed: Annotated[int, Field(ge=0)] = 0
+    hardware_seed: Seed = 0
     prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
     dark_e_s: Electrons = 0.0
-    dark_temperature_c: Annotated[Number, Field(ge=-150, le=150)] = 20.0
+    dark_temperature_c: Temperature = 20.0
     dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
-    temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
+    temperature_c: Temperature | None = None
     dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
     hot_pixels: Fraction = 0.0
     hot_e_s: Electrons = 0.0
