@@ -17,7 +17,7 @@ from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics
-from skysim.results.plots import annotate, reduce_width, visible
+from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
@@ -179,7 +179,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.uint8]:
+def annotated(frame: Frame, truth: Truth, report: Report | None) -> Picture:
     """The stretched frame with visible true sources and, if it was solved, detections and matches marked."""
     detected = report.centroids.xy_px if report else np.empty((0, 2))
     match = report.attitude.match if report else None
@@ -227,7 +227,7 @@ class Score:
         """Rotation angle between the solution and the truth, arcseconds; NaN without a solution."""
         return math.hypot(self.row.cross_arcsec, self.row.roll_arcsec)
 
-    def annotated(self) -> NDArray[np.uint8]:
+    def annotated(self) -> Picture:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
         return annotated(self.shot.frame, self.truth, self.shot.report)
 
@@ -247,7 +247,7 @@ def score(shot: Shot) -> Score:
     )
 
 
-def image_tag(image: NDArray[np.uint8]) -> str:
+def image_tag(image: Picture) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     data = cv2.imencode(".jpg", reduce_width(image, 800))[1].tobytes()
     return f'<img src="{embed(data, "jpeg")}">'

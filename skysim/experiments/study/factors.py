@@ -22,6 +22,7 @@ from skysim.core.units import ConfigModel
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
+Option = tuple[Value, Settings]  # a level as in tables, and its settings
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*?)?\s*$")
 Name = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*$")]
 
@@ -49,7 +50,7 @@ def join_quantity(number: float, unit: str) -> Value:
     )
 
 
-def option_at(factor: Levels | Values, u: float) -> tuple[Value, Settings]:
+def option_at(factor: Levels | Values, u: float) -> Option:
     """The level or value at u in [0, 1], which is divided equally among all options."""
     options = factor.options()
     return options[min(int(u * len(options)), len(options) - 1)]
@@ -61,7 +62,7 @@ class Levels(ConfigModel):
     levels: Annotated[dict[str, Settings], Field(min_length=1)]
     value_at = option_at
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """Every level: its name in tables and its settings."""
         return list(self.levels.items())
 
@@ -89,7 +90,7 @@ class Values(KeyedFactor):
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
     value_at = option_at
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """Every value with its settings."""
         return [(value, self.settings_for(value)) for value in self.values]
 
@@ -124,11 +125,11 @@ class Range(KeyedFactor):
             raise InputError("", f"from is {self.from_!r}", "above 0 with scale: log")
         return self
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """`steps` values from one bound to the other, both included."""
         return [self.value_at(u) for u in np.linspace(0, 1, self.steps)]
 
-    def value_at(self, u: float) -> tuple[Value, Settings]:
+    def value_at(self, u: float) -> Option:
         """The value at the fraction u of the way from `from` to `to`."""
         (low, unit), (high, _) = split_quantity(self.from_), split_quantity(self.to)
         number = low * (high / low) ** u if self.scale == "log" else low + (high - low) * u
@@ -193,11 +194,11 @@ class Distribution(KeyedFactor):
             raise InputError("", f"{', '.join(ascending)} are not in ascending order")
         return parameters, units.pop()
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """None: a distribution has no levels."""
         return []
 
-    def value_at(self, u: float) -> tuple[Value, Settings]:
+    def value_at(self, u: float) -> Option:
         """The quantile at probability u."""
         parameters, unit = self.parameters()
         value = join_quantity(float(QUANTILES[self.distribution](u, *parameters)), unit)
@@ -298,7 +299,7 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     return list(DESIGNS[design.kind](design, factors, seed))
 
 
-def make_point(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
+def make_point(chosen: Mapping[str, Option]) -> Point:
     """The point with these levels and settings of each factor."""
     settings: Settings = {}
     for _, level_settings in chosen.values():

@@ -37,7 +37,7 @@ from skysim.core.units import (
     Seed,
     Triple,
 )
-from skysim.core.yaml_reader import explain, is_file, set_key
+from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
@@ -482,7 +482,7 @@ class TrialSpec:
     folder: str
     seed: int
     base: Settings
-    trial: dict[str, Any]
+    trial: Tree
     paired: bool
     hardware: tuple[str, ...] = ()
     programs: Mapping[str, str] = field(default_factory=dict)
@@ -558,9 +558,7 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
-def make_plan(
-    path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]
-) -> Plan:
+def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -605,7 +603,7 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     """The trial at a point, with its settings applied. Raises InputError with one line."""
-    tree: dict[str, Any] = {"trial": dict(spec.trial)}
+    tree: Tree = {"trial": dict(spec.trial)}
     for key, value in (spec.base | settings).items():
         if key.startswith(TRIAL):
             set_key(tree, key, one_line(value))

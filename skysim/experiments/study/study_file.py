@@ -6,12 +6,19 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
-from skysim.core.yaml_reader import check_version, explain, read_yaml, set_key, where_of
+from skysim.core.yaml_reader import (
+    OverrideTexts,
+    Tree,
+    check_version,
+    explain,
+    read_yaml,
+    set_key,
+    where_of,
+)
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.factors import (
@@ -66,7 +73,7 @@ MEASURED_BY: dict[str, tuple[str, ...]] = {
 
 def load(
     name: str | Path,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
     programs: Mapping[str, str] | None = None,
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
@@ -91,12 +98,12 @@ def load(
 
 
 def plan_of(
-    tree: dict[str, Any],
+    tree: Tree,
     text: str,
     path: Path,
     base: Path | None = None,
     *,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
     programs: Mapping[str, str] | None = None,
 ) -> Plan:
     """The validated plan of a study's tree, read from a text.

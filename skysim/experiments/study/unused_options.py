@@ -7,9 +7,10 @@ bounds the exposure time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.factors import Settings, Value, make_point
 from skysim.experiments.study.plan import (
     TRIAL,
@@ -308,7 +309,7 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
             raise error.within(level).within(f"factors.{name}")
 
 
-def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:
+def unused_overrides(overrides: OverrideTexts, scene: Scene, trial: Trial) -> set[str]:
     """The overrides that have no effect on a trial of the resulting scene."""
     useless = set()
     for key, text in overrides.items():

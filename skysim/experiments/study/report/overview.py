@@ -14,7 +14,14 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.trials import rate_axis
-from skysim.experiments.study.factors import Distribution, Factor, Point, Range, make_point
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Option,
+    Point,
+    Range,
+    make_point,
+)
 from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
 from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguity
 from skysim.experiments.study.table import format_level
@@ -26,7 +33,6 @@ from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
-Level = tuple[object, dict[str, object]]  # value, settings
 MAX_CHECKED = (
     16  # maximum number of scenes that are checked: building one takes up to a second
 )
@@ -165,7 +171,7 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
     yield from named.items()
 
 
-def ends(levels: list[Level]) -> list[Level]:
+def ends(levels: list[Option]) -> list[Option]:
     """The levels with the least and the greatest number; the first and the last one of levels without numbers."""
     numbers = [float(found[0]) for value, _ in levels if (found := NUMBER.match(str(value)))]
     if len(numbers) == len(levels):
@@ -173,7 +179,7 @@ def ends(levels: list[Level]) -> list[Level]:
     return [levels[0], levels[-1]] if len(levels) > 1 else levels
 
 
-def options(factor: Factor) -> list[Level]:
+def options(factor: Factor) -> list[Option]:
     """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
