@@ -20,25 +20,20 @@ from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot
 from skysim.simulation.lab import StarCamera
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:
     """Names of the three angles of a row."""
-    return (
-        ("RA", "Dec", "roll")
-        if isinstance(scene.light, StarsConfig)
-        else ("roll", "pitch", "yaw")
-    )
+    return ("RA", "Dec", "roll") if scene.stars else ("roll", "pitch", "yaw")
 
 
 def angles_deg(
     cam_from_lab: Rotation, scene: Scene, mount: Mount
 ) -> tuple[float, float, float]:
     """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
         return float(ra), float(dec), float(roll)
     lab_from_body = cam_from_lab.inv() * mount.cam_from_body

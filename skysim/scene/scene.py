@@ -32,7 +32,7 @@ from skysim.core.units import (
 )
 from skysim.core.yaml_reader import excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
+from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
 from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
@@ -176,9 +176,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
                     "seed": tracker.survey.seed,
                 }
             )
-        if not isinstance(self.light, DomeConfig) and (
-            tracker.survey != lens_only or tracker.map
-        ):
+        if not self.dome and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
                 f"tracker.{key}",
@@ -213,11 +211,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @model_validator(mode="after")
     def complete_layout(self) -> Scene:
         """The scene with the field of view and the camera position of an optimized layout completed by its own."""
-        layout = self.light.layout if isinstance(self.light, DomeConfig) else None
-        nested = isinstance(layout, OnPoints)
-        points = layout.points if isinstance(layout, OnPoints) else layout
-        if not isinstance(points, OptimizedConfig):
+        dome = self.dome
+        if dome is None or not isinstance(dome.points, OptimizedConfig):
             return self
+        points = dome.points
+        nested = dome.layout is not points
         camera_m = points.camera_m or self.vehicle.camera_m
         chip = (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
@@ -230,15 +228,13 @@ class Scene(ConfigModel, metaclass=SceneKind):
         points = points.model_copy(
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
         )
-        layout = layout.model_copy(update={"points": points}) if nested and layout else points
-        return self.model_copy(
-            update={"light": self.light.model_copy(update={"layout": layout})}
-        )
+        layout = dome.layout.model_copy(update={"points": points}) if nested else points
+        return self.model_copy(update={"light": dome.model_copy(update={"layout": layout})})
 
     @model_validator(mode="after")
     def check_code(self) -> Scene:
         """Check that the decoder has a code, and that all rows of the shutter show the same bits."""
-        code = self.light.led.code if isinstance(self.light, DomeConfig) else None
+        code = self.dome.led.code if self.dome else None
         if self.tracker.decoder and code is None:
             raise InputError("tracker.decoder", "requires light.led.code")
         if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
@@ -267,7 +263,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @model_validator(mode="after")
     def check_orbit(self) -> Scene:
         """Check that an orbit is under the stars, and that satellites have an orbit or a site."""
-        if self.orbit and not isinstance(self.light, StarsConfig):
+        if self.orbit and not self.stars:
             raise InputError(
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
             )
@@ -366,7 +362,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
             motion.is_prescribed
             and motion.start == "profile"
             and {leg.kind for leg in motion.maneuver} <= {"profile", "hold", "jitter"}
-            and not isinstance(self.light, StarsConfig)
+            and not self.stars
         )
         if two_axis != bool(self.vehicle.gimbals) or (two_axis and not follows):
             raise InputError(
@@ -434,6 +430,16 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @property
+    def dome(self) -> DomeConfig | None:
+        """The light if it is an LED dome."""
+        return self.light if isinstance(self.light, DomeConfig) else None
+
+    @property
+    def stars(self) -> StarsConfig | None:
+        """The light if it is the sky."""
+        return self.light if isinstance(self.light, StarsConfig) else None
+
+    @property
     def inherited(self) -> tuple[str, ...]:
         """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
         return self._inherited
@@ -471,7 +477,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         exposure = self.exposure
         control = self.motion.control
         tracker = self.tracker
-        dome = self.light if isinstance(self.light, DomeConfig) else None
+        dome = self.dome
         stages = [
             getattr(tracker, stage)
             for stage in ("detector", "centroider", "identifier", "solver")

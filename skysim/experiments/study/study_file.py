@@ -48,8 +48,7 @@ from skysim.experiments.study.plan import (
 from skysim.results import metrics
 from skysim.scene import unused
 from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.tracking.tracker_interface import OWN, TRACKERS
 
 SURVEY_SEED = "tracker.survey.seed"
@@ -287,12 +286,10 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
 def dome_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds of the survey and of the LEDs that have an effect in a scene."""
     seeds = [] if unused.reason(SURVEY_SEED, scene) else [SURVEY_SEED]
-    key = "light.layout"
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    if isinstance(layout, OnPoints):
-        key = "light.layout.points"
-        layout = layout.points
-    return seeds + [f"{key}.hardware_seed"] * hasattr(layout, "hardware_seed")
+    if scene.dome and hasattr(scene.dome.points, "hardware_seed"):
+        nested = scene.dome.points is not scene.dome.layout
+        seeds.append(f"light.layout{'.points' * nested}.hardware_seed")
+    return seeds
 
 
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
@@ -354,11 +351,8 @@ def may_report_ambiguity(scene: Scene) -> bool:
     """Whether the tracker of a scene can refuse a frame as ambiguous."""
     from estimator.trackers.dome_tracker import SETTINGS
 
-    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (
-        None,
-        SETTINGS.identifier,
-    )
-    return own or scene.tracker.name != OWN
+    may = scene.dome is not None and scene.tracker.identifier in (None, SETTINGS.identifier)
+    return may or scene.tracker.name != OWN
 
 
 def check_random_start(scene: Scene, start: AttitudeRange) -> None:
@@ -370,8 +364,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
             else "motion.start: profile"
         )
         raise InputError("trial.start", f"random with {where}", "scene")
-    dome = isinstance(scene.light, DomeConfig)
-    for key in ("dec_deg", "near") if dome else ("tilt_deg",):
+    for key in ("dec_deg", "near") if scene.dome else ("tilt_deg",):
         if key in start.model_fields_set:
             raise InputError(
                 f"trial.start.{key}",
@@ -382,7 +375,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
     )
     vehicle = scene.vehicle
-    if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
+    if scene.dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(
             "trial.start.tilt_deg",
             f"{greatest_deg:g}",

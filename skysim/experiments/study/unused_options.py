@@ -24,8 +24,7 @@ from skysim.experiments.study.plan import (
 from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.scene.sections.layouts import CelestialConfig, OnPoints
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.layouts import CelestialConfig
 from skysim.scene.unused_rules import Rule
 from skysim.tracking import factory
 
@@ -96,7 +95,7 @@ def ignores_streak(scene: Scene, trial: Trial) -> bool:
 def tracks(scene: Scene) -> bool:
     """Whether the scene's tracker has a tracking mode."""
     return (
-        isinstance(scene.light, StarsConfig)
+        scene.stars is not None
         and not unused_rules.external(scene)
         and not isinstance(scene.camera.shutter, RollingShutterConfig)
     )
@@ -104,14 +103,12 @@ def tracks(scene: Scene) -> bool:
 
 def in_dome(scene: Scene, trial: Trial) -> bool:
     """Whether the light is an LED dome."""
-    return isinstance(scene.light, DomeConfig)
+    return scene.dome is not None
 
 
 def merges_stars(scene: Scene) -> bool:
     """Whether the size of an LED decides which stars share an LED."""
-    layout = getattr(scene.light, "layout", None)
-    points = layout.points if isinstance(layout, OnPoints) else layout
-    return isinstance(points, CelestialConfig)
+    return scene.dome is not None and isinstance(scene.dome.points, CelestialConfig)
 
 
 RULES = (
@@ -184,7 +181,7 @@ RULES = (
         lambda scene, trial: (
             isinstance(trial, FrameTrial)
             and not trial.tracked
-            and (not isinstance(scene.light, DomeConfig) or unused_rules.steady(scene))
+            and (not scene.dome or unused_rules.steady(scene))
         ),
         "the light of a trial's frame is steady",
         "trial.kind: flight",

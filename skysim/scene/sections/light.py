@@ -39,7 +39,13 @@ from skysim.core.units import (
     RightAscension,
     Seed,
 )
-from skysim.scene.sections.layouts import Layout, PixelsConfig
+from skysim.scene.sections.layouts import (
+    Layout,
+    OnPoints,
+    PatchBoardsConfig,
+    PixelsConfig,
+    Points,
+)
 from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
@@ -365,6 +371,11 @@ class DomeConfig(ConfigModel):
     occlusion: bool = True
     reflection: ReflectionConfig | None = None
     room: RoomConfig | None = None
+
+    @property
+    def points(self) -> PatchBoardsConfig | Points:
+        """The layout of single LEDs or boards: of fibers and displays, that of the points that they show."""
+        return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:

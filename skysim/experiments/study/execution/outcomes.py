@@ -20,7 +20,6 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 from skysim.tracking.computer_time import total
@@ -343,7 +342,7 @@ def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[st
     """The columns DIRECTION of an attitude."""
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
     z = np.array([0.0, 0.0, 1.0])
-    if isinstance(lab.scene.light, DomeConfig):
+    if lab.scene.dome:
         x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
         values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
         values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360

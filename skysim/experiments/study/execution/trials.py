@@ -57,7 +57,6 @@ from skysim.experiments.study.plan import (
     TrialSpec,
 )
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import StarCamera, UserParts
@@ -356,7 +355,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> 
     assert attitudes is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if isinstance(lab.scene.light, DomeConfig):
+    if lab.scene.dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         least = math.cos(math.radians(high))

@@ -27,7 +27,6 @@ from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguit
 from skysim.experiments.study.table import format_level
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
@@ -82,7 +81,7 @@ def overview(plan: Plan) -> Overview:
         except InputError:
             continue
         checked += 1
-        if isinstance(scene.light, DomeConfig):
+        if scene.dome:
             leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
@@ -99,11 +98,7 @@ def overview(plan: Plan) -> Overview:
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
     drawn = trial.start if isinstance(trial, FlightTrial) else trial
-    return (
-        None
-        if drawn is None or not isinstance(scene.light, DomeConfig)
-        else float(np.max(drawn.tilt_deg))
-    )
+    return None if drawn is None or not scene.dome else float(np.max(drawn.tilt_deg))
 
 
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
@@ -219,18 +214,17 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
 
 def light_text(scene: Scene, lab: Lab) -> str:
     """The light source in words."""
-    light = scene.light
-    if isinstance(light, DomeConfig):
-        surface = light.surface
-        layout = light.layout
+    if scene.dome:
+        surface = scene.dome.surface
+        layout = scene.dome.layout
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
         cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
         return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({layout.kind}){cap}"
-    if isinstance(light, StarsConfig):
+    if light := scene.stars:
         limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
         return f"{len(lab.camera.sources)} stars of {light.catalog}{limit}"
-    return light.kind.replace("_", " ")
+    return scene.light.kind.replace("_", " ")
 
 
 def camera_text(camera: CameraConfig) -> str:
