@@ -52,25 +52,25 @@ def list_cameras() -> list[str]:
     return sorted(path.stem for path in PRESETS.glob("*.yaml"))
 
 
-def preset_path(name: str, where: str = "camera.preset") -> Path:
+def preset_path(name: str) -> Path:
     """The file of a camera preset, which is a name in data/cameras or a path. Raises InputError for an unknown name."""
     path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         problem, names = unknown_name("preset", name, list_cameras())
-        raise InputError(where, problem, f"{names}, or a .yaml file with a camera")
+        raise InputError("camera.preset", problem, f"{names}, or a .yaml file with a camera")
     return path
 
 
-def preset(name: str, where: str = "camera.preset") -> Tree:
+def preset(name: str) -> Tree:
     """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
-    path = preset_path(name, where)
+    path = preset_path(name)
     try:
         camera = resolve_files(path, read_yaml(path)[0]).get("camera")
     except InputError as error:
-        raise error.within(where) from None
+        raise error.within("camera.preset") from None
     if not isinstance(camera, dict) or "preset" in camera:
         raise InputError(
-            where, f"{path} is not a camera", "a section camera without a preset"
+            "camera.preset", f"{path} is not a camera", "a section camera without a preset"
         )
     return camera
 
@@ -445,30 +445,30 @@ def apply_preset(tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:
 
 
 # Keys whose value may be a file in the scene's folder; * stands for every item of a list.
-FILE_KEYS = (
-    ("vehicle", "model"),
-    ("motion", "maneuver", "*", "file"),
-    ("camera", "preset"),
-    ("camera", "psf", "file"),
-    ("camera", "calibration"),
-    ("camera", "transmission"),
-    ("camera", "detector", "quantum_efficiency"),
-    *(
-        ("camera", "detector", "quantum_efficiency", key)
-        for key in ("curve", "red", "green", "blue")
-    ),
-    ("light", "catalog"),
-    ("light", "satellites", "file"),
-    ("light", "led", "spectrum"),
-    ("light", "surface", "file"),
-    ("light", "layout", "catalog"),
-    ("light", "layout", "file"),
-    ("light", "layout", "points", "file"),
-    ("orbit", "file"),
-    ("tracker", "catalog"),
-    ("tracker", "map"),
+FILE_KEYS: tuple[str, ...] = (
+    "vehicle.model",
+    "motion.maneuver.*.file",
+    "camera.preset",
+    "camera.psf.file",
+    "camera.calibration",
+    "camera.transmission",
+    "camera.detector.quantum_efficiency",
+    "camera.detector.quantum_efficiency.curve",
+    "camera.detector.quantum_efficiency.red",
+    "camera.detector.quantum_efficiency.green",
+    "camera.detector.quantum_efficiency.blue",
+    "light.catalog",
+    "light.satellites.file",
+    "light.led.spectrum",
+    "light.surface.file",
+    "light.layout.catalog",
+    "light.layout.file",
+    "light.layout.points.file",
+    "orbit.file",
+    "tracker.catalog",
+    "tracker.map",
 )
-FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEAD_SECTIONS)
+FILE_KEYS += tuple(f"heads.*.{key}" for key in FILE_KEYS if key.startswith(HEAD_SECTIONS))
 
 
 def resolve_files(path: Path, tree: Tree) -> Tree:
@@ -498,7 +498,7 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
     """Yield the dotted keys under which a scene may name files, with their values."""
 
     def below(
-        node: Any, keys: tuple[str, ...], path: tuple[str, ...]
+        node: Any, keys: Sequence[str], path: tuple[str, ...]
     ) -> Iterator[tuple[str, str]]:
         """Those below a node that is at path, under further keys."""
         if not keys:
@@ -512,8 +512,8 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
         elif isinstance(node, dict) and keys[0] in node:
             yield from below(node[keys[0]], keys[1:], (*path, keys[0]))
 
-    for keys in FILE_KEYS:
-        yield from below(tree, keys, ())
+    for key in FILE_KEYS:
+        yield from below(tree, key.split("."), ())
 
 
 def load_camera(
