@@ -128,6 +128,14 @@ MAX_HEADS = 8
 HEAD_SECTIONS = ("camera", "tracker", "exposure")
 
 
+def ephemeris_problem(start_time: datetime.datetime) -> str:
+    """The reason why the ephemeris does not have a time; empty if it has."""
+    first, last = BODIES_YEARS
+    if first <= start_time.year <= last:
+        return ""
+    return f"start_time {start_time} is outside {first} to {last}"
+
+
 class SceneKind(ModelMetaclass):
     """The class of `Scene`: a scene from Python's keywords is refused in one line, like one from a file."""
 
@@ -248,16 +256,14 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @model_validator(mode="after")
     def check_bodies(self) -> Scene:
         """Check that the ephemeris is valid at the scene's time."""
-        first, last = BODIES_YEARS
+        problem = ephemeris_problem(self.start_time)
         sections = {
             "orbit": self.orbit,
             **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS},
         }
         for key, section in sections.items():
-            if section and not first <= self.start_time.year <= last:
-                raise InputError(
-                    key, f"start_time {self.start_time} is outside {first} to {last}"
-                )
+            if section and problem:
+                raise InputError(key, problem)
         return self
 
     @model_validator(mode="after")
@@ -283,17 +289,15 @@ class Scene(ConfigModel, metaclass=SceneKind):
     def check_air(self) -> Scene:
         """Check that the air has a site, and that the ephemeris of its light, Sun and Moon, is valid."""
         air = getattr(self.light, "air", None)
-        first, last = BODIES_YEARS
+        problem = ephemeris_problem(self.start_time)
         if air and self.orbit:
             raise InputError(
                 "light.air", "the camera is in an orbit, above the air", "light.air or orbit"
             )
         if air and self.site.longitude_deg is None:
             raise InputError("light.air", "requires site.longitude_deg")
-        if air and air.glow and not first <= self.start_time.year <= last:
-            raise InputError(
-                "light.air.glow", f"start_time {self.start_time} is outside {first} to {last}"
-            )
+        if air and air.glow and problem:
+            raise InputError("light.air.glow", problem)
         if air and air.glow and any(glow.kind in ("sky", "moon") for glow in self.background):
             raise InputError(
                 "light.air.glow",

@@ -47,7 +47,7 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import metrics
 from skysim.scene import unused
-from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.scene import Scene, ephemeris_problem
 from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.tracking.tracker_interface import OWN, TRACKERS
 
@@ -263,13 +263,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
     if near and near.body == "zenith" and scene.site.longitude_deg is None:
         raise InputError("trial.near.body", "zenith requires site.longitude_deg in the scene")
-    if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
-        first, last = BODIES_YEARS
-        raise InputError(
-            "trial.near",
-            f"start_time {scene.start_time} is outside {first} to {last}",
-            "none",
-        )
+    if near and (problem := ephemeris_problem(scene.start_time)):
+        raise InputError("trial.near", problem, "none")
     if to_run:
         tracker = scene.tracker.name
         TRACKERS.check_name(tracker, plan.spec.programs)
