@@ -51,11 +51,6 @@ class Rule(NamedTuple):
 # Conditions of the rules.
 
 
-def under_dome(scene: Scene) -> bool:
-    """Whether the light is an LED dome."""
-    return scene.dome is not None
-
-
 def steady(scene: Scene) -> bool:
     """Whether all light is steady."""
     return scene.dome is not None and isinstance(scene.dome.led.drive, DirectConfig)
@@ -80,11 +75,6 @@ def free_running_code(scene: Scene) -> bool:
     """Whether the LEDs' bits have their own clock."""
     code = scene.dome.led.code if scene.dome else None
     return code is not None and code.bit_time_s != "frame"
-
-
-def actuators(scene: Scene) -> str:
-    """The actuators that the controller uses; empty without a controller."""
-    return scene.motion.control.actuators if scene.motion.control else ""
 
 
 def external(scene: Scene) -> bool:
@@ -198,13 +188,13 @@ def seeing_is_narrow(scene: Scene) -> bool:
 RULES = (
     Rule(
         ("tracker.catalog", "tracker.limit_mag"),
-        under_dome,
+        lambda scene: scene.dome is not None,
         "under a dome the tracker's map is of LEDs",
         "light of kind stars or collimated_display",
     ),
     Rule(
         ("tracker.assumed_camera_body",),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "the tracker takes stars to be at infinity, whatever the camera's place",
         "light of kind dome",
     ),
@@ -240,7 +230,7 @@ RULES = (
     ),
     Rule(
         ("tracker.brightness_sigma",),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "stars are identified by their places",
         "a dome",
     ),
@@ -271,7 +261,7 @@ RULES = (
     Rule(
         ("tracker.assumed_attitude_deg",),
         lambda scene: (
-            not under_dome(scene)
+            scene.dome is None
             or external(scene)
             or scene.tracker.identifier in (None, "led_pairs", "non_dimensional")
         ),
@@ -491,7 +481,7 @@ RULES = (
     ),
     Rule(
         ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "there is no dome to move",
         "light of kind dome",
     ),
@@ -529,7 +519,7 @@ RULES = (
     ),
     Rule(
         ("vehicle.cmgs.gimbal_rate_limit_deg_s", "vehicle.cmgs.steering"),
-        lambda scene: actuators(scene) != "cmgs",
+        lambda scene: not (scene.motion.control and scene.motion.control.actuators == "cmgs"),
         "nothing commands the CMGs",
         "motion.control with actuators: cmgs",
     ),

@@ -23,7 +23,7 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import RollingShutterConfig
+from skysim.scene.sections.camera import DetectorConfig, RollingShutterConfig
 from skysim.scene.sections.layouts import CelestialConfig
 from skysim.scene.unused_rules import Rule
 from skysim.tracking import factory
@@ -55,33 +55,11 @@ def on_ground(scene: Scene, trial: Trial) -> bool:
     )
 
 
+# All but the color and efficiency of the detector, which decide the brightness of the lights.
 DETECTOR = tuple(
     f"camera.detector.{key}"
-    for key in (
-        "hardware_seed",
-        "prnu",
-        "dark_e_s",
-        "dark_temperature_c",
-        "dark_doubling_c",
-        "temperature_c",
-        "dsnu",
-        "hot_pixels",
-        "hot_e_s",
-        "particles",
-        "full_well_e",
-        "blooming",
-        "anti_blooming",
-        "cti_parallel",
-        "cti_serial",
-        "read_noise_e",
-        "reset_noise_e",
-        "column_offset_e",
-        "gain_e_dn",
-        "offset_dn",
-        "nonlinearity",
-        "bits",
-        "noise",
-    )
+    for key in DetectorConfig.model_fields
+    if key not in ("quantum_efficiency", "bayer")
 )
 
 
@@ -99,11 +77,6 @@ def tracks(scene: Scene) -> bool:
         and not unused_rules.external(scene)
         and not isinstance(scene.camera.shutter, RollingShutterConfig)
     )
-
-
-def in_dome(scene: Scene, trial: Trial) -> bool:
-    """Whether the light is an LED dome."""
-    return scene.dome is not None
 
 
 def merges_stars(scene: Scene) -> bool:
@@ -126,13 +99,13 @@ RULES = (
     ),
     Rule(
         ("trial.tilt_deg",),
-        lambda scene, trial: not in_dome(scene, trial),
+        lambda scene, trial: scene.dome is None,
         "the boresight is drawn from the sphere",
         "trial.dec_deg, or a scene with light of kind dome",
     ),
     Rule(
         ("trial.dec_deg", "trial.near"),
-        in_dome,
+        lambda scene, trial: scene.dome is not None,
         "under a dome the tilt is drawn",
         "trial.tilt_deg",
     ),
