@@ -40,6 +40,12 @@ FocusText = Annotated[str, Field(description='a length such as "33 in", or infin
 
 Electrons = Annotated[Number, Field(ge=0, le=1e9)]
 
+Wavelength = Annotated[Length, Field(ge=200e-9, le=2e-6)]
+
+# Standard deviation of a Gaussian: one that blurs a smooth image more, and one that alone makes it smooth enough.
+Blur = Annotated[Number, Field(ge=0, le=20)]
+SampledBlur = Annotated[Number, Field(ge=0.2, le=20)]
+
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
@@ -62,14 +68,14 @@ class PsfConfig(ConfigModel):
         quadrature (field curvature and coma, to first order)
     """
 
-    corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    corner_sigma_px: Blur = 0.0
 
 
 class GaussianPsfConfig(PsfConfig):
     """A Gaussian of standard deviation sigma_px."""
 
     kind: Literal["gaussian"] = "gaussian"
-    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+    sigma_px: SampledBlur = 0.7
 
 
 class MoffatPsfConfig(PsfConfig):
@@ -84,8 +90,8 @@ class AiryPsfConfig(PsfConfig):
     """Diffraction at the lens's working f-number, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["airy"]
-    wavelength_m: Annotated[Length, Field(ge=200e-9, le=2e-6)] = 550e-9
-    sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    wavelength_m: Wavelength = 550e-9
+    sigma_px: Blur = 0.0
 
 
 class DiskPsfConfig(PsfConfig):
@@ -93,7 +99,7 @@ class DiskPsfConfig(PsfConfig):
 
     kind: Literal["disk"]
     radius_px: Annotated[Number, Field(gt=0, le=200)]
-    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+    sigma_px: SampledBlur = 0.7
 
 
 class MeasuredPsfConfig(PsfConfig):
@@ -144,9 +150,7 @@ class ChromaticConfig(ConfigModel):
         distance from the principal point
     """
 
-    wavelength_m: Annotated[
-        tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)
-    ]
+    wavelength_m: Annotated[tuple[Wavelength, ...], Field(min_length=2)]
     focus_m: (
         Annotated[
             tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)

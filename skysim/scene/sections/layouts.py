@@ -31,6 +31,7 @@ Level = PositiveFraction
 Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
 Magnitudes = Annotated[tuple[Magnitude, ...], Field(min_length=1)]
 TypeNames = Annotated[tuple[str, ...], Field(min_length=1)]
+Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
@@ -475,9 +476,7 @@ class PixelsConfig(ConfigModel):
         White over black, which glows over the whole display; without it black is dark
     """
 
-    pixels: tuple[
-        Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]
-    ]
+    pixels: tuple[Pixels, Pixels]
     pitch_m: PositiveLength
     block: PositiveInt = 1
     gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256

@@ -209,6 +209,7 @@ class ThermalConfig(ConfigModel):
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
+ExclusionAngle = Annotated[Number, Field(ge=0, lt=180)]
 Rate = Annotated[Number, Field(gt=0, le=30)]
 
 
@@ -280,9 +281,9 @@ class ExclusionConfig(ConfigModel):
         Least number of stars to `tracker.limit_mag` in a round field of the detector's area
     """
 
-    sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
-    earth_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
-    moon_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    sun_deg: ExclusionAngle = 0.0
+    earth_deg: ExclusionAngle = 0.0
+    moon_deg: ExclusionAngle = 0.0
     stars: Annotated[int, Field(ge=0)] = 4
 
 
@@ -363,6 +364,9 @@ Orbit = Annotated[
 # The scene section `background`: glow.
 
 
+ZenithDistance = Annotated[Number, Field(ge=0, lt=90)]
+
+
 class UniformGlowConfig(ConfigModel):
     """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
 
@@ -396,8 +400,8 @@ class MoonGlowConfig(ConfigModel):
     dec_deg: Declination
     phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
     extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
-    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
-    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+    moon_zenith_deg: ZenithDistance
+    field_zenith_deg: ZenithDistance
 
 
 class StrayLightConfig(ConfigModel):
