@@ -65,7 +65,7 @@ def row(
     mount = camera.mount
     attitude = report.attitude
     cam_from_lab = scored_attitude(camera, truth)
-    cross = roll = cross_sigma = roll_sigma = chance = float("nan")
+    cross = roll = cross_sigma = roll_sigma = chance = math.nan
     estimate = None
     wrong = False
     if attitude.cam_from_ref is not None:
@@ -132,7 +132,7 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
     Both are lengths of vectors, NaN without a rate.
     """
     if rate is None:
-        return float("nan"), float("nan")
+        return math.nan, math.nan
     signs = (1,) if rate.sign_known else (1, -1)
     error = min(
         np.linalg.norm(sign * rate.rate_rad_s - truth.mean_rate_cam_rad_s) for sign in signs
@@ -146,7 +146,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
-    missing = (float("nan"),) * 3
+    missing = (math.nan,) * 3
     columns: dict[str, Any] = {
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")

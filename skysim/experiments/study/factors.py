@@ -168,15 +168,10 @@ class Distribution(KeyedFactor):
 
     def parameters(self) -> tuple[list[float], str]:
         """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""
-        quantities = [
-            split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]
-        ]
-        units = {
-            unit
-            for _, unit in (
-                quantities[:1] if self.distribution == "lognormal" else quantities
-            )
-        }
+        names = PARAMETERS[self.distribution]
+        quantities = [split_quantity(getattr(self, name)) for name in names]
+        with_unit = quantities[:1] if self.distribution == "lognormal" else quantities
+        units = {unit for _, unit in with_unit}
         if len(units) > 1:
             raise InputError(
                 "",
@@ -186,10 +181,8 @@ class Distribution(KeyedFactor):
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
             raise InputError("", f"sigma is {self.sigma!r}", "above 0")
-        ascending = [
-            name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")
-        ]
-        values = [parameters[PARAMETERS[self.distribution].index(name)] for name in ascending]
+        ascending = [name for name in names if name in ("low", "mode", "high")]
+        values = [parameters[names.index(name)] for name in ascending]
         if values and not (values == sorted(values) and values[0] < values[-1]):
             raise InputError("", f"{', '.join(ascending)} are not in ascending order")
         return parameters, units.pop()

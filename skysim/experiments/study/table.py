@@ -25,7 +25,7 @@ from skysim.experiments.study.factors import (
 )
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
-from skysim.results.files.row_parts import Rows, subset
+from skysim.results.files.row_parts import Array, Rows, subset
 from skysim.results.metrics import NO_VALUE, Columns, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
@@ -189,14 +189,14 @@ def trial_columns(store: Store) -> Rows:
     return with_levels(store.columns(), level_columns(store))
 
 
-def level_columns(store: Store) -> dict[str, NDArray[Any]]:
+def level_columns(store: Store) -> dict[str, Array]:
     """(P,) levels of each factor by point: numbers, or texts."""
     points = store.points()
     names = points[0].levels if points else {}
     return {name: to_array([one.levels[name] for one in points]) for name in names}
 
 
-def to_array(levels: Sequence[Any]) -> NDArray[Any]:
+def to_array(levels: Sequence[Any]) -> Array:
     """Levels of a factor as an array; as texts if numpy has no type for them."""
     plain = [format_level(one) if isinstance(one, list) else one for one in levels]
     array = np.array(plain)
@@ -205,10 +205,10 @@ def to_array(levels: Sequence[Any]) -> NDArray[Any]:
     return np.array([one if one is None else str(one) for one in levels], object)
 
 
-def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
+def with_levels(rows: Rows, levels: dict[str, Array]) -> Rows:
     """Rows of trials, and the levels of their points."""
 
-    def column(name: str) -> NDArray[Any]:
+    def column(name: str) -> Array:
         return levels[name][rows["point"]] if name in levels else rows[name]
 
     return Rows((*rows, *levels), [column], [rows.starts[-1]])

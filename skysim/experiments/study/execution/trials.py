@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from estimator.core.errors import ImageError
@@ -267,7 +268,7 @@ def solved_centroids(
     return list(zip(lights, reports, strict=True))
 
 
-def streams(setup: TrialSetup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+def streams(setup: TrialSetup, seed: int) -> tuple[Generator, Generator]:
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes only the noise."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
@@ -338,12 +339,12 @@ TRIALS: dict[str, Callable[[TrialSetup, Sequence[int]], list[Outcome]]] = {
 # Parts of trials.
 
 
-def random_attitude(setup: TrialSetup, rng: np.random.Generator) -> Rotation:
+def random_attitude(setup: TrialSetup, rng: Generator) -> Rotation:
     """Random lab_from_body, see `random_attitudes`."""
     return random_attitudes(setup, [rng])[0]
 
 
-def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> Rotation:
+def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     """N random lab_from_body, each drawn by its own generator.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
@@ -466,7 +467,7 @@ def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     return MovingCamera(camera, trajectory, streak)
 
 
-def attitude_and_axis(setup: TrialSetup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
+def attitude_and_axis(setup: TrialSetup, rng: Generator) -> tuple[Rotation, Floats]:
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
     lab_from_body = random_attitude(setup, rng)
