@@ -29,6 +29,8 @@ from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_
 from skysim.core.paths import shipped_files
 
 Files = list[tuple[Path, str]]  # paths and texts
+Tree = dict[str, Any]  # nested keys: a file or a section as read, or a JSON schema
+OverrideTexts = Mapping[str, str]  # YAML texts by dotted key
 # Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
 VERSION = 1
 
@@ -181,7 +183,7 @@ def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
     return texts
 
 
-def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
+def read_yaml(path: Path) -> tuple[Tree, str]:
     """A YAML mapping and its text. Raises InputError."""
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -236,7 +238,7 @@ def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
     raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
 
 
-def set_key(tree: dict[str, Any], key: str, value: str) -> None:
+def set_key(tree: Tree, key: str, value: str) -> None:
     """Set one dotted key of a raw tree to a YAML value. A number is an index into a list: `camera_body.2`.
 
     Raises InputError for a value that is not YAML, and for a key below a value.
@@ -331,9 +333,9 @@ PATTERNS = {
 def explain(
     error: ValidationError,
     model: type[BaseModel],
-    tree: dict[str, Any],
+    tree: Tree,
     files: Files,
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
 ) -> InputError:
     """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
@@ -397,7 +399,7 @@ def plain_number(value: Any) -> Any:
     return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
 
 
-def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where | None:
+def where_of(keys: list[str], files: Files, overrides: OverrideTexts) -> Where | None:
     """The place that sets a key: OVERRIDES, or the line in the file that has most components of the key."""
     dotted = ".".join(keys)
     if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
@@ -428,7 +430,7 @@ def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int 
 def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """The allowed keys of a section, found by following an error's location through the JSON schema."""
     schema = model.model_json_schema(by_alias=True)
-    node: dict[str, Any] = schema
+    node: Tree = schema
     for key in loc:
         node = resolve(node, schema)
         # Branches of a union; an optional section has its union nested one level deeper.
@@ -446,7 +448,7 @@ def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str
     return list(resolve(node, schema).get("properties", {}))
 
 
-def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+def resolve(node: Tree, schema: Tree) -> Tree:
     """The schema to which a node refers; for an optional section, that of the section."""
     options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
     if len(options) == 1:
@@ -454,7 +456,7 @@ def resolve(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
     return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
 
 
-def kind_of(node: dict[str, Any]) -> str | None:
+def kind_of(node: Tree) -> str | None:
     """The literal of the key `kind` in a schema; None without one."""
     return node.get("properties", {}).get("kind", {}).get("const")
 

@@ -463,6 +463,11 @@ def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
     return summary._replace(low=low, high=high, trials=runs)
 
 
+def frames_with(name: str) -> Response:
+    """The proportion of the frames that a column counts."""
+    return lambda c: proportion_of_frames(c[name], c["frames"])
+
+
 def mismatched(c: Columns) -> Summary:
     """Proportion of all matches of lights with stars or LEDs that are wrong.
 
@@ -481,13 +486,13 @@ def mismatched(c: Columns) -> Summary:
 PROPORTIONS: dict[str, Response] = {
     "overconfident": overconfident,
     "identified": lambda c: proportion_of_frames(c["solved"] - c["wrong"], c["frames"]),
-    "wrong": lambda c: proportion_of_frames(c["wrong"], c["frames"]),
+    "wrong": frames_with("wrong"),
     "refused": lambda c: proportion_of_frames(c["frames"] - c["solved"], c["frames"]),
-    "ambiguous": lambda c: proportion_of_frames(c["ambiguous"], c["frames"]),
-    "misidentified": lambda c: proportion_of_frames(c["misidentified"], c["frames"]),
-    "misled": lambda c: proportion_of_frames(c["misled"], c["frames"]),
+    "ambiguous": frames_with("ambiguous"),
+    "misidentified": frames_with("misidentified"),
+    "misled": frames_with("misled"),
     "mismatched": mismatched,
-    "roll_noise": lambda c: proportion_of_frames(c["roll_noise"], c["frames"]),
+    "roll_noise": frames_with("roll_noise"),
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")

@@ -14,6 +14,7 @@ from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Floats, SourceTruth
 from skysim.sources.satellites import light_name
 
+Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
 DPI = 120
 # Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
 INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
@@ -56,7 +57,7 @@ def figure_png(fig: Any, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> NDArray[np.uint8]:
+def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> Picture:
     """(H, W, 3) BGR image of the figure that `draw` fills, in the default style of matplotlib."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -128,7 +129,7 @@ def display_levels(image: NDArray) -> tuple[float, float]:
 
 def to_8bit(
     image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None
-) -> NDArray[np.uint8]:
+) -> Picture:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
     A uint16 frame is mapped through a lookup table, which is faster than evaluating the curve at each pixel.
@@ -168,7 +169,7 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     return FrameStatistics(sky, float(background.std()), peak, saturated)
 
 
-def reduce_width(image: NDArray[np.uint8], max_width_px: int) -> NDArray[np.uint8]:
+def reduce_width(image: Picture, max_width_px: int) -> Picture:
     """The image reduced to at most `max_width_px` columns; area averaging, so that no star is skipped."""
     height, width = image.shape[:2]
     if width <= max_width_px:
@@ -177,7 +178,7 @@ def reduce_width(image: NDArray[np.uint8], max_width_px: int) -> NDArray[np.uint
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def jpeg(gray: NDArray[np.uint8]) -> bytes:
+def jpeg(gray: Picture) -> bytes:
     """The image as JPEG bytes for the browser."""
     return bytes(cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, 88])[1])
 
@@ -198,7 +199,7 @@ def frame_levels(image: NDArray) -> tuple[float, float]:
     return low, max(high, low + 1.0, float(image.max()) * 0.25)
 
 
-def enlarged(image: NDArray) -> tuple[NDArray[np.uint8], int, int]:
+def enlarged(image: NDArray) -> tuple[Picture, int, int]:
     """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
     scale = 2 if max(image.shape) < 1000 else 1
     picture = cv2.cvtColor(
@@ -222,7 +223,7 @@ def annotate(
     matched_px: Floats,
     labels: list[str] | None = None,
     truth_px: Floats | None = None,
-) -> NDArray[np.uint8]:
+) -> Picture:
     """The stretched frame in BGR with blue ticks (truth), red squares (detections), green circles (matched stars).
 
     All markers leave their center open. A frame smaller than 1000 pixels is enlarged twice, so that the markers do
@@ -247,7 +248,7 @@ def annotate(
     return with_legend(picture, meanings)
 
 
-def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
+def annotate_truth(image: NDArray, sources: SourceTruth) -> Picture:
     """The stretched frame in BGR with ticks at the flux centroid of each visible source and the 40 brightest labeled.
 
     Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
@@ -267,9 +268,7 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> NDArray[np.uint8]:
     )
 
 
-def with_legend(
-    picture: NDArray[np.uint8], meanings: dict[str, tuple[int, int, int]]
-) -> NDArray[np.uint8]:
+def with_legend(picture: Picture, meanings: dict[str, tuple[int, int, int]]) -> Picture:
     """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
     strip = cv2.copyMakeBorder(
         picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0)
@@ -282,7 +281,7 @@ def with_legend(
 
 
 def draw_ticks(
-    picture: NDArray[np.uint8], x: int, y: int, size: int, color: tuple[int, int, int]
+    picture: Picture, x: int, y: int, size: int, color: tuple[int, int, int]
 ) -> None:
     """Draw four strokes around (x, y), with an open center."""
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
@@ -294,7 +293,7 @@ def draw_ticks(
 
 
 def draw_label(
-    picture: NDArray[np.uint8], text: str, x: int, y: int, color: tuple[int, int, int]
+    picture: Picture, text: str, x: int, y: int, color: tuple[int, int, int]
 ) -> None:
     """Draw a small label with its lower left corner at (x, y)."""
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)

@@ -11,10 +11,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.types import FrameRow
-from skysim.results.plots import figure_png, stacked_axes
+from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Cell,
@@ -58,7 +57,7 @@ def run_report(
     *,
     stages_ms: Mapping[str, float],
     computer: str = "",
-    annotated: NDArray[np.uint8],
+    annotated: Picture,
     motion: Mapping[str, float],
     motion_figure: bytes,
     motion_findings: Sequence[str] = (),

@@ -17,28 +17,23 @@ from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, FrameRow, Mount, Truth
 from skysim.results import metrics
-from skysim.results.plots import annotate, reduce_width, visible
+from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.flight import Shot
 from skysim.simulation.lab import StarCamera
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:
     """Names of the three angles of a row."""
-    return (
-        ("RA", "Dec", "roll")
-        if isinstance(scene.light, StarsConfig)
-        else ("roll", "pitch", "yaw")
-    )
+    return ("RA", "Dec", "roll") if scene.stars else ("roll", "pitch", "yaw")
 
 
 def angles_deg(
     cam_from_lab: Rotation, scene: Scene, mount: Mount
 ) -> tuple[float, float, float]:
     """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
         return float(ra), float(dec), float(roll)
     lab_from_body = cam_from_lab.inv() * mount.cam_from_body
@@ -70,7 +65,7 @@ def row(
     mount = camera.mount
     attitude = report.attitude
     cam_from_lab = scored_attitude(camera, truth)
-    cross = roll = cross_sigma = roll_sigma = chance = float("nan")
+    cross = roll = cross_sigma = roll_sigma = chance = math.nan
     estimate = None
     wrong = False
     if attitude.cam_from_ref is not None:
@@ -137,7 +132,7 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
     Both are lengths of vectors, NaN without a rate.
     """
     if rate is None:
-        return float("nan"), float("nan")
+        return math.nan, math.nan
     signs = (1,) if rate.sign_known else (1, -1)
     error = min(
         np.linalg.norm(sign * rate.rate_rad_s - truth.mean_rate_cam_rad_s) for sign in signs
@@ -151,7 +146,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
-    missing = (float("nan"),) * 3
+    missing = (math.nan,) * 3
     columns: dict[str, Any] = {
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")
@@ -179,7 +174,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     return Table(columns)
 
 
-def annotated(frame: Frame, truth: Truth, report: Report | None) -> NDArray[np.uint8]:
+def annotated(frame: Frame, truth: Truth, report: Report | None) -> Picture:
     """The stretched frame with visible true sources and, if it was solved, detections and matches marked."""
     detected = report.centroids.xy_px if report else np.empty((0, 2))
     match = report.attitude.match if report else None
@@ -227,7 +222,7 @@ class Score:
         """Rotation angle between the solution and the truth, arcseconds; NaN without a solution."""
         return math.hypot(self.row.cross_arcsec, self.row.roll_arcsec)
 
-    def annotated(self) -> NDArray[np.uint8]:
+    def annotated(self) -> Picture:
         """(H, W, 3) stretched frame in BGR: truth in blue, detections in red, identified sources in green."""
         return annotated(self.shot.frame, self.truth, self.shot.report)
 
@@ -247,7 +242,7 @@ def score(shot: Shot) -> Score:
     )
 
 
-def image_tag(image: NDArray[np.uint8]) -> str:
+def image_tag(image: Picture) -> str:
     """An HTML <img> element of an image, reduced to at most 800 pixels in width."""
     data = cv2.imencode(".jpg", reduce_width(image, 800))[1].tobytes()
     return f'<img src="{embed(data, "jpeg")}">'

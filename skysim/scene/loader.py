@@ -30,6 +30,8 @@ from skysim.core.paths import DATA, SCENES, shipped_files
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
     Files,
+    OverrideTexts,
+    Tree,
     check_version,
     explain,
     is_file,
@@ -50,30 +52,30 @@ def list_cameras() -> list[str]:
     return sorted(path.stem for path in PRESETS.glob("*.yaml"))
 
 
-def preset_path(name: str, where: str = "camera.preset") -> Path:
+def preset_path(name: str) -> Path:
     """The file of a camera preset, which is a name in data/cameras or a path. Raises InputError for an unknown name."""
     path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         problem, names = unknown_name("preset", name, list_cameras())
-        raise InputError(where, problem, f"{names}, or a .yaml file with a camera")
+        raise InputError("camera.preset", problem, f"{names}, or a .yaml file with a camera")
     return path
 
 
-def preset(name: str, where: str = "camera.preset") -> dict[str, Any]:
+def preset(name: str) -> Tree:
     """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
-    path = preset_path(name, where)
+    path = preset_path(name)
     try:
         camera = resolve_files(path, read_yaml(path)[0]).get("camera")
     except InputError as error:
-        raise error.within(where) from None
+        raise error.within("camera.preset") from None
     if not isinstance(camera, dict) or "preset" in camera:
         raise InputError(
-            where, f"{path} is not a camera", "a section camera without a preset"
+            "camera.preset", f"{path} is not a camera", "a section camera without a preset"
         )
     return camera
 
 
-def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
+def with_preset(tree: Tree) -> Tree:
     """The raw scene with the preset and the calibration of its camera applied. Raises InputError.
 
     The camera's own keys override those of the preset; the values of the calibration are added to both.
@@ -100,7 +102,7 @@ def with_preset(tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
+def with_heads(tree: Tree) -> Tree:
     """The raw scene with complete heads: each section takes missing keys from the main camera. Raises InputError."""
     heads = tree.get("heads")
     if not isinstance(heads, list):
@@ -108,7 +110,7 @@ def with_heads(tree: dict[str, Any]) -> dict[str, Any]:
     return tree | {"heads": [completed_head(tree, head, n) for n, head in enumerate(heads)]}
 
 
-def completed_head(tree: dict[str, Any], head: Any, n: int) -> Any:
+def completed_head(tree: Tree, head: Any, n: int) -> Any:
     """The raw head n with complete sections; unchanged if it is not a mapping, which validation reports."""
     if not isinstance(head, dict):
         return head
@@ -129,7 +131,7 @@ CALIBRATED_KEYS = (
 )
 
 
-def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
+def calibrated_keys(path: Path, camera: Tree) -> Tree:
     """The camera keys that an OpenCV calibration defines: size, focal length, principal point, distortion.
 
     The focal length in meters follows from the camera's pixel pitch and focus, which the file does not contain.
@@ -166,7 +168,7 @@ def calibrated_keys(path: Path, camera: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
+def merge(base: Tree, override: Tree) -> Tree:
     """The mapping `override` merged over `base`, recursively; a section of another kind replaces that of the base."""
     merged = base | override
     for key, value in override.items():
@@ -176,10 +178,10 @@ def merge(base: dict[str, Any], override: dict[str, Any]) -> dict[str, Any]:
 
 
 def over_base(
-    base: dict[str, Any],
-    own: dict[str, Any],
-    camera_of: Callable[[Any], dict[str, Any]] = lambda name: preset(str(name)),
-) -> dict[str, Any]:
+    base: Tree,
+    own: Tree,
+    camera_of: Callable[[Any], Tree] = lambda name: preset(str(name)),
+) -> Tree:
     """The keys of a scene merged over the keys of its base.
 
     A camera preset in `own` also removes the keys of the base that it defines, another `vehicle.model` the mass
@@ -222,13 +224,13 @@ BODY_KEYS = (
 )
 
 
-def plain_at(tree: dict[str, Any], section: str, key: str) -> Any:
+def plain_at(tree: Tree, section: str, key: str) -> Any:
     """The value of a section's key, None without one. In `provenance` a value is an object with its origin."""
     found = tree[section].get(key) if isinstance(tree.get(section), dict) else None
     return getattr(found, "value", found)
 
 
-def without_keys(tree: dict[str, Any], section: str, keys: Sequence[str]) -> dict[str, Any]:
+def without_keys(tree: Tree, section: str, keys: Sequence[str]) -> Tree:
     """The tree without these keys of a section."""
     inner = tree.get(section)
     if not isinstance(inner, dict):
@@ -236,13 +238,13 @@ def without_keys(tree: dict[str, Any], section: str, keys: Sequence[str]) -> dic
     return tree | {section: {key: inner[key] for key in inner if key not in keys}}
 
 
-def has_other_model(own: dict[str, Any], base: dict[str, Any]) -> bool:
+def has_other_model(own: Tree, base: Tree) -> bool:
     """Whether a scene names another model of the vehicle than its base does."""
     names = [plain_at(tree, "vehicle", "model") for tree in (own, base)]
     return None not in names and len({SCENES / str(name) for name in names}) == 2
 
 
-def inherited_keys(trees: Sequence[dict[str, Any]]) -> tuple[str, ...]:
+def inherited_keys(trees: Sequence[Tree]) -> tuple[str, ...]:
     """The BODY_KEYS that a vehicle has from below its model, from a base with another one.
 
     The trees are those of the layers, the overrides' first.
@@ -259,9 +261,9 @@ def inherited_keys(trees: Sequence[dict[str, Any]]) -> tuple[str, ...]:
     return ()
 
 
-def undefined_keys(section: dict[str, Any], defined: dict[str, Any]) -> dict[str, Any]:
+def undefined_keys(section: Tree, defined: Tree) -> Tree:
     """The keys of a section that another one does not define; nothing of a section of another kind."""
-    kept: dict[str, Any] = {}
+    kept: Tree = {}
     for key, value in section.items():
         if key not in defined:
             kept[key] = value
@@ -291,7 +293,7 @@ def find(name: str) -> Path:
 
 
 def load(
-    name: str | Path, overrides: Mapping[str, str] | None = None, refuses_unused: bool = True
+    name: str | Path, overrides: OverrideTexts | None = None, refuses_unused: bool = True
 ) -> Scene:
     """The validated scene of a file with overrides.
 
@@ -323,7 +325,7 @@ def load(
     return scene
 
 
-def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
+def validate(layers: list[Layer], overrides: OverrideTexts) -> Scene:
     """The scene of layers and overrides: steps 2 to 4 of the module's docstring. Raises InputError."""
     tree = with_overrides(merged(layers), overrides)
     files = locations(layers)
@@ -337,11 +339,11 @@ def validate(layers: list[Layer], overrides: Mapping[str, str]) -> Scene:
     return scene
 
 
-def with_overrides(tree: dict[str, Any], overrides: Mapping[str, str]) -> dict[str, Any]:
+def with_overrides(tree: Tree, overrides: OverrideTexts) -> Tree:
     """The raw scene with dotted keys overridden, those in REPLACING first. `tree` may be changed."""
     for key in REPLACING:
         if key in overrides:
-            named: dict[str, Any] = {}
+            named: Tree = {}
             set_key(named, key, overrides[key])
             tree = over_base(tree, named)
     for key, value in overrides.items():
@@ -364,7 +366,7 @@ def list_scenes() -> list[str]:
     return list(shipped_files(SCENES))
 
 
-def located(error: InputError, name: str, overrides: Mapping[str, str]) -> InputError:
+def located(error: InputError, name: str, overrides: OverrideTexts) -> InputError:
     """The error with file and line, if it is about a key of the scene that was checked after loading."""
     keys = error.key.split(".")
     if error.where or keys[0] not in Scene.model_fields:
@@ -385,7 +387,7 @@ class Layer(NamedTuple):
 
     path: Path
     text: str
-    tree: dict[str, Any]
+    tree: Tree
 
 
 def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
@@ -417,7 +419,7 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     return [Layer(path, text, tree), *read_layers(base_path, (*derived, path.resolve()))]
 
 
-def merged(layers: list[Layer]) -> dict[str, Any]:
+def merged(layers: list[Layer]) -> Tree:
     """A copy of the keys of a scene, merged over the keys of its base scenes."""
     tree = functools.reduce(over_base, (layer.tree for layer in reversed(layers)))
     return copy.deepcopy(tree)
@@ -428,15 +430,13 @@ def locations(layers: list[Layer]) -> Files:
     return [(layer.path, layer.text) for layer in layers]
 
 
-def read(path: Path) -> tuple[dict[str, Any], Files]:
+def read(path: Path) -> tuple[Tree, Files]:
     """The keys of a scene merged over those of its base scenes, and its files, its own first. Raises InputError."""
     layers = read_layers(path)
     return merged(layers), locations(layers)
 
 
-def apply_preset(
-    tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
-) -> dict[str, Any]:
+def apply_preset(tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:
     """The tree with presets and calibrations of camera and heads applied. Raises InputError with file and line."""
     try:
         return with_preset(with_heads(tree))
@@ -445,33 +445,33 @@ def apply_preset(
 
 
 # Keys whose value may be a file in the scene's folder; * stands for every item of a list.
-FILE_KEYS = (
-    ("vehicle", "model"),
-    ("motion", "maneuver", "*", "file"),
-    ("camera", "preset"),
-    ("camera", "psf", "file"),
-    ("camera", "calibration"),
-    ("camera", "transmission"),
-    ("camera", "detector", "quantum_efficiency"),
-    *(
-        ("camera", "detector", "quantum_efficiency", key)
-        for key in ("curve", "red", "green", "blue")
-    ),
-    ("light", "catalog"),
-    ("light", "satellites", "file"),
-    ("light", "led", "spectrum"),
-    ("light", "surface", "file"),
-    ("light", "layout", "catalog"),
-    ("light", "layout", "file"),
-    ("light", "layout", "points", "file"),
-    ("orbit", "file"),
-    ("tracker", "catalog"),
-    ("tracker", "map"),
+FILE_KEYS: tuple[str, ...] = (
+    "vehicle.model",
+    "motion.maneuver.*.file",
+    "camera.preset",
+    "camera.psf.file",
+    "camera.calibration",
+    "camera.transmission",
+    "camera.detector.quantum_efficiency",
+    "camera.detector.quantum_efficiency.curve",
+    "camera.detector.quantum_efficiency.red",
+    "camera.detector.quantum_efficiency.green",
+    "camera.detector.quantum_efficiency.blue",
+    "light.catalog",
+    "light.satellites.file",
+    "light.led.spectrum",
+    "light.surface.file",
+    "light.layout.catalog",
+    "light.layout.file",
+    "light.layout.points.file",
+    "orbit.file",
+    "tracker.catalog",
+    "tracker.map",
 )
-FILE_KEYS += tuple(("heads", "*", *keys) for keys in FILE_KEYS if keys[0] in HEAD_SECTIONS)
+FILE_KEYS += tuple(f"heads.*.{key}" for key in FILE_KEYS if key.startswith(HEAD_SECTIONS))
 
 
-def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
+def resolve_files(path: Path, tree: Tree) -> Tree:
     """The raw scene with file names made absolute if the file is in the folder of the scene."""
     resolved = copy.deepcopy(tree)
     for key, name in file_names(tree):
@@ -480,7 +480,7 @@ def resolve_files(path: Path, tree: dict[str, Any]) -> dict[str, Any]:
     return resolved
 
 
-def resolve_overrides(path: Path, overrides: Mapping[str, str]) -> dict[str, str]:
+def resolve_overrides(path: Path, overrides: OverrideTexts) -> dict[str, str]:
     """The overrides with the names of files in the scene's folder made absolute, unless the command runs beside them.
 
     A relative `vehicle.model` would be in scenes/, so this name is made absolute in both cases.
@@ -498,7 +498,7 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
     """Yield the dotted keys under which a scene may name files, with their values."""
 
     def below(
-        node: Any, keys: tuple[str, ...], path: tuple[str, ...]
+        node: Any, keys: Sequence[str], path: tuple[str, ...]
     ) -> Iterator[tuple[str, str]]:
         """Those below a node that is at path, under further keys."""
         if not keys:
@@ -512,14 +512,14 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
         elif isinstance(node, dict) and keys[0] in node:
             yield from below(node[keys[0]], keys[1:], (*path, keys[0]))
 
-    for keys in FILE_KEYS:
-        yield from below(tree, keys, ())
+    for key in FILE_KEYS:
+        yield from below(tree, key.split("."), ())
 
 
 def load_camera(
     path: Path,
     lens: Mapping[str, Any] | None = None,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with only a camera. Raises InputError.
 
@@ -544,9 +544,7 @@ def load_camera(
         raise explain(error, CameraFileConfig, tree, files, overrides) from None
 
 
-def camera_tree(
-    path: Path, tree: dict[str, Any], files: Files, overrides: Mapping[str, str]
-) -> dict[str, Any]:
+def camera_tree(path: Path, tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:
     """A tree with only the section `camera` of a scene, with its preset and calibration applied."""
     own = resolve_files(path, {key: tree[key] for key in tree if key == "camera"})
     return apply_preset(own, files, overrides)

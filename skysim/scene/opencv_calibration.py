@@ -11,7 +11,7 @@ import yaml
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.yaml_reader import StrictLoader, excerpt, parse_yaml
+from skysim.core.yaml_reader import StrictLoader, Tree, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 # Allowed relative difference of fx and fy: a detector's pixels are square, so it is an error of the calibration.
@@ -135,7 +135,7 @@ def read(path: Path) -> OpencvCalibration:
     )
 
 
-def parse_file(path: Path) -> dict[str, Any]:
+def parse_file(path: Path) -> Tree:
     """The mapping in the file. Raises InputError.
 
     OpenCV before version 5 begins a file with %YAML:1.0, which is invalid YAML.
@@ -159,7 +159,7 @@ def parse_file(path: Path) -> dict[str, Any]:
     return tree
 
 
-def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
+def image_side(path: Path, tree: Tree, key: str) -> int:
     """The width or height of the image. Raises InputError."""
     value = tree.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE_PX:
@@ -169,7 +169,7 @@ def image_side(path: Path, tree: dict[str, Any], key: str) -> int:
 
 
 def matrix(
-    path: Path, tree: dict[str, Any], key: str, shapes: tuple[tuple[int, int], ...]
+    path: Path, tree: Tree, key: str, shapes: tuple[tuple[int, int], ...]
 ) -> list[float]:
     """The numbers of a matrix, row by row. Raises InputError."""
     node = tree.get(key)

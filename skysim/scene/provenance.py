@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from skysim.core.units import ConfigModel, si_unit
-from skysim.core.yaml_reader import parse_yaml, read_yaml, shared_depth
+from skysim.core.yaml_reader import OverrideTexts, Tree, parse_yaml, read_yaml, shared_depth
 from skysim.scene import loader, unused
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
@@ -70,7 +70,7 @@ class Located:
     origin: Origin = field(compare=False)
 
 
-def effective(name: str | Path, overrides: Mapping[str, str] | None = None) -> list[Entry]:
+def effective(name: str | Path, overrides: OverrideTexts | None = None) -> list[Entry]:
     """All keys of a scene in the order of the schema. Raises InputError as `loader.load`."""
     # 1. Tree with origins.
     path = loader.find(str(name))
@@ -87,11 +87,11 @@ def effective(name: str | Path, overrides: Mapping[str, str] | None = None) -> l
     return found
 
 
-def located_tree(layers: list[Layer], overrides: Mapping[str, str]) -> dict[str, Any]:
+def located_tree(layers: list[Layer], overrides: OverrideTexts) -> Tree:
     """The raw scene with preset, calibration and overrides applied, and the origin of each value."""
     whats = ["this file", *(f"base {layer.path.name}" for layer in layers[1:])]
     trees = [with_origins(*layer, what) for layer, what in zip(layers, whats, strict=True)]
-    tree: dict[str, Any] = functools.reduce(over_base, reversed(trees))
+    tree: Tree = functools.reduce(over_base, reversed(trees))
     for key in loader.REPLACING:
         if key in overrides:
             tree = over_base(tree, put({}, key.split("."), parse_yaml(overrides[key])[1]))
@@ -101,22 +101,22 @@ def located_tree(layers: list[Layer], overrides: Mapping[str, str]) -> dict[str,
     return tree | {"camera": with_preset(camera)} if isinstance(camera, dict) else tree
 
 
-def over_base(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+def over_base(base: Tree, own: Tree) -> Tree:
     """`loader.over_base` for located values."""
     return loader.over_base(base, own, preset_camera)
 
 
-def preset_camera(preset: Located) -> dict[str, Any]:
+def preset_camera(preset: Located) -> Tree:
     """The camera section of a preset with the origin of each value; empty if there is no preset."""
     if preset.value is None:
         return {}
     path = loader.preset_path(str(preset.value))
     tree, text = read_yaml(path)
-    camera: dict[str, Any] = with_origins(path, text, tree, f"preset {path.name}")["camera"]
+    camera: Tree = with_origins(path, text, tree, f"preset {path.name}")["camera"]
     return camera
 
 
-def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
+def with_preset(camera: Tree) -> Tree:
     """The keys of a camera merged over the keys of its preset, and the keys of a calibration merged over both."""
     own = {
         key: value for key, value in camera.items() if key not in ("preset", "calibration")
@@ -130,7 +130,7 @@ def with_preset(camera: dict[str, Any]) -> dict[str, Any]:
     return own
 
 
-def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> dict[str, Any]:
+def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> Tree:
     """The tree of a file with the origin of each value; a list is one value."""
     lines = lines_of(text)
 
@@ -140,7 +140,7 @@ def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> d
             return {key: locate(inner, (*keys, str(key))) for key, inner in value.items()}
         return Located(value, Origin(what, str(path), lines.get(keys, 0)))
 
-    located: dict[str, Any] = locate(tree, ())
+    located: Tree = locate(tree, ())
     return located
 
 
@@ -233,7 +233,7 @@ def tidy(value: float) -> float | int:
     return int(short) if short.is_integer() and abs(short) < 1e15 else short
 
 
-def as_dicts(found: list[Entry]) -> list[dict[str, Any]]:
+def as_dicts(found: list[Entry]) -> list[Tree]:
     """The entries as JSON objects: key, value, what, file, line, no_effect; dates as ISO 8601."""
     return [
         {

@@ -19,10 +19,20 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
-from skysim.core.units import ConfigModel, Length, Number, Spin, Time
+from skysim.core.units import (
+    ConfigModel,
+    Delay,
+    Position,
+    Positive,
+    PositiveInt,
+    Seed,
+    Spins,
+    Time,
+    Triple,
+)
 from skysim.core.yaml_reader import excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.layouts import OnPoints, OptimizedConfig
+from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
 from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
@@ -52,10 +62,10 @@ class ExposureConfig(ConfigModel):
     """
 
     time_s: Annotated[Time, Field(ge=1e-6)]
-    rate_hz: Annotated[Number, Field(gt=0)]
-    frames: Annotated[int, Field(ge=1)]
-    first_s: Annotated[Time, Field(ge=0)] = 0.0
-    trigger_jitter_s: Annotated[Time, Field(ge=0)] = 0.0
+    rate_hz: Positive
+    frames: PositiveInt
+    first_s: Delay = 0.0
+    trigger_jitter_s: Delay = 0.0
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
@@ -104,9 +114,9 @@ class HeadConfig(ConfigModel):
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
-    position_m: tuple[Length, Length, Length]
-    rotation_deg: tuple[Spin, Spin, Spin]
-    mount_error_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    position_m: Position
+    rotation_deg: Spins
+    mount_error_arcsec: Triple = (0.0, 0.0, 0.0)
     mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
@@ -116,6 +126,14 @@ class HeadConfig(ConfigModel):
 MAX_HEADS = 8
 # Sections of a head, whose keys override those of the main camera.
 HEAD_SECTIONS = ("camera", "tracker", "exposure")
+
+
+def ephemeris_problem(start_time: datetime.datetime) -> str:
+    """The reason why the ephemeris does not have a time; empty if it has."""
+    first, last = BODIES_YEARS
+    if first <= start_time.year <= last:
+        return ""
+    return f"start_time {start_time} is outside {first} to {last}"
 
 
 class SceneKind(ModelMetaclass):
@@ -133,7 +151,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     start_time: Annotated[datetime.datetime, AfterValidator(check_year)]
     site: SiteConfig = SiteConfig()
     orbit: Orbit | None = None
@@ -166,9 +184,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
                     "seed": tracker.survey.seed,
                 }
             )
-        if not isinstance(self.light, DomeConfig) and (
-            tracker.survey != lens_only or tracker.map
-        ):
+        if not self.dome and (tracker.survey != lens_only or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
                 f"tracker.{key}",
@@ -203,11 +219,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @model_validator(mode="after")
     def complete_layout(self) -> Scene:
         """The scene with the field of view and the camera position of an optimized layout completed by its own."""
-        layout = self.light.layout if isinstance(self.light, DomeConfig) else None
-        nested = isinstance(layout, OnPoints)
-        points = layout.points if isinstance(layout, OnPoints) else layout
-        if not isinstance(points, OptimizedConfig):
+        dome = self.dome
+        if dome is None or not isinstance(dome.points, OptimizedConfig):
             return self
+        points = dome.points
+        nested = dome.layout is not points
         camera_m = points.camera_m or self.vehicle.camera_m
         chip = (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
@@ -220,15 +236,13 @@ class Scene(ConfigModel, metaclass=SceneKind):
         points = points.model_copy(
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
         )
-        layout = layout.model_copy(update={"points": points}) if nested and layout else points
-        return self.model_copy(
-            update={"light": self.light.model_copy(update={"layout": layout})}
-        )
+        layout = dome.layout.model_copy(update={"points": points}) if nested else points
+        return self.model_copy(update={"light": dome.model_copy(update={"layout": layout})})
 
     @model_validator(mode="after")
     def check_code(self) -> Scene:
         """Check that the decoder has a code, and that all rows of the shutter show the same bits."""
-        code = self.light.led.code if isinstance(self.light, DomeConfig) else None
+        code = self.dome.led.code if self.dome else None
         if self.tracker.decoder and code is None:
             raise InputError("tracker.decoder", "requires light.led.code")
         if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
@@ -242,22 +256,20 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @model_validator(mode="after")
     def check_bodies(self) -> Scene:
         """Check that the ephemeris is valid at the scene's time."""
-        first, last = BODIES_YEARS
+        problem = ephemeris_problem(self.start_time)
         sections = {
             "orbit": self.orbit,
             **{f"light.{key}": getattr(self.light, key, None) for key in EPHEMERIS_KEYS},
         }
         for key, section in sections.items():
-            if section and not first <= self.start_time.year <= last:
-                raise InputError(
-                    key, f"start_time {self.start_time} is outside {first} to {last}"
-                )
+            if section and problem:
+                raise InputError(key, problem)
         return self
 
     @model_validator(mode="after")
     def check_orbit(self) -> Scene:
         """Check that an orbit is under the stars, and that satellites have an orbit or a site."""
-        if self.orbit and not isinstance(self.light, StarsConfig):
+        if self.orbit and not self.stars:
             raise InputError(
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
             )
@@ -277,17 +289,15 @@ class Scene(ConfigModel, metaclass=SceneKind):
     def check_air(self) -> Scene:
         """Check that the air has a site, and that the ephemeris of its light, Sun and Moon, is valid."""
         air = getattr(self.light, "air", None)
-        first, last = BODIES_YEARS
+        problem = ephemeris_problem(self.start_time)
         if air and self.orbit:
             raise InputError(
                 "light.air", "the camera is in an orbit, above the air", "light.air or orbit"
             )
         if air and self.site.longitude_deg is None:
             raise InputError("light.air", "requires site.longitude_deg")
-        if air and air.glow and not first <= self.start_time.year <= last:
-            raise InputError(
-                "light.air.glow", f"start_time {self.start_time} is outside {first} to {last}"
-            )
+        if air and air.glow and problem:
+            raise InputError("light.air.glow", problem)
         if air and air.glow and any(glow.kind in ("sky", "moon") for glow in self.background):
             raise InputError(
                 "light.air.glow",
@@ -356,7 +366,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
             motion.is_prescribed
             and motion.start == "profile"
             and {leg.kind for leg in motion.maneuver} <= {"profile", "hold", "jitter"}
-            and not isinstance(self.light, StarsConfig)
+            and not self.stars
         )
         if two_axis != bool(self.vehicle.gimbals) or (two_axis and not follows):
             raise InputError(
@@ -424,6 +434,16 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @property
+    def dome(self) -> DomeConfig | None:
+        """The light if it is an LED dome."""
+        return self.light if isinstance(self.light, DomeConfig) else None
+
+    @property
+    def stars(self) -> StarsConfig | None:
+        """The light if it is the sky."""
+        return self.light if isinstance(self.light, StarsConfig) else None
+
+    @property
     def inherited(self) -> tuple[str, ...]:
         """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
         return self._inherited
@@ -461,7 +481,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         exposure = self.exposure
         control = self.motion.control
         tracker = self.tracker
-        dome = self.light if isinstance(self.light, DomeConfig) else None
+        dome = self.dome
         stages = [
             getattr(tracker, stage)
             for stage in ("detector", "centroider", "identifier", "solver")

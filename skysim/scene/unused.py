@@ -15,7 +15,7 @@ from typing import Any
 
 from skysim.core.errors import OVERRIDES, InputError
 from skysim.core.units import ConfigModel
-from skysim.core.yaml_reader import Files, parse_yaml, where_of
+from skysim.core.yaml_reader import Files, OverrideTexts, parse_yaml, where_of
 from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.unused_rules import RULES, Rule
 
@@ -23,7 +23,7 @@ from skysim.scene.unused_rules import RULES, Rule
 def check(
     scene: Scene,
     own: Mapping[str, Any],
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
     files: Files,
     without_overrides: Callable[[], Scene],
 ) -> None:
@@ -61,7 +61,7 @@ def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
                 raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
 
 
-def check_overrides(scenes: Sequence[Scene], overrides: Mapping[str, str]) -> None:
+def check_overrides(scenes: Sequence[Scene], overrides: OverrideTexts) -> None:
     """Raise InputError for the first key of the overrides that has no effect in any of the scenes."""
     for key in override_keys(overrides):
         broken = [find(RULES, [key], scene) for scene in scenes]
@@ -147,6 +147,6 @@ def set_keys(tree: Mapping[str, Any], parent: str = "") -> Iterator[str]:
             yield f"{parent}{key}"
 
 
-def override_keys(overrides: Mapping[str, str]) -> list[str]:
+def override_keys(overrides: OverrideTexts) -> list[str]:
     """The dotted keys that overrides set; a value that is a section sets all keys in it."""
     return list(set_keys({key: parse_yaml(text)[1] for key, text in overrides.items()}))

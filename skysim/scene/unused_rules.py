@@ -17,12 +17,10 @@ from skysim.scene.sections.layouts import (
     FibersConfig,
     FibonacciConfig,
     ListedConfig,
-    OnPoints,
     PatchBoardsConfig,
     PixelsConfig,
 )
 from skysim.scene.sections.leds import DirectConfig, PwmConfig
-from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
@@ -53,26 +51,16 @@ class Rule(NamedTuple):
 # Conditions of the rules.
 
 
-def under_dome(scene: Scene) -> bool:
-    """Whether the light is an LED dome."""
-    return isinstance(scene.light, DomeConfig)
-
-
 def steady(scene: Scene) -> bool:
     """Whether all light is steady."""
-    return isinstance(scene.light, DomeConfig) and isinstance(
-        scene.light.led.drive, DirectConfig
-    )
+    return scene.dome is not None and isinstance(scene.dome.led.drive, DirectConfig)
 
 
 def equally_bright(scene: Scene) -> bool:
     """Whether all LEDs of a dome have one nominal brightness; those of a file and of a sky do not."""
-    if not isinstance(scene.light, DomeConfig):
+    if scene.dome is None or scene.dome.led.types:
         return False
-    layout = scene.light.layout
-    if scene.light.led.types:
-        return False
-    points = layout.points if isinstance(layout, OnPoints) else layout
+    points = scene.dome.points
     if isinstance(points, PatchBoardsConfig):
         levels = {level for board in points.boards or () for level in board.levels or (1.0,)}
         return len(levels or set(points.pwm_levels)) == 1
@@ -85,13 +73,8 @@ def equally_bright(scene: Scene) -> bool:
 
 def free_running_code(scene: Scene) -> bool:
     """Whether the LEDs' bits have their own clock."""
-    code = scene.light.led.code if isinstance(scene.light, DomeConfig) else None
+    code = scene.dome.led.code if scene.dome else None
     return code is not None and code.bit_time_s != "frame"
-
-
-def actuators(scene: Scene) -> str:
-    """The actuators that the controller uses; empty without a controller."""
-    return scene.motion.control.actuators if scene.motion.control else ""
 
 
 def external(scene: Scene) -> bool:
@@ -110,7 +93,7 @@ def surface_unused(scene: Scene) -> bool:
 def survey_draws_nothing(scene: Scene) -> bool:
     """Whether `tracker.survey.seed` draws no survey error."""
     survey = scene.tracker.survey
-    surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    surface_m = scene.dome.surface.error_m if scene.dome else 0.0
     drawn = (
         survey.led_sigma_m,
         survey.lever_sigma_m,
@@ -128,15 +111,15 @@ def listed_boards(scene: Scene) -> bool:
 
 def dome_draws_nothing(scene: Scene) -> bool:
     """Whether neither the places of the LEDs nor their brightness nor their pulses are random."""
-    if not isinstance(scene.light, DomeConfig) or not steady(scene):
+    if scene.dome is None or not steady(scene):
         return False
-    led = scene.light.led
-    layout = scene.light.layout
+    led = scene.dome.led
+    layout = scene.dome.layout
     if led.scatter or led.color_scatter_m or (led.aging and led.aging.scatter):
         return False
     if isinstance(layout, FibersConfig) and (layout.radius_variation or layout.aiming):
         return False
-    points = layout.points if isinstance(layout, OnPoints) else layout
+    points = scene.dome.points
     # The level of each LED of a spiral is drawn from the list.
     if isinstance(points, FibonacciConfig):
         return len(set(points.dimming)) == 1
@@ -164,7 +147,7 @@ def earth_unused(scene: Scene) -> bool:
 
 def flat_wall(scene: Scene) -> bool:
     """Whether the LEDs are on a flat wall."""
-    return isinstance(scene.light, DomeConfig) and scene.light.surface.kind == "flat"
+    return scene.dome is not None and scene.dome.surface.kind == "flat"
 
 
 def has_floor(scene: Scene) -> bool:
@@ -205,13 +188,13 @@ def seeing_is_narrow(scene: Scene) -> bool:
 RULES = (
     Rule(
         ("tracker.catalog", "tracker.limit_mag"),
-        under_dome,
+        lambda scene: scene.dome is not None,
         "under a dome the tracker's map is of LEDs",
         "light of kind stars or collimated_display",
     ),
     Rule(
         ("tracker.assumed_camera_body",),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "the tracker takes stars to be at infinity, whatever the camera's place",
         "light of kind dome",
     ),
@@ -247,7 +230,7 @@ RULES = (
     ),
     Rule(
         ("tracker.brightness_sigma",),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "stars are identified by their places",
         "a dome",
     ),
@@ -278,7 +261,7 @@ RULES = (
     Rule(
         ("tracker.assumed_attitude_deg",),
         lambda scene: (
-            not under_dome(scene)
+            scene.dome is None
             or external(scene)
             or scene.tracker.identifier in (None, "led_pairs", "non_dimensional")
         ),
@@ -346,18 +329,13 @@ RULES = (
     ),
     Rule(
         ("tracker.survey.surface_seed",),
-        lambda scene: (
-            not (isinstance(scene.light, DomeConfig) and scene.light.surface.error_m)
-        ),
+        lambda scene: not (scene.dome and scene.dome.surface.error_m),
         "it draws light.surface.error, which is 0",
         "light.surface.error above 0",
     ),
     Rule(
         ("light.led.pwm_period",),
-        lambda scene: (
-            isinstance(scene.light, DomeConfig)
-            and not isinstance(scene.light.led.drive, PwmConfig)
-        ),
+        lambda scene: scene.dome and not isinstance(scene.dome.led.drive, PwmConfig),
         "it is the period of the drive pwm",
         "light.led.drive: {kind: pwm}",
     ),
@@ -503,7 +481,7 @@ RULES = (
     ),
     Rule(
         ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
-        lambda scene: not under_dome(scene),
+        lambda scene: scene.dome is None,
         "there is no dome to move",
         "light of kind dome",
     ),
@@ -541,7 +519,7 @@ RULES = (
     ),
     Rule(
         ("vehicle.cmgs.gimbal_rate_limit_deg_s", "vehicle.cmgs.steering"),
-        lambda scene: actuators(scene) != "cmgs",
+        lambda scene: not (scene.motion.control and scene.motion.control.actuators == "cmgs"),
         "nothing commands the CMGs",
         "motion.control with actuators: cmgs",
     ),

@@ -18,6 +18,7 @@ from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import (
     Place,
     PointRow,
+    PointRows,
     axis,
     distinct,
     format_level,
@@ -36,7 +37,7 @@ TRUE_NEES = (2.5, 3.5)
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: Sequence[PointRow], place: Place) -> list[str]:
+def claimed_errors(lines: PointRows, place: Place) -> list[str]:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES."""
     known = [(line.responses.get("nees", metrics.NO_VALUE), line) for line in lines]
     known = [(one, line) for one, line in known if one.trials]
@@ -111,7 +112,7 @@ def noticed(nees: Summary, points: int) -> float:
     return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
-def effect_of_wrong_matches(lines: Sequence[PointRow], place: Place) -> list[str]:
+def effect_of_wrong_matches(lines: PointRows, place: Place) -> list[str]:
     """Sentences on wrong matches, and on whether they make the attitude err more than claimed; none without them."""
     known = [line.responses.get("mismatched", metrics.NO_VALUE) for line in lines]
     shares = [one for one in known if one.value > 0]
@@ -137,7 +138,7 @@ def everywhere(points: int) -> str:
     return f" at all {points} points" if points > 1 else ""
 
 
-def runs_needed(lines: Sequence[PointRow], events: Sequence[str]) -> list[str]:
+def runs_needed(lines: PointRows, events: Sequence[str]) -> list[str]:
     """Sentences on how many trials a smaller claim about events that were never seen needs; none if all were seen.
 
     The next smaller claim is the next power of ten below the bound of the point with the fewest trials.
@@ -169,7 +170,7 @@ RESPONSES = (*SHARES, "mismatched", "nees")
 
 def headline(
     study: Study,
-    lines: Sequence[PointRow],
+    lines: PointRows,
     may_be_ambiguous: bool,
     worst: str = "skysim study worst STUDY",
 ) -> list[str]:
@@ -200,14 +201,14 @@ def headline(
     return [*found, *runs_needed(done, list(EVENTS)), *claimed_errors(done, place)]
 
 
-def answered(lines: Sequence[PointRow]) -> list[PointRow]:
+def answered(lines: PointRows) -> list[PointRow]:
     """The points with a trial that has an answer."""
     return [
         line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)
     ]
 
 
-def verdict(study: Study, lines: Sequence[PointRow]) -> str:
+def verdict(study: Study, lines: PointRows) -> str:
     """The answer of the study in three or four short sentences; "" if no trial has an answer.
 
     1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
@@ -233,9 +234,7 @@ def verdict(study: Study, lines: Sequence[PointRow]) -> str:
     return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
 
 
-def worst_share(
-    name: str, never: str, text: str, lines: Sequence[PointRow], place: Place
-) -> str:
+def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place) -> str:
     """A sentence such as "No attitude is wrong (in 12,000).", or the fraction at the point where it is largest."""
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
@@ -246,7 +245,7 @@ def worst_share(
     return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
 
 
-def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
+def ranges(study: Study, lines: PointRows) -> list[str]:
     """Smallest and largest value over the points of each response that the headline is not about."""
     done = [line for line in lines if line.trials]
     if not done:
@@ -257,7 +256,7 @@ def ranges(study: Study, lines: Sequence[PointRow]) -> list[str]:
     ]
 
 
-def placer(study: Study, lines: Sequence[PointRow]) -> Place:
+def placer(study: Study, lines: PointRows) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
     varied = [
         name
@@ -274,13 +273,13 @@ def placer(study: Study, lines: Sequence[PointRow]) -> Place:
     return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
-def valued(name: str, lines: Sequence[PointRow]) -> list[PointRow]:
+def valued(name: str, lines: PointRows) -> list[PointRow]:
     """The points with a value of a response; those with few values only if there are no others."""
     found = [line for line in lines if np.isfinite(line.responses[name].value)]
     return [line for line in found if not has_few_values(line, name)] or found
 
 
-def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow]:
+def extremes(name: str, lines: PointRows) -> tuple[PointRow, PointRow]:
     """The points with the least and the largest value of a response."""
 
     def value(line: PointRow) -> float:
@@ -289,7 +288,7 @@ def extremes(name: str, lines: Sequence[PointRow]) -> tuple[PointRow, PointRow]:
     return min(lines, key=value), max(lines, key=value)
 
 
-def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
+def response_range(name: str, lines: PointRows, place: Place) -> str:
     """Smallest and largest value of a response over the points, as a sentence."""
     points = valued(name, lines)
     if not points:
@@ -303,7 +302,7 @@ def response_range(name: str, lines: Sequence[PointRow], place: Place) -> str:
     return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
 
 
-def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
+def range_rows(study: Study, lines: PointRows) -> list[list[str]]:
     """A row per response: name, least value and its point, largest value and its point."""
     done = [line for line in lines if line.trials]
     place = placer(study, done)
@@ -316,9 +315,7 @@ def range_rows(study: Study, lines: Sequence[PointRow]) -> list[list[str]]:
     return rows
 
 
-def event(
-    text: str, shares: Sequence[Summary], lines: Sequence[PointRow], place: Place
-) -> str:
+def event(text: str, shares: Sequence[Summary], lines: PointRows, place: Place) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
     pairs = zip(shares, lines, strict=True)
     known = [(share, line) for share, line in pairs if np.isfinite(share.value)]
@@ -337,7 +334,7 @@ def event(
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 
 
-def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
+def ambiguity(study: Study, lines: PointRows, place: Place) -> str:
     """A sentence on attitudes whose lights fit another attitude as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
@@ -352,9 +349,7 @@ def ambiguity(study: Study, lines: Sequence[PointRow], place: Place) -> str:
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 
 
-def solved_everywhere(
-    study: Study, lines: Sequence[PointRow], place: Place, worst: str
-) -> str:
+def solved_everywhere(study: Study, lines: PointRows, place: Place, worst: str) -> str:
     """A sentence on whether every attitude is solved, and how often and where the tracker refuses one."""
     shares = [line.responses["refused"] for line in lines]
     text = event("Refused (no attitude is returned)", shares, lines, place)

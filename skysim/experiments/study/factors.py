@@ -22,6 +22,7 @@ from skysim.core.units import ConfigModel
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
+Option = tuple[Value, Settings]  # a level as in tables, and its settings
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*?)?\s*$")
 Name = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*$")]
 
@@ -49,7 +50,7 @@ def join_quantity(number: float, unit: str) -> Value:
     )
 
 
-def option_at(factor: Levels | Values, u: float) -> tuple[Value, Settings]:
+def option_at(factor: Levels | Values, u: float) -> Option:
     """The level or value at u in [0, 1], which is divided equally among all options."""
     options = factor.options()
     return options[min(int(u * len(options)), len(options) - 1)]
@@ -61,7 +62,7 @@ class Levels(ConfigModel):
     levels: Annotated[dict[str, Settings], Field(min_length=1)]
     value_at = option_at
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """Every level: its name in tables and its settings."""
         return list(self.levels.items())
 
@@ -89,7 +90,7 @@ class Values(KeyedFactor):
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
     value_at = option_at
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """Every value with its settings."""
         return [(value, self.settings_for(value)) for value in self.values]
 
@@ -124,11 +125,11 @@ class Range(KeyedFactor):
             raise InputError("", f"from is {self.from_!r}", "above 0 with scale: log")
         return self
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """`steps` values from one bound to the other, both included."""
         return [self.value_at(u) for u in np.linspace(0, 1, self.steps)]
 
-    def value_at(self, u: float) -> tuple[Value, Settings]:
+    def value_at(self, u: float) -> Option:
         """The value at the fraction u of the way from `from` to `to`."""
         (low, unit), (high, _) = split_quantity(self.from_), split_quantity(self.to)
         number = low * (high / low) ** u if self.scale == "log" else low + (high - low) * u
@@ -167,15 +168,10 @@ class Distribution(KeyedFactor):
 
     def parameters(self) -> tuple[list[float], str]:
         """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""
-        quantities = [
-            split_quantity(getattr(self, name)) for name in PARAMETERS[self.distribution]
-        ]
-        units = {
-            unit
-            for _, unit in (
-                quantities[:1] if self.distribution == "lognormal" else quantities
-            )
-        }
+        names = PARAMETERS[self.distribution]
+        quantities = [split_quantity(getattr(self, name)) for name in names]
+        with_unit = quantities[:1] if self.distribution == "lognormal" else quantities
+        units = {unit for _, unit in with_unit}
         if len(units) > 1:
             raise InputError(
                 "",
@@ -185,19 +181,17 @@ class Distribution(KeyedFactor):
         parameters = [number for number, _ in quantities]
         if self.sigma is not None and parameters[1] <= 0:
             raise InputError("", f"sigma is {self.sigma!r}", "above 0")
-        ascending = [
-            name for name in PARAMETERS[self.distribution] if name in ("low", "mode", "high")
-        ]
-        values = [parameters[PARAMETERS[self.distribution].index(name)] for name in ascending]
+        ascending = [name for name in names if name in ("low", "mode", "high")]
+        values = [parameters[names.index(name)] for name in ascending]
         if values and not (values == sorted(values) and values[0] < values[-1]):
             raise InputError("", f"{', '.join(ascending)} are not in ascending order")
         return parameters, units.pop()
 
-    def options(self) -> list[tuple[Value, Settings]]:
+    def options(self) -> list[Option]:
         """None: a distribution has no levels."""
         return []
 
-    def value_at(self, u: float) -> tuple[Value, Settings]:
+    def value_at(self, u: float) -> Option:
         """The quantile at probability u."""
         parameters, unit = self.parameters()
         value = join_quantity(float(QUANTILES[self.distribution](u, *parameters)), unit)
@@ -298,7 +292,7 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     return list(DESIGNS[design.kind](design, factors, seed))
 
 
-def make_point(chosen: Mapping[str, tuple[Value, Settings]]) -> Point:
+def make_point(chosen: Mapping[str, Option]) -> Point:
     """The point with these levels and settings of each factor."""
     settings: Settings = {}
     for _, level_settings in chosen.values():

@@ -24,8 +24,20 @@ from pydantic import (
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES
-from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Time, Triple
-from skysim.core.yaml_reader import explain, is_file, set_key
+from skysim.core.units import (
+    ConfigModel,
+    Declination,
+    Delay,
+    Duration,
+    Fraction,
+    InnerFraction,
+    NotNegative,
+    Number,
+    PositiveInt,
+    Seed,
+    Triple,
+)
+from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
@@ -33,7 +45,6 @@ from skysim.scene.scene import Scene
 
 TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
-Declination = Annotated[Number, Field(ge=-90, le=90)]
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 Angle = Annotated[Number, Field(ge=0, le=180)]
@@ -105,8 +116,8 @@ class RandomAttitude(AttitudeRange):
         same
     """
 
-    noise_seed: Annotated[int, Field(ge=0)] = 0
-    attitude_seed: Annotated[int, Field(ge=0)] = 0
+    noise_seed: Seed = 0
+    attitude_seed: Seed = 0
 
 
 class AxisConfig(ConfigModel):
@@ -164,7 +175,7 @@ class CentroidTrial(RandomAttitude):
     noise_px: NotNegative = 0.1
     noise_arcsec: NotNegative | None = None
     magnitude_sigma: NotNegative = 0.25
-    lights: Annotated[int, Field(ge=1)] | None = None
+    lights: PositiveInt | None = None
     missing: Fraction = 0.0
     false_lights: Annotated[int, Field(ge=0, le=10_000)] = 0
     false_share: Annotated[Number, Field(ge=0, le=0.95)] = 0.0
@@ -229,7 +240,7 @@ class FlightTrial(ConfigModel):
             json_schema_input_type=AttitudeRange | Literal["scene", "random"] | None,
         ),
     ] = None
-    settle_s: Annotated[Time, Field(ge=0)] = 0.0
+    settle_s: Delay = 0.0
 
 
 Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator="kind")]
@@ -238,9 +249,9 @@ Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator=
 class Budget(ConfigModel):
     """Limits of a study: total trials, wall-clock time, failed trials; it can be resumed after the last two."""
 
-    trials: Annotated[int, Field(ge=1)] | None = None
-    time_s: Annotated[Time, Field(gt=0)] | None = None
-    failures: Annotated[int, Field(ge=1)] | None = None
+    trials: PositiveInt | None = None
+    time_s: Duration | None = None
+    failures: PositiveInt | None = None
 
 
 class Curve(ConfigModel):
@@ -326,7 +337,7 @@ class Threshold(ConfigModel):
     """
 
     response: str
-    limit: Annotated[Number, Field(gt=0, lt=1)]
+    limit: InnerFraction
     along: str
     by: str | None = None
     where: dict[str, Value] = Field(default_factory=dict)
@@ -412,7 +423,7 @@ class Study(ConfigModel):
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
     scene: str
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
     factors: Annotated[
@@ -471,7 +482,7 @@ class TrialSpec:
     folder: str
     seed: int
     base: Settings
-    trial: dict[str, Any]
+    trial: Tree
     paired: bool
     hardware: tuple[str, ...] = ()
     programs: Mapping[str, str] = field(default_factory=dict)
@@ -547,9 +558,7 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
-def make_plan(
-    path: Path, study: Study, trial: dict[str, Any], programs: Mapping[str, str]
-) -> Plan:
+def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -594,7 +603,7 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     """The trial at a point, with its settings applied. Raises InputError with one line."""
-    tree: dict[str, Any] = {"trial": dict(spec.trial)}
+    tree: Tree = {"trial": dict(spec.trial)}
     for key, value in (spec.base | settings).items():
         if key.startswith(TRIAL):
             set_key(tree, key, one_line(value))

@@ -40,7 +40,6 @@ from skysim.results import metrics
 from skysim.results.files.parts import parts_list
 from skysim.results.metrics import Columns, Summary
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -79,7 +78,7 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
 
 def check_parts(config: Cost, scene: Scene) -> None:
     """Raise InputError if a scene whose parts are to be priced has no dome."""
-    if config.parts and not isinstance(scene.light, DomeConfig):
+    if config.parts and not scene.dome:
         raise InputError(
             "optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome"
         )

@@ -6,12 +6,19 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
-from skysim.core.yaml_reader import check_version, explain, read_yaml, set_key, where_of
+from skysim.core.yaml_reader import (
+    OverrideTexts,
+    Tree,
+    check_version,
+    explain,
+    read_yaml,
+    set_key,
+    where_of,
+)
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.factors import (
@@ -40,9 +47,8 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import metrics
 from skysim.scene import unused
-from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.layouts import OnPoints
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.scene import Scene, ephemeris_problem
+from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.tracking.tracker_interface import OWN, TRACKERS
 
 SURVEY_SEED = "tracker.survey.seed"
@@ -66,7 +72,7 @@ MEASURED_BY: dict[str, tuple[str, ...]] = {
 
 def load(
     name: str | Path,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
     programs: Mapping[str, str] | None = None,
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
@@ -91,12 +97,12 @@ def load(
 
 
 def plan_of(
-    tree: dict[str, Any],
+    tree: Tree,
     text: str,
     path: Path,
     base: Path | None = None,
     *,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
     programs: Mapping[str, str] | None = None,
 ) -> Plan:
     """The validated plan of a study's tree, read from a text.
@@ -257,13 +263,8 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
     near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
     if near and near.body == "zenith" and scene.site.longitude_deg is None:
         raise InputError("trial.near.body", "zenith requires site.longitude_deg in the scene")
-    if near and not BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]:
-        first, last = BODIES_YEARS
-        raise InputError(
-            "trial.near",
-            f"start_time {scene.start_time} is outside {first} to {last}",
-            "none",
-        )
+    if near and (problem := ephemeris_problem(scene.start_time)):
+        raise InputError("trial.near", problem, "none")
     if to_run:
         tracker = scene.tracker.name
         TRACKERS.check_name(tracker, plan.spec.programs)
@@ -280,12 +281,10 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
 def dome_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds of the survey and of the LEDs that have an effect in a scene."""
     seeds = [] if unused.reason(SURVEY_SEED, scene) else [SURVEY_SEED]
-    key = "light.layout"
-    layout = scene.light.layout if isinstance(scene.light, DomeConfig) else None
-    if isinstance(layout, OnPoints):
-        key = "light.layout.points"
-        layout = layout.points
-    return seeds + [f"{key}.hardware_seed"] * hasattr(layout, "hardware_seed")
+    if scene.dome and hasattr(scene.dome.points, "hardware_seed"):
+        nested = scene.dome.points is not scene.dome.layout
+        seeds.append(f"light.layout{'.points' * nested}.hardware_seed")
+    return seeds
 
 
 def fixed_seeds(study: Study, scene: Scene) -> list[str]:
@@ -347,11 +346,8 @@ def may_report_ambiguity(scene: Scene) -> bool:
     """Whether the tracker of a scene can refuse a frame as ambiguous."""
     from estimator.trackers.dome_tracker import SETTINGS
 
-    own = isinstance(scene.light, DomeConfig) and scene.tracker.identifier in (
-        None,
-        SETTINGS.identifier,
-    )
-    return own or scene.tracker.name != OWN
+    may = scene.dome is not None and scene.tracker.identifier in (None, SETTINGS.identifier)
+    return may or scene.tracker.name != OWN
 
 
 def check_random_start(scene: Scene, start: AttitudeRange) -> None:
@@ -363,8 +359,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
             else "motion.start: profile"
         )
         raise InputError("trial.start", f"random with {where}", "scene")
-    dome = isinstance(scene.light, DomeConfig)
-    for key in ("dec_deg", "near") if dome else ("tilt_deg",):
+    for key in ("dec_deg", "near") if scene.dome else ("tilt_deg",):
         if key in start.model_fields_set:
             raise InputError(
                 f"trial.start.{key}",
@@ -375,7 +370,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
         max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
     )
     vehicle = scene.vehicle
-    if dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
+    if scene.dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(
             "trial.start.tilt_deg",
             f"{greatest_deg:g}",

@@ -25,7 +25,7 @@ from skysim.experiments.study.factors import (
 )
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
-from skysim.results.files.row_parts import Rows, subset
+from skysim.results.files.row_parts import Array, Rows, subset
 from skysim.results.metrics import NO_VALUE, Columns, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
@@ -42,6 +42,7 @@ class PointRow(NamedTuple):
     trials: int = 0
 
 
+PointRows = Sequence[PointRow]
 Place = Callable[[PointRow], str]  # names a point in words
 
 
@@ -121,7 +122,7 @@ def has_few_values(row: PointRow, response: str) -> bool:
     return 0 < values < max(row.trials / 2, min(MIN_VALUES, row.trials))
 
 
-def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list[PointRow]:
+def select_responses(rows: PointRows, responses: Sequence[str]) -> list[PointRow]:
     """The rows with only these responses."""
     return [
         one._replace(responses={name: one.responses[name] for name in responses})
@@ -129,7 +130,7 @@ def select_responses(rows: Sequence[PointRow], responses: Sequence[str]) -> list
     ]
 
 
-def cells(rows: Sequence[PointRow]) -> tuple[list[str], list[list[str]]]:
+def cells(rows: PointRows) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not rows:
         return [], []
@@ -171,7 +172,7 @@ def format_response(row: PointRow, name: str) -> str:
     return f"{text} n={row.responses[name].trials}" if has_few_values(row, name) else text
 
 
-def to_columns(rows: Sequence[PointRow]) -> dict[str, list[Any]]:
+def to_columns(rows: PointRows) -> dict[str, list[Any]]:
     """The rows as columns: point, factors, and value, low, high and trial count of each response."""
     columns: dict[str, list[Any]] = {"point": [one.point for one in rows]}
     for name in rows[0].levels if rows else ():
@@ -188,14 +189,14 @@ def trial_columns(store: Store) -> Rows:
     return with_levels(store.columns(), level_columns(store))
 
 
-def level_columns(store: Store) -> dict[str, NDArray[Any]]:
+def level_columns(store: Store) -> dict[str, Array]:
     """(P,) levels of each factor by point: numbers, or texts."""
     points = store.points()
     names = points[0].levels if points else {}
     return {name: to_array([one.levels[name] for one in points]) for name in names}
 
 
-def to_array(levels: Sequence[Any]) -> NDArray[Any]:
+def to_array(levels: Sequence[Any]) -> Array:
     """Levels of a factor as an array; as texts if numpy has no type for them."""
     plain = [format_level(one) if isinstance(one, list) else one for one in levels]
     array = np.array(plain)
@@ -204,10 +205,10 @@ def to_array(levels: Sequence[Any]) -> NDArray[Any]:
     return np.array([one if one is None else str(one) for one in levels], object)
 
 
-def with_levels(rows: Rows, levels: dict[str, NDArray[Any]]) -> Rows:
+def with_levels(rows: Rows, levels: dict[str, Array]) -> Rows:
     """Rows of trials, and the levels of their points."""
 
-    def column(name: str) -> NDArray[Any]:
+    def column(name: str) -> Array:
         return levels[name][rows["point"]] if name in levels else rows[name]
 
     return Rows((*rows, *levels), [column], [rows.starts[-1]])
@@ -386,7 +387,7 @@ def label(name: str, unit: str = "") -> str:
     return f"{text} [share]" if metrics.is_proportion(name) else text
 
 
-def axis(study: Study, lines: Sequence[PointRow], name: str) -> Axis:
+def axis(study: Study, lines: PointRows, name: str) -> Axis:
     """The axis of a factor, with the levels at which there are points."""
     factor = study.factors[name]
     levels = distinct(line.levels[name] for line in lines)
@@ -448,7 +449,7 @@ def suits_log_scale(numbers: Floats) -> bool:
 # Selection of points.
 
 
-def fixed_levels(shown: Shown, study: Study, lines: Sequence[PointRow]) -> dict[str, Value]:
+def fixed_levels(shown: Shown, study: Study, lines: PointRows) -> dict[str, Value]:
     """The levels at which a figure or threshold keeps factors fixed.
 
     They are those of its `where`, and the first level of the other factors that it does not show. Sampled points share
@@ -465,14 +466,12 @@ def fixed_levels(shown: Shown, study: Study, lines: Sequence[PointRow]) -> dict[
     }
 
 
-def shown_points(lines: Sequence[PointRow], shown: Shown, study: Study) -> list[PointRow]:
+def shown_points(lines: PointRows, shown: Shown, study: Study) -> list[PointRow]:
     """The table lines (points) of a figure or threshold."""
     return points_at(lines, study, fixed_levels(shown, study, lines))
 
 
-def check_levels(
-    levels: Mapping[str, Value], study: Study, lines: Sequence[PointRow]
-) -> None:
+def check_levels(levels: Mapping[str, Value], study: Study, lines: PointRows) -> None:
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
         if name not in study.factors:
@@ -483,9 +482,7 @@ def check_levels(
             raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
 
 
-def points_at(
-    lines: Sequence[PointRow], study: Study, levels: Mapping[str, Value]
-) -> list[PointRow]:
+def points_at(lines: PointRows, study: Study, levels: Mapping[str, Value]) -> list[PointRow]:
     """The table lines (points) at these levels. Raises InputError for an unknown factor or level."""
     check_levels(levels, study, lines)
     return [
@@ -496,7 +493,7 @@ def points_at(
 
 
 def group_points(
-    all_lines: Sequence[PointRow], shown: Shown, study: Study
+    all_lines: PointRows, shown: Shown, study: Study
 ) -> dict[str, list[PointRow]]:
     """The table lines of a figure or threshold by the level of its `by`; under "" if it has none."""
     lines = shown_points(all_lines, shown, study)

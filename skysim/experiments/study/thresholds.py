@@ -8,7 +8,6 @@ one side of the limit to the first level that is certainly on the other, so more
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study import table
 from skysim.experiments.study.plan import Curve, Study, Threshold
-from skysim.experiments.study.table import Axis, PointRow
+from skysim.experiments.study.table import Axis, PointRows
 from skysim.results import metrics
 
 MOST_TRIALS = 1_000_000  # greatest number of trials that is advised
@@ -157,7 +156,7 @@ def certain_levels(
 # Thresholds of a study.
 
 
-def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRow]) -> None:
+def check(threshold: Threshold, where: str, study: Study, rows: PointRows) -> None:
     """Raise InputError if the response is not a proportion, or the factor has no numeric levels."""
     name = threshold.response
     if not metrics.is_proportion(name):
@@ -177,7 +176,7 @@ def check(threshold: Threshold, where: str, study: Study, rows: Sequence[PointRo
         )
 
 
-def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list[Threshold]:
+def thresholds_of(curve: Curve, study: Study, lines: PointRows) -> list[Threshold]:
     """The study's thresholds of a curve's response, along its x, at its levels."""
     levels = table.fixed_levels(curve, study, lines)
     shown = (curve.y, curve.x, curve.by)
@@ -190,7 +189,7 @@ def thresholds_of(curve: Curve, study: Study, lines: Sequence[PointRow]) -> list
 
 
 def crossings(
-    threshold: Threshold, study: Study, lines: Sequence[PointRow]
+    threshold: Threshold, study: Study, lines: PointRows
 ) -> dict[str, Crossing | None]:
     """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
     axis = table.axis(study, lines, threshold.along)
@@ -198,9 +197,7 @@ def crossings(
     return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
 
 
-def group_crossing(
-    threshold: Threshold, lines: Sequence[PointRow], axis: Axis
-) -> Crossing | None:
+def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossing | None:
     """The crossing along one series of points; None without trials at two levels."""
     summaries = [
         (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
@@ -215,7 +212,7 @@ def group_crossing(
     return crossing(x, hits, trials, threshold.limit, axis.log)
 
 
-def sentences(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> list[str]:
+def sentences(threshold: Threshold, study: Study, lines: PointRows) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
     axis = table.axis(study, lines, threshold.along)
     unit = (
@@ -273,7 +270,7 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     return f"{100 * metrics.CONFIDENCE:g} %: {span}"
 
 
-def brief(threshold: Threshold, study: Study, lines: Sequence[PointRow]) -> str:
+def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
     """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
     axis = table.axis(study, lines, threshold.along)
     unit = table.unit_of(axis)

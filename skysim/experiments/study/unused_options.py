@@ -7,9 +7,10 @@ bounds the exposure time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
+from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.factors import Settings, Value, make_point
 from skysim.experiments.study.plan import (
     TRIAL,
@@ -22,9 +23,8 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.scene.sections.layouts import CelestialConfig, OnPoints
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.camera import DetectorConfig, RollingShutterConfig
+from skysim.scene.sections.layouts import CelestialConfig
 from skysim.scene.unused_rules import Rule
 from skysim.tracking import factory
 
@@ -55,33 +55,11 @@ def on_ground(scene: Scene, trial: Trial) -> bool:
     )
 
 
+# All but the color and efficiency of the detector, which decide the brightness of the lights.
 DETECTOR = tuple(
     f"camera.detector.{key}"
-    for key in (
-        "hardware_seed",
-        "prnu",
-        "dark_e_s",
-        "dark_temperature_c",
-        "dark_doubling_c",
-        "temperature_c",
-        "dsnu",
-        "hot_pixels",
-        "hot_e_s",
-        "particles",
-        "full_well_e",
-        "blooming",
-        "anti_blooming",
-        "cti_parallel",
-        "cti_serial",
-        "read_noise_e",
-        "reset_noise_e",
-        "column_offset_e",
-        "gain_e_dn",
-        "offset_dn",
-        "nonlinearity",
-        "bits",
-        "noise",
-    )
+    for key in DetectorConfig.model_fields
+    if key not in ("quantum_efficiency", "bayer")
 )
 
 
@@ -95,22 +73,15 @@ def ignores_streak(scene: Scene, trial: Trial) -> bool:
 def tracks(scene: Scene) -> bool:
     """Whether the scene's tracker has a tracking mode."""
     return (
-        isinstance(scene.light, StarsConfig)
+        scene.stars is not None
         and not unused_rules.external(scene)
         and not isinstance(scene.camera.shutter, RollingShutterConfig)
     )
 
 
-def in_dome(scene: Scene, trial: Trial) -> bool:
-    """Whether the light is an LED dome."""
-    return isinstance(scene.light, DomeConfig)
-
-
 def merges_stars(scene: Scene) -> bool:
     """Whether the size of an LED decides which stars share an LED."""
-    layout = getattr(scene.light, "layout", None)
-    points = layout.points if isinstance(layout, OnPoints) else layout
-    return isinstance(points, CelestialConfig)
+    return scene.dome is not None and isinstance(scene.dome.points, CelestialConfig)
 
 
 RULES = (
@@ -128,13 +99,13 @@ RULES = (
     ),
     Rule(
         ("trial.tilt_deg",),
-        lambda scene, trial: not in_dome(scene, trial),
+        lambda scene, trial: scene.dome is None,
         "the boresight is drawn from the sphere",
         "trial.dec_deg, or a scene with light of kind dome",
     ),
     Rule(
         ("trial.dec_deg", "trial.near"),
-        in_dome,
+        lambda scene, trial: scene.dome is not None,
         "under a dome the tilt is drawn",
         "trial.tilt_deg",
     ),
@@ -183,7 +154,7 @@ RULES = (
         lambda scene, trial: (
             isinstance(trial, FrameTrial)
             and not trial.tracked
-            and (not isinstance(scene.light, DomeConfig) or unused_rules.steady(scene))
+            and (not scene.dome or unused_rules.steady(scene))
         ),
         "the light of a trial's frame is steady",
         "trial.kind: flight",
@@ -308,7 +279,7 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
             raise error.within(level).within(f"factors.{name}")
 
 
-def unused_overrides(overrides: Mapping[str, str], scene: Scene, trial: Trial) -> set[str]:
+def unused_overrides(overrides: OverrideTexts, scene: Scene, trial: Trial) -> set[str]:
     """The overrides that have no effect on a trial of the resulting scene."""
     useless = set()
     for key, text in overrides.items():

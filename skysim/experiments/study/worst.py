@@ -15,7 +15,7 @@ from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import PointRow, points_at
 from skysim.results import metrics
-from skysim.results.files.row_parts import row_of, subset
+from skysim.results.files.row_parts import Array, row_of, subset
 from skysim.results.metrics import Columns
 
 COUNT = 3  # number of worst trials that a report lists
@@ -30,7 +30,7 @@ FIRST = 1000  # number of worst trials that are sorted first
 APART_DEG = 5.0  # least angle between the directions of two listed trials
 NEAR = math.cos(math.radians(APART_DEG))
 # How often a trial counts for a proportion; for `identified`, how often it does not.
-FLAGS: dict[str, Callable[[Columns], NDArray[Any]]] = {
+FLAGS: dict[str, Callable[[Columns], Array]] = {
     "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
     "refused": lambda c: c["frames"] - c["solved"],
     "overconfident": lambda c: np.nan_to_num(c["nees"]) > metrics.OVERCONFIDENT_NEES,

@@ -284,9 +284,9 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
 
 def build_design(scene: Scene) -> DomeDesign:
     """The scene's dome as designed. Raises InputError without a dome."""
-    light = scene.light
-    if not isinstance(light, DomeConfig):
-        raise InputError("light.kind", f"{light.kind} has no parts", "dome")
+    light = scene.dome
+    if light is None:
+        raise InputError("light.kind", f"{scene.light.kind} has no parts", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
     return DomeDesign(

@@ -23,7 +23,6 @@ from skysim.core.files import atomic_file, write_png16, write_table
 from skysim.core.images import TOP_DOWN_CARD, read_image
 from skysim.core.types import ATTITUDES, Floats, Frame, Truth
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
@@ -264,7 +263,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["FRAME"] = (frame.index, "index of the frame")
     header.append(TOP_DOWN_CARD)
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         header.update(wcs.header(scene.camera, truth.mean_cam_from_lab))
         header["COMMENT"] = (
             "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
@@ -312,9 +311,7 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         **{f"{name}_xyzw": getattr(truth, name).as_quat().tolist() for name in ATTITUDES},
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "hidden": truth.hidden.tolist(),
-        "lab": "ICRS axes"
-        if isinstance(scene.light, StarsConfig)
-        else "bearing center, z up",
+        "lab": "ICRS axes" if scene.stars else "bearing center, z up",
     }
     if truth.bodies:
         table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]

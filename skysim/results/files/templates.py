@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
@@ -181,9 +180,9 @@ class Dome(NamedTuple):
 
 def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
-    light = lab.scene.light
-    if not isinstance(light, DomeConfig):
-        raise InputError("light.kind", f"{light.kind} has no {ending}", "dome")
+    light = lab.scene.dome
+    if light is None:
+        raise InputError("light.kind", f"{lab.scene.light.kind} has no {ending}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
     # Boards stand out.

@@ -21,11 +21,15 @@ from skysim.core.paths import DATA
 from skysim.core.units import (
     Ascending,
     ConfigModel,
+    Duration,
     Fraction,
+    Fractions,
     Length,
     NotNegative,
     Number,
-    Time,
+    PositiveFraction,
+    Seed,
+    Temperature,
     check_table,
     quantity,
 )
@@ -35,6 +39,12 @@ from skysim.scene.opencv_calibration import OpencvCalibration
 FocusText = Annotated[str, Field(description='a length such as "33 in", or infinity')]
 
 Electrons = Annotated[Number, Field(ge=0, le=1e9)]
+
+Wavelength = Annotated[Length, Field(ge=200e-9, le=2e-6)]
+
+# Standard deviation of a Gaussian: one that blurs a smooth image more, and one that alone makes it smooth enough.
+Blur = Annotated[Number, Field(ge=0, le=20)]
+SampledBlur = Annotated[Number, Field(ge=0.2, le=20)]
 
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
@@ -58,14 +68,14 @@ class PsfConfig(ConfigModel):
         quadrature (field curvature and coma, to first order)
     """
 
-    corner_sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    corner_sigma_px: Blur = 0.0
 
 
 class GaussianPsfConfig(PsfConfig):
     """A Gaussian of standard deviation sigma_px."""
 
     kind: Literal["gaussian"] = "gaussian"
-    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+    sigma_px: SampledBlur = 0.7
 
 
 class MoffatPsfConfig(PsfConfig):
@@ -80,8 +90,8 @@ class AiryPsfConfig(PsfConfig):
     """Diffraction at the lens's working f-number, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["airy"]
-    wavelength_m: Annotated[Length, Field(ge=200e-9, le=2e-6)] = 550e-9
-    sigma_px: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    wavelength_m: Wavelength = 550e-9
+    sigma_px: Blur = 0.0
 
 
 class DiskPsfConfig(PsfConfig):
@@ -89,7 +99,7 @@ class DiskPsfConfig(PsfConfig):
 
     kind: Literal["disk"]
     radius_px: Annotated[Number, Field(gt=0, le=200)]
-    sigma_px: Annotated[Number, Field(ge=0.2, le=20)] = 0.7
+    sigma_px: SampledBlur = 0.7
 
 
 class MeasuredPsfConfig(PsfConfig):
@@ -118,7 +128,7 @@ class VignettingTableConfig(ConfigModel):
 
     kind: Literal["table"]
     angle_deg: Ascending
-    transmission: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+    transmission: Fractions
 
     @model_validator(mode="after")
     def check_columns(self) -> VignettingTableConfig:
@@ -140,9 +150,7 @@ class ChromaticConfig(ConfigModel):
         distance from the principal point
     """
 
-    wavelength_m: Annotated[
-        tuple[Annotated[Length, Field(ge=200e-9, le=2e-6)], ...], Field(min_length=2)
-    ]
+    wavelength_m: Annotated[tuple[Wavelength, ...], Field(min_length=2)]
     focus_m: (
         Annotated[
             tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)
@@ -224,7 +232,7 @@ class BaffleConfig(ConfigModel):
     """
 
     angle_deg: Ascending
-    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+    pst: Fractions
 
     @model_validator(mode="after")
     def check_columns(self) -> BaffleConfig:
@@ -244,21 +252,21 @@ class RollingShutterConfig(ConfigModel):
     """Each row opens and closes row_time after the one above it."""
 
     kind: Literal["rolling"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
 
 
 class FrameTransferConfig(ConfigModel):
     """Exposed charge is shifted into a covered store, row_time per row, so a pixel collects along its column."""
 
     kind: Literal["frame_transfer"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
 
 
 class InterlineConfig(ConfigModel):
     """The covered register is not opaque: it collects the fraction `leak` of the light of each row that it passes."""
 
     kind: Literal["interline"]
-    row_time_s: Annotated[Time, Field(gt=0)]
+    row_time_s: Duration
     leak: Fraction = 1e-4
 
 
@@ -310,7 +318,7 @@ class EfficiencyConfig(ConfigModel):
     """
 
     curve: Curve
-    peak: Annotated[Number, Field(gt=0, le=1)]
+    peak: PositiveFraction
 
 
 class ColorEfficiencyConfig(ConfigModel):
@@ -354,7 +362,7 @@ def curve_exists(value: str) -> str:
 
 
 Transmission = Annotated[
-    Annotated[Annotated[Number, Field(gt=0, le=1)], Tag("number")]
+    Annotated[PositiveFraction, Tag("number")]
     | Annotated[Annotated[str, AfterValidator(curve_exists)], Tag("curve")],
     Discriminator(transmission_tag),
 ]
@@ -403,12 +411,12 @@ class DetectorConfig(ConfigModel):
 
     quantum_efficiency: Efficiency
     bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
-    hardware_seed: Annotated[int, Field(ge=0)] = 0
+    hardware_seed: Seed = 0
     prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
     dark_e_s: Electrons = 0.0
-    dark_temperature_c: Annotated[Number, Field(ge=-150, le=150)] = 20.0
+    dark_temperature_c: Temperature = 20.0
     dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
-    temperature_c: Annotated[Number, Field(ge=-150, le=150)] | None = None
+    temperature_c: Temperature | None = None
     dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
     hot_pixels: Fraction = 0.0
     hot_e_s: Electrons = 0.0

@@ -11,18 +11,29 @@ from pydantic import Field, field_validator, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
-from skysim.core.units import ConfigModel, Length, Number
+from skysim.core.units import (
+    ConfigModel,
+    Declination,
+    Length,
+    Magnitude,
+    Number,
+    Position,
+    Positive,
+    PositiveFraction,
+    PositiveInt,
+    PositiveLength,
+    RightAscension,
+    Seed,
+)
 
 HOLES = 9  # holes of a patch board, 3x3
-Level = Annotated[Number, Field(gt=0, le=1)]
+Level = PositiveFraction
 Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
-Magnitudes = Annotated[
-    tuple[Annotated[Number, Field(ge=-30, le=30)], ...], Field(min_length=1)
-]
+Magnitudes = Annotated[tuple[Magnitude, ...], Field(min_length=1)]
 TypeNames = Annotated[tuple[str, ...], Field(min_length=1)]
+Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
-Seed = Annotated[int, Field(ge=0)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 
 
@@ -89,8 +100,8 @@ class PatchBoardsConfig(ConfigModel):
 
     kind: Literal["patch_boards"]
     cap_deg: Cap
-    spacing_m: Annotated[Length, Field(gt=0)] | None = None
-    pitch_m: Annotated[Length, Field(gt=0)]
+    spacing_m: PositiveLength | None = None
+    pitch_m: PositiveLength
     spread: Literal["spiral", "grid"] = "spiral"
     lit: tuple[int, int] = (4, 6)
     pwm_levels: Levels = (1.0,)
@@ -170,7 +181,7 @@ class PoissonDiskConfig(DimmedConfig):
     """LEDs at random with a least spacing: as many as fit at `spacing`, or `count` LEDs as far apart as possible."""
 
     kind: Literal["poisson_disk"]
-    spacing_m: Annotated[Length, Field(gt=0)] | None = None
+    spacing_m: PositiveLength | None = None
     count: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
     @model_validator(mode="after")
@@ -194,7 +205,7 @@ class LitConfig(DimmedConfig):
     LEDs are left out or differ in brightness. An LED keeps its number among all positions.
     """
 
-    lit_fraction: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    lit_fraction: PositiveFraction = 1.0
 
 
 class GeodesicConfig(LitConfig):
@@ -274,9 +285,9 @@ class OptimizedConfig(DimmedConfig):
     count: Annotated[int, Field(ge=3, le=2000)]
     tilt_deg: Annotated[Number, Field(ge=0, le=60)]
     field_deg: tuple[FieldOfView, FieldOfView] | None = None
-    camera_m: tuple[Length, Length, Length] | None = None
-    spacing_m: Annotated[Length, Field(gt=0)]
-    coincidence_m: Annotated[Length, Field(gt=0)] = 1e-3
+    camera_m: Position | None = None
+    spacing_m: PositiveLength
+    coincidence_m: PositiveLength = 1e-3
     min_leds: Annotated[int, Field(ge=2, le=50)] = 5
     rounds: Annotated[int, Field(ge=1, le=5000)] = 100
 
@@ -310,9 +321,9 @@ class CelestialConfig(ConfigModel):
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
     brightness: Literal["v", "band"] = "band"
     brightest_mag: Number | None = None
-    camera_m: tuple[Length, Length, Length]
-    zenith_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    zenith_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    camera_m: Position
+    zenith_ra_deg: RightAscension
+    zenith_dec_deg: Declination
     roll_deg: Number = 0.0
     epoch: datetime.datetime = datetime.datetime(2000, 1, 1, 12)
     hardware_seed: Seed = 0
@@ -343,9 +354,7 @@ class ListedConfig(DimmedConfig):
     """
 
     kind: Literal["listed"]
-    positions_m: (
-        Annotated[tuple[tuple[Length, Length, Length], ...], Field(min_length=1)] | None
-    ) = None
+    positions_m: Annotated[tuple[Position, ...], Field(min_length=1)] | None = None
     directions_deg: (
         Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None
     ) = None
@@ -403,7 +412,7 @@ class AimingConfig(ConfigModel):
         Standard deviation of a hole from its mark along two axes in the surface, or its tolerance; drawn for each hole
     """
 
-    laser_m: tuple[Length, Length, Length]
+    laser_m: Position
     pointing_sigma_arcsec: NumberError = 0.0
     orientation_sigma_arcsec: NumberError = 0.0
     drill_sigma_m: LengthError = 0.0
@@ -467,11 +476,9 @@ class PixelsConfig(ConfigModel):
         White over black, which glows over the whole display; without it black is dark
     """
 
-    pixels: tuple[
-        Annotated[int, Field(ge=1, le=20_000)], Annotated[int, Field(ge=1, le=20_000)]
-    ]
-    pitch_m: Annotated[Length, Field(gt=0)]
-    block: Annotated[int, Field(ge=1)] = 1
+    pixels: tuple[Pixels, Pixels]
+    pitch_m: PositiveLength
+    block: PositiveInt = 1
     gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
     gamma: Annotated[Number, Field(gt=0, le=10)] = 2.2
     contrast: Annotated[Number, Field(ge=2)] | None = None
@@ -535,12 +542,12 @@ class ProjectorConfig(PixelsConfig):
 
     kind: Literal["projector"]
     points: Points
-    position_m: tuple[Length, Length, Length]
-    aim_m: tuple[Length, Length, Length]
+    position_m: Position
+    aim_m: Position
     rotation_deg: Number = 0.0
-    focal_length_m: Annotated[Length, Field(gt=0)]
-    f_number: Annotated[Number, Field(gt=0)] = 2.0
-    focus_m: Annotated[Length, Field(gt=0)] | None = None
+    focal_length_m: PositiveLength
+    f_number: Positive = 2.0
+    focus_m: PositiveLength | None = None
     distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 

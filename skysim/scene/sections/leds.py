@@ -20,10 +20,15 @@ from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     Ascending,
     ConfigModel,
+    Duration,
+    InnerFraction,
     Intensity,
     Length,
     NotNegative,
     Number,
+    Positive,
+    PositiveFraction,
+    PositiveInt,
     RadiantIntensity,
     Time,
     check_table,
@@ -73,7 +78,7 @@ class LowPassConfig(ConfigModel):
         Relative standard deviation of R C from LED to LED, or its tolerance (of both parts together)
     """
 
-    time_constant_s: Annotated[Time, Field(gt=0)]
+    time_constant_s: Duration
     error: Annotated[NumberError, Field(lt=0.5)] = 0.0
 
 
@@ -106,9 +111,9 @@ class SequentialConfig(ConfigModel):
     """
 
     kind: Literal["sequential"]
-    slot_s: Annotated[Time, Field(gt=0)] = 1e-3
-    controller: Literal["board", "dome"] | Annotated[int, Field(ge=1)] = "board"
-    slots: Annotated[int, Field(ge=1)] | None = None
+    slot_s: Duration = 1e-3
+    controller: Literal["board", "dome"] | PositiveInt = "board"
+    slots: PositiveInt | None = None
 
 
 class RefreshConfig(ConfigModel):
@@ -119,8 +124,8 @@ class RefreshConfig(ConfigModel):
     """
 
     kind: Literal["refresh"]
-    rate_hz: Annotated[Number, Field(gt=0)]
-    duty: Annotated[Number, Field(gt=0, le=1)] = 1.0
+    rate_hz: Positive
+    duty: PositiveFraction = 1.0
 
 
 Drive = Annotated[
@@ -159,7 +164,7 @@ class CodeConfig(ConfigModel):
         Probability that a bit of an LED fails, independently of all others; drawn by the scene's seed
     """
 
-    depth: Annotated[Number, Field(gt=0, le=1)] = 0.5
+    depth: PositiveFraction = 0.5
     bit_time_s: Literal["frame"] | Annotated[Time, Field(ge=1e-4)] = "frame"
     dropout: Annotated[Number, Field(ge=0, lt=0.5)] = 0.0
 
@@ -261,8 +266,8 @@ class WarmUpConfig(ConfigModel):
         Time after which 63 % of the loss is reached
     """
 
-    steady: Annotated[Number, Field(gt=0, lt=1)]
-    time_s: Annotated[Time, Field(gt=0)]
+    steady: InnerFraction
+    time_s: Duration
 
 
 def spectrum_file(spectrum: str) -> Path:
@@ -380,7 +385,7 @@ class LedConfig(LedLightConfig):
     drive: Drive = PwmConfig()
     clock: ClockConfig = ClockConfig()
     code: Code | None = None
-    pwm_period_s: Annotated[Time, Field(gt=0)] = 1e-3
+    pwm_period_s: Duration = 1e-3
 
     def of_type(self, name: str) -> LedConfig:
         """The LED with brightness and color of one of its types; itself for an empty name."""

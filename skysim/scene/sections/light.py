@@ -28,12 +28,24 @@ from skysim.core.plugins import PluginKind
 from skysim.core.tolerance import LengthError
 from skysim.core.units import (
     ConfigModel,
+    Declination,
     Fraction,
     Length,
+    Magnitude,
     Number,
-    SemiAxis,
+    Position,
+    Positive,
+    PositiveLength,
+    RightAscension,
+    Seed,
 )
-from skysim.scene.sections.layouts import Layout, PixelsConfig
+from skysim.scene.sections.layouts import (
+    Layout,
+    OnPoints,
+    PatchBoardsConfig,
+    PixelsConfig,
+    Points,
+)
 from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
@@ -59,7 +71,7 @@ class SurfaceConfig(ConfigModel):
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
-    offset_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    offset_m: Position = (0.0, 0.0, 0.0)
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 
@@ -112,19 +124,19 @@ class WallConfig(ConfigModel):
         Density, from which `skysim check` computes the mass; 1190 for acrylic
     """
 
-    thickness_apex_m: Annotated[Length, Field(gt=0)]
-    thickness_base_m: Annotated[Length, Field(gt=0)]
+    thickness_apex_m: PositiveLength
+    thickness_base_m: PositiveLength
     base_deg: Annotated[Number, Field(gt=0, le=90)]
     radius_of: Literal["outside", "mid_wall"] = "outside"
-    density_kg_m3: Annotated[Number, Field(gt=0)] | None = None
+    density_kg_m3: Positive | None = None
 
 
 class SphereSurfaceConfig(RimmedConfig):
     """A sphere; with a wall, the inner face of a formed shell whose outside or middle is a sphere."""
 
     kind: Literal["sphere"]
-    apex_m: Annotated[Length, Field(gt=0)]
-    radius_m: Annotated[Length, Field(gt=0)]
+    apex_m: PositiveLength
+    radius_m: PositiveLength
     wall: WallConfig | None = None
 
     @model_validator(mode="after")
@@ -143,17 +155,17 @@ class EllipsoidSurfaceConfig(RimmedConfig):
     """An ellipsoid: oblate, prolate or triaxial."""
 
     kind: Literal["ellipsoid"]
-    apex_m: Annotated[Length, Field(gt=0)]
-    semi_axes_m: tuple[SemiAxis, SemiAxis, SemiAxis]
+    apex_m: PositiveLength
+    semi_axes_m: tuple[PositiveLength, PositiveLength, PositiveLength]
 
 
 class FlatSurfaceConfig(SurfaceConfig):
     """A level panel, with a width along x and a height along y, or infinite."""
 
     kind: Literal["flat"]
-    apex_m: Annotated[Length, Field(gt=0)]
-    width_m: Annotated[Length, Field(gt=0)] | None = None
-    height_m: Annotated[Length, Field(gt=0)] | None = None
+    apex_m: PositiveLength
+    width_m: PositiveLength | None = None
+    height_m: PositiveLength | None = None
 
 
 class CylinderSurfaceConfig(SurfaceConfig):
@@ -161,9 +173,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
 
     kind: Literal["cylinder"]
     axis: Literal["x", "y", "z"]
-    apex_m: Annotated[Length, Field(gt=0)]
-    radius_m: Annotated[Length, Field(gt=0)]
-    length_m: Annotated[Length, Field(gt=0)] | None = None
+    apex_m: PositiveLength
+    radius_m: PositiveLength
+    length_m: PositiveLength | None = None
     rim_height_m: Length | None = None
 
     @model_validator(mode="after")
@@ -191,7 +203,7 @@ class SurveyedSurfaceConfig(RimmedConfig):
     file: str
     unit: Literal["m", "cm", "mm", "in"]
     degree: Annotated[int, Field(ge=0, le=12)] = 6
-    rms_limit_m: Annotated[Length, Field(gt=0)] = 1e-3
+    rms_limit_m: PositiveLength = 1e-3
 
     @field_validator("file")
     @classmethod
@@ -255,13 +267,11 @@ class RoomConfig(ConfigModel):
         Thickness of the shell with its ribs
     """
 
-    height_m: Annotated[Length, Field(gt=0)] | None = None
+    height_m: PositiveLength | None = None
     bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
-    width_m: Annotated[Length, Field(gt=0)] | None = None
-    length_m: Annotated[Length, Field(gt=0)] | None = None
-    door_m: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = (
-        None
-    )
+    width_m: PositiveLength | None = None
+    length_m: PositiveLength | None = None
+    door_m: tuple[PositiveLength, PositiveLength] | None = None
     segments: Annotated[int, Field(ge=1, le=100)] = 1
     thickness_m: Annotated[Length, Field(ge=0)] = 0.0
 
@@ -292,8 +302,8 @@ class FloorConfig(ConfigModel):
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
-    depth_m: Annotated[Length, Field(gt=0)]
-    radius_m: Annotated[Length, Field(gt=0)]
+    depth_m: PositiveLength
+    radius_m: PositiveLength
 
 
 class ReflectionConfig(ConfigModel):
@@ -361,6 +371,11 @@ class DomeConfig(ConfigModel):
     occlusion: bool = True
     reflection: ReflectionConfig | None = None
     room: RoomConfig | None = None
+
+    @property
+    def points(self) -> PatchBoardsConfig | Points:
+        """The layout of single LEDs or boards: of fibers and displays, that of the points that they show."""
+        return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
     @model_validator(mode="after")
     def check_controller(self) -> DomeConfig:
@@ -458,7 +473,7 @@ class StarsConfig(ConfigModel):
     kind: Literal["stars"]
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
-    variability_seed: Annotated[int, Field(ge=0)] | None = None
+    variability_seed: Seed | None = None
     bodies: BodiesConfig | None = None
     satellites: SatellitesConfig | None = None
     air: AirConfig | None = None
@@ -488,13 +503,13 @@ class CollimatedDisplayConfig(PixelsConfig):
     """
 
     kind: Literal["collimated_display"]
-    focal_length_m: Annotated[Length, Field(gt=0)]
+    focal_length_m: PositiveLength
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
-    axis_ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    axis_dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    axis_ra_deg: RightAscension
+    axis_dec_deg: Declination
     roll_deg: Number = 0.0
-    brightest_mag: Annotated[Number, Field(ge=-30, le=30)]
+    brightest_mag: Magnitude
     conjugate_m: Annotated[Length, Field(ge=10)] | None = None
 
 

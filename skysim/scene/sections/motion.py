@@ -14,16 +14,25 @@ from pydantic import (
 )
 
 from skysim.core.errors import InputError
-from skysim.core.units import ConfigModel, Momentum, NotNegative, Number, Positive, Spin, Time
+from skysim.core.units import (
+    ConfigModel,
+    Declination,
+    Duration,
+    Momentum,
+    NotNegative,
+    Number,
+    Positive,
+    RightAscension,
+    Spins,
+    Time,
+    Triple,
+)
 from skysim.core.yaml_reader import existing_file
 from skysim.scene.sections.vehicle import ActuatorsName
 
-Duration = Annotated[Time, Field(gt=0)]
-Acceleration = Positive
-RatesDegS = tuple[Spin, Spin, Spin]
 SIDEREAL = "sidereal"  # the rate of a vehicle that stands on the Earth, under the stars
 StartRate = Annotated[
-    Annotated[RatesDegS, Tag("rates")] | Annotated[Literal["sidereal"], Tag("name")],
+    Annotated[Spins, Tag("rates")] | Annotated[Literal["sidereal"], Tag("name")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "rates"),
 ]
 LawName = Annotated[str, Field(pattern=r"^\w[\w.-]*$", max_length=100)]
@@ -42,8 +51,8 @@ class AttitudeConfig(ConfigModel):
 class PointingConfig(ConfigModel):
     """Pointing of the camera in the ICRS: its boresight, and the position angle of the image's up direction."""
 
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    ra_deg: RightAscension
+    dec_deg: Declination
     roll_deg: Number = 0.0
 
 
@@ -112,14 +121,14 @@ class SlewConfig(AttitudeConfig):
 
     kind: Literal["slew"]
     rate_deg_s: Positive = 2.0
-    acceleration_deg_s2: Acceleration = 0.5
+    acceleration_deg_s2: Positive = 0.5
 
 
 class RateConfig(ConfigModel):
     """Rotate at a constant rate, rate_deg_s about body x, y, z, from the beginning of the maneuver."""
 
     kind: Literal["rate"]
-    rate_deg_s: RatesDegS
+    rate_deg_s: Spins
     duration_s: Duration
 
 
@@ -127,7 +136,7 @@ class SpinUpConfig(ConfigModel):
     """Change the rate smoothly from its present value to rate_deg_s about body x, y, z."""
 
     kind: Literal["spin_up"]
-    rate_deg_s: RatesDegS
+    rate_deg_s: Spins
     duration_s: Duration
 
 
@@ -135,7 +144,7 @@ class SineConfig(ConfigModel):
     """Oscillate about the attitude: amplitude_deg about body x, y, z at frequency_hz, starting and ending smoothly."""
 
     kind: Literal["sine"]
-    amplitude_deg: tuple[Number, Number, Number]
+    amplitude_deg: Triple
     frequency_hz: Positive
     duration_s: Duration
 
@@ -152,7 +161,7 @@ class ChirpConfig(ConfigModel):
     """
 
     kind: Literal["chirp"]
-    amplitude_deg: tuple[Number, Number, Number]
+    amplitude_deg: Triple
     from_hz: Positive
     to_hz: Positive
     duration_s: Duration
@@ -227,7 +236,7 @@ class BumpConfig(ConfigModel):
     """
 
     kind: Literal["bump"]
-    rate_deg_s: RatesDegS
+    rate_deg_s: Spins
     duration_s: Duration
     caught_after_s: Duration | None = None
 

@@ -12,10 +12,18 @@ from skysim.core.errors import InputError
 from skysim.core.units import (
     Ascending,
     ConfigModel,
+    Declination,
+    Duration,
     Fraction,
+    Fractions,
     Length,
+    Magnitude,
     Number,
-    Time,
+    Position,
+    RightAscension,
+    Seed,
+    Spin,
+    Temperature,
     check_table,
 )
 from skysim.core.yaml_reader import existing_file
@@ -103,7 +111,6 @@ class AirConfig(ConfigModel):
 
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
-Temperature = Annotated[Number, Field(ge=-150, le=150)]
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
 
 
@@ -128,8 +135,8 @@ class SineTemperatureConfig(ConfigModel):
     kind: Literal["sine"]
     mean_c: Temperature
     amplitude_c: Annotated[Number, Field(gt=0, le=100)]
-    period_s: Annotated[Time, Field(gt=0)]
-    phase_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+    period_s: Duration
+    phase_deg: Spin = 0.0
 
 
 class TemperatureTableConfig(ConfigModel):
@@ -179,7 +186,7 @@ class ThermalConfig(ConfigModel):
     speed: Annotated[Number, Field(ge=1, le=1e5)] = 1.0
     dome_ppm_k: Coefficient = 0.0
     anchor_height_m: Length = 0.0
-    creep_m: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    creep_m: Position = (0.0, 0.0, 0.0)
     mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
     lens_ppm_k: Coefficient = 0.0
 
@@ -202,7 +209,7 @@ class ThermalConfig(ConfigModel):
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
 ElementsFile = Annotated[str, AfterValidator(existing_file)]
-Magnitude = Annotated[Number, Field(ge=-30, le=30)]
+ExclusionAngle = Annotated[Number, Field(ge=0, lt=180)]
 Rate = Annotated[Number, Field(gt=0, le=30)]
 
 
@@ -224,7 +231,7 @@ class RandomSatellitesConfig(ConfigModel):
     per_field: Annotated[Number, Field(gt=0, le=1000)]
     rate_deg_s: tuple[Rate, Rate] = (0.05, 1.5)
     v_mag: tuple[Magnitude, Magnitude] = (2.0, 8.0)
-    seed: Annotated[int, Field(ge=0)]
+    seed: Seed
 
     @model_validator(mode="after")
     def check_ranges(self) -> Self:
@@ -274,9 +281,9 @@ class ExclusionConfig(ConfigModel):
         Least number of stars to `tracker.limit_mag` in a round field of the detector's area
     """
 
-    sun_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
-    earth_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
-    moon_deg: Annotated[Number, Field(ge=0, lt=180)] = 0.0
+    sun_deg: ExclusionAngle = 0.0
+    earth_deg: ExclusionAngle = 0.0
+    moon_deg: ExclusionAngle = 0.0
     stars: Annotated[int, Field(ge=0)] = 4
 
 
@@ -324,8 +331,8 @@ class CircularOrbitConfig(OrbitConfig):
     kind: Literal["circular"]
     altitude_m: Annotated[Length, Field(ge=100e3, le=1e9)]
     inclination_deg: Annotated[Number, Field(ge=0, le=180)]
-    raan_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
-    argument_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
+    raan_deg: Spin = 0.0
+    argument_deg: Spin = 0.0
 
 
 class TleOrbitConfig(OrbitConfig):
@@ -357,6 +364,9 @@ Orbit = Annotated[
 # The scene section `background`: glow.
 
 
+ZenithDistance = Annotated[Number, Field(ge=0, lt=90)]
+
+
 class UniformGlowConfig(ConfigModel):
     """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
 
@@ -386,12 +396,12 @@ class MoonGlowConfig(ConfigModel):
     """
 
     kind: Literal["moon"]
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    ra_deg: RightAscension
+    dec_deg: Declination
     phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
     extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
-    moon_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
-    field_zenith_deg: Annotated[Number, Field(ge=0, lt=90)]
+    moon_zenith_deg: ZenithDistance
+    field_zenith_deg: ZenithDistance
 
 
 class StrayLightConfig(ConfigModel):
@@ -408,11 +418,11 @@ class StrayLightConfig(ConfigModel):
     """
 
     kind: Literal["stray"]
-    ra_deg: Annotated[Number, Field(ge=0, lt=360)]
-    dec_deg: Annotated[Number, Field(ge=-90, le=90)]
+    ra_deg: RightAscension
+    dec_deg: Declination
     v_mag: Number = SUN_V_MAG
     angle_deg: Ascending
-    pst: Annotated[tuple[Fraction, ...], Field(min_length=2)]
+    pst: Fractions
 
     @model_validator(mode="after")
     def check_columns(self) -> StrayLightConfig:

@@ -8,7 +8,21 @@ from pydantic import AfterValidator, Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
-from skysim.core.units import ConfigModel, Length, NotNegative, Number, Positive, Spin, Time
+from skysim.core.units import (
+    ConfigModel,
+    Delay,
+    Duration,
+    InnerFraction,
+    NotNegative,
+    Number,
+    Position,
+    Positive,
+    PositiveInt,
+    PositiveLength,
+    Seed,
+    Spins,
+    Time,
+)
 from skysim.core.yaml_reader import existing_file
 
 
@@ -40,7 +54,7 @@ class TotalStationConfig(ConfigModel):
     """
 
     kind: Literal["total_station"]
-    position_m: tuple[Length, Length, Length]
+    position_m: Position
     angle_sigma_arcsec: NumberError
     distance_sigma_m: LengthError
     distance_ppm: NumberError = 0.0
@@ -73,13 +87,13 @@ class SurveyErrorsConfig(ConfigModel):
         Seed of the errors
     """
 
-    rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
-    surface_seed: Annotated[int, Field(ge=0)] | None = None
+    rotation_deg: Spins = (0.0, 0.0, 0.0)
+    surface_seed: Seed | None = None
     led_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
     lever_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
     focal_length_sigma_m: LengthError = 0.0
     instrument: TotalStationConfig | None = None
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
 
 
 class ExposureControlConfig(ConfigModel):
@@ -105,8 +119,8 @@ class ExposureControlConfig(ConfigModel):
     shortest_s: Annotated[Time, Field(ge=10e-6)] = 10e-6
     longest_s: Annotated[Time, Field(le=10.0)] = 50e-3
     step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
-    min_stars: Annotated[int, Field(ge=1)] = 4
-    overexposed_objects: Annotated[int, Field(ge=1)] = 4
+    min_stars: PositiveInt = 4
+    overexposed_objects: PositiveInt = 4
     saturated_px: Annotated[int, Field(ge=0)] = 1
 
     @model_validator(mode="after")
@@ -223,25 +237,25 @@ class TrackerConfig(ConfigModel):
     acceptance: Literal["evidence", "thesis"] = "evidence"
     cos_error: Annotated[Number, Field(ge=1e-12, le=0.1)] | None = None
     solver: str | None = None
-    threshold_sigma: Annotated[Number, Field(gt=0)] = 5.0
-    min_area_px: Annotated[int, Field(ge=1)] = 3
-    intensity_threshold: Annotated[Number, Field(gt=0, lt=1)] = 0.04
+    threshold_sigma: Positive = 5.0
+    min_area_px: PositiveInt = 3
+    intensity_threshold: InnerFraction = 0.04
     catalog: str = "hipparcos_hp6.5"
     limit_mag: Number = 6.0
-    centroid_sigma_px: Annotated[Number, Field(gt=0)] = 0.2
-    assumed_focal_length_m: Annotated[Length, Field(gt=0)] | None = None
+    centroid_sigma_px: Positive = 0.2
+    assumed_focal_length_m: PositiveLength | None = None
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
-    assumed_row_time_s: Annotated[Time, Field(ge=0)] | None = None
+    assumed_row_time_s: Delay | None = None
     gyro: bool = False
     orbit_velocity: bool = True
     refraction: bool = False
     brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
-    assumed_camera_body_m: tuple[Length, Length, Length] | None = None
+    assumed_camera_body_m: Position | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
     exposure_control: ExposureControlConfig | None = None
     decoder: DecoderConfig | None = None
     brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
-    assumed_attitude_deg: tuple[Spin, Spin, Spin] | None = None
+    assumed_attitude_deg: Spins | None = None
     magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
     computer: ComputerConfig | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
@@ -331,14 +345,14 @@ class FilterConfig(ConfigModel):
 
     arw_deg_sqrt_h: NotNegative = 0.07
     bias_deg_h: NotNegative = 1.0
-    bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
+    bias_time_s: Duration = 300.0
     scale_ppm: NotNegative = 0.0
     misalignment_arcsec: NotNegative = 0.0
     rate_limit_deg_s: Positive | None = None
     start_deg: Positive = 1.0
     start_bias_deg_h: Positive = 10.0
     systematic_arcsec: NotNegative = 1.0
-    systematic_time_s: Annotated[Time, Field(gt=0)] = 3600.0
+    systematic_time_s: Duration = 3600.0
     systematic_angle_deg: Positive = 10.0
     mounting_arcsec: NotNegative = 0.0
     mounting_drift_arcsec_sqrt_h: NotNegative = 0.0
@@ -351,10 +365,10 @@ class FilterConfig(ConfigModel):
     )
     gate_sigma: Positive = 5.0
     missed_per_h: Annotated[Number, Field(gt=0, lt=3600)] = 1e-4
-    wrong_share: Annotated[Number, Field(gt=0, lt=1)] = 1e-4
-    wrong_repeat: Annotated[Number, Field(gt=0, lt=1)] = 0.75
-    latency_s: Annotated[Time, Field(ge=0)] = 0.0
-    time_tag_sigma_s: Annotated[Time, Field(ge=0)] = 0.0
+    wrong_share: InnerFraction = 1e-4
+    wrong_repeat: InnerFraction = 0.75
+    latency_s: Delay = 0.0
+    time_tag_sigma_s: Delay = 0.0
 
     @model_validator(mode="after")
     def check_drift(self) -> FilterConfig:

@@ -12,6 +12,7 @@ from skysim.core.units import (
     Angles,
     ConfigModel,
     Damping,
+    Duration,
     Force,
     Imbalance,
     Inertia,
@@ -19,9 +20,13 @@ from skysim.core.units import (
     Mass,
     NotNegative,
     Number,
+    Position,
     Positive,
+    PositiveLength,
     QuadraticDrag,
+    Seed,
     Spin,
+    Spins,
     Stiffness,
     Time,
     Torque,
@@ -129,8 +134,8 @@ class TrimConfig(ConfigModel):
     """
 
     position_m: tuple[Length, ...] = ()
-    travel_m: Annotated[Length, Field(gt=0)] = 0.02
-    step_m: Annotated[Length, Field(gt=0)] = 1e-6
+    travel_m: PositiveLength = 0.02
+    step_m: PositiveLength = 1e-6
 
     @model_validator(mode="after")
     def check_positions(self) -> TrimConfig:
@@ -156,7 +161,7 @@ class AirCurrentConfig(ConfigModel):
     """Air currents: a random torque about each lab axis, correlated over the correlation time."""
 
     rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
-    correlation_s: Annotated[Time, Field(gt=0)] = 2.0
+    correlation_s: Duration = 2.0
 
 
 class DisturbancesConfig(ConfigModel):
@@ -199,7 +204,7 @@ class GyroConfig(ConfigModel):
 
     arw_deg_sqrt_h: NotNegative = 0.07
     bias_deg_h: NotNegative = 1.0
-    bias_time_s: Annotated[Time, Field(gt=0)] = 300.0
+    bias_time_s: Duration = 300.0
     turn_on_bias_deg_h: NumberError = 1.0  # assumed
     scale_ppm: NumberError = 100.0  # assumed
     misalignment_arcsec: NumberError = 20.0  # assumed
@@ -212,7 +217,7 @@ class AccelerometerConfig(ConfigModel):
 
     vrw_ug_sqrt_hz: NotNegative = 50.0
     bias_ug: NotNegative = 50.0
-    bias_time_s: Annotated[Time, Field(gt=0)] = 60.0
+    bias_time_s: Duration = 60.0
     turn_on_bias_ug: NumberError = 300.0
     scale_ppm: NumberError = 300.0
     misalignment_arcsec: NumberError = 20.0
@@ -241,7 +246,7 @@ class ImuConfig(ConfigModel):
     accelerometer: AccelerometerConfig = AccelerometerConfig()
     earth_rate: Literal["none", "uncompensated", "compensated"] = "none"
     home_error_deg: Angles = (0.0, 0.0, 0.0)
-    hardware_seed: Annotated[int, Field(ge=0)] = 200
+    hardware_seed: Seed = 200
 
 
 class GimbalsConfig(ConfigModel):
@@ -296,9 +301,9 @@ class VehicleConfig(ConfigModel):
     mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
     mass_kg: Annotated[Mass, Field(gt=0)] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
-    center_of_mass_m: tuple[Length, Length, Length] | None = None
-    camera_m: tuple[Length, Length, Length] | None = None
-    camera_rotation_deg: tuple[Spin, Spin, Spin] = (0.0, 0.0, 0.0)
+    center_of_mass_m: Position | None = None
+    camera_m: Position | None = None
+    camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None
@@ -352,4 +357,4 @@ class SiteConfig(ConfigModel):
     latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8
     longitude_deg: Annotated[Number, Field(ge=-180, le=360)] | None = None
     height_m: Annotated[Length, Field(ge=-500, le=10_000)] = 0.0
-    x_azimuth_deg: Annotated[Number, Field(ge=-360, le=360)] = 90.0
+    x_azimuth_deg: Spin = 90.0

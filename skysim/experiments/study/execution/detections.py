@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -107,7 +108,7 @@ def simulate_detections(
     xy_px: Floats,
     electrons: Floats,
     scene: Scene,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Centroids:
     """Simulated detections, brightest first: some true sources missed, all with noise, false detections added.
 
@@ -144,7 +145,7 @@ def simulate_detections(
 
 
 def with_direction_noise(
-    xy_px: Floats, sigma_rad: float, scene: Scene, rng: np.random.Generator
+    xy_px: Floats, sigma_rad: float, scene: Scene, rng: Generator
 ) -> Floats:
     """(N, 2) images of directions with normal errors of every component of the unit vector.
 
@@ -162,7 +163,7 @@ def solve_coded(
     tracker: CodedTracker,
     trial: CentroidTrial,
     lab_from_body: Rotation,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Floats, Report]:
     """(N, 2) true pixel positions, and the report of the first frame with an attitude, or of the code's last one."""
     lab = lab.in_run(int(rng.integers(2**62)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from math import nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +21,6 @@ from skysim.core.jit import jit
 from skysim.core.types import Floats, Telemetry, Truth
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 from skysim.tracking.computer_time import total
@@ -107,41 +107,41 @@ class Outcome:
     frames: int = 0
     solved: int = 0
     wrong: int = 0
-    x_arcsec: float = math.nan
-    y_arcsec: float = math.nan
-    roll_arcsec: float = math.nan
-    nees: float = math.nan
-    stars: float = math.nan
-    detected: float = math.nan
-    matched: float = math.nan
-    availability: float = math.nan
-    filter_arcsec: float = math.nan
-    filter_worst_arcsec: float = math.nan
-    drift_arcsec: float = math.nan
-    pointing_arcsec: float = math.nan
-    pointing_worst_arcsec: float = math.nan
-    saturated_s: float = math.nan
+    x_arcsec: float = nan
+    y_arcsec: float = nan
+    roll_arcsec: float = nan
+    nees: float = nan
+    stars: float = nan
+    detected: float = nan
+    matched: float = nan
+    availability: float = nan
+    filter_arcsec: float = nan
+    filter_worst_arcsec: float = nan
+    drift_arcsec: float = nan
+    pointing_arcsec: float = nan
+    pointing_worst_arcsec: float = nan
+    saturated_s: float = nan
     ambiguous: int = 0
-    misidentified: float = math.nan
-    roll_noise: float = math.nan
-    misled: float = math.nan
-    wrong_matches: float = math.nan
-    centroid_px: float = math.nan
-    lights_detected: float = math.nan
-    false_detections: float = math.nan
-    streak_px: float = math.nan
-    angles_compared: float = math.nan
-    exposure_ms: float = math.nan
-    lab_from_body_w: float = math.nan
-    lab_from_body_x: float = math.nan
-    lab_from_body_y: float = math.nan
-    lab_from_body_z: float = math.nan
-    body_tilt_deg: float = math.nan
-    body_azimuth_deg: float = math.nan
-    boresight_ra_deg: float = math.nan
-    boresight_dec_deg: float = math.nan
-    detect_ms: float = field(default=math.nan, compare=False)
-    computer_ms: float = field(default=math.nan, compare=False)
+    misidentified: float = nan
+    roll_noise: float = nan
+    misled: float = nan
+    wrong_matches: float = nan
+    centroid_px: float = nan
+    lights_detected: float = nan
+    false_detections: float = nan
+    streak_px: float = nan
+    angles_compared: float = nan
+    exposure_ms: float = nan
+    lab_from_body_w: float = nan
+    lab_from_body_x: float = nan
+    lab_from_body_y: float = nan
+    lab_from_body_z: float = nan
+    body_tilt_deg: float = nan
+    body_azimuth_deg: float = nan
+    boresight_ra_deg: float = nan
+    boresight_dec_deg: float = nan
+    detect_ms: float = field(default=nan, compare=False)
+    computer_ms: float = field(default=nan, compare=False)
 
 
 FIELDS = tuple(one.name for one in fields(Outcome) if one.compare)
@@ -149,6 +149,17 @@ FIELDS = tuple(one.name for one in fields(Outcome) if one.compare)
 IDENTITY = ("misidentified", "roll_noise", "misled", "wrong_matches")
 FAILED = Outcome("failed")
 DIRECTION = FIELDS[-8:]  # attitude and direction
+# Values of which a flight has the mean over the frames that have one.
+MEANS = (
+    "detected",
+    "matched",
+    "lights_detected",
+    "false_detections",
+    "streak_px",
+    "angles_compared",
+    "detect_ms",
+    "computer_ms",
+)
 
 
 class TrueLights(NamedTuple):
@@ -195,7 +206,7 @@ def score(
     lab_from_body = quaternion.from_rotation(lights.lab_from_body)
     cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
-    streak_px = math.nan
+    streak_px = nan
     if lights.streak_px is not None and len(lights.streak_px):
         streak_px = float(np.median(lights.streak_px))
     reach_px = SAME_LIGHT_PX + (0.0 if math.isnan(streak_px) else streak_px / 2)
@@ -205,14 +216,14 @@ def score(
         "detected": len(centroids_px),
         "matched": len(solution.match.observed) if solution.match else 0,
         "ambiguous": int(solution.status.startswith(AMBIGUOUS)),
-        **dict.fromkeys(IDENTITY, 0.0 if own_tracker else math.nan),
+        **dict.fromkeys(IDENTITY, 0.0 if own_tracker else nan),
         "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
         "lights_detected": near(lights.flux_xy_px, centroids_px, reach_px),
         "false_detections": len(centroids_px)
         - near(centroids_px, lights.flux_xy_px, reach_px),
         "streak_px": streak_px,
-        "angles_compared": solution.angles_compared or math.nan,
-        "detect_ms": 1e3 * report.seconds.get("detect", math.nan),
+        "angles_compared": solution.angles_compared or nan,
+        "detect_ms": 1e3 * report.seconds.get("detect", nan),
         "computer_ms": 1e3 * total(lab.scene.tracker.computer, report.seconds),
         **directions(lab, lab_from_body, cam_from_lab),
     }
@@ -244,7 +255,7 @@ def error_and_nees(solution: Attitude, cam_from_lab: Floats) -> tuple[Floats, fl
         quaternion.multiply(estimate, quaternion.inverse(cam_from_lab))
     )
     covariance = solution.covariance_rad2
-    return error, math.nan if covariance is None else float(
+    return error, nan if covariance is None else float(
         error @ np.linalg.solve(covariance, error)
     )
 
@@ -305,7 +316,7 @@ def count_wrong_matches(
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
     """RMS error of the centroids about each axis, of those within reach_px of a true image; NaN if there are none."""
     if not len(centroids_px) or not len(true_px):
-        return math.nan
+        return nan
     _, distance_px = nearest_light(centroids_px, true_px)
     distance_px = distance_px[distance_px <= reach_px]
     return rms(distance_px) / math.sqrt(2)
@@ -343,7 +354,7 @@ def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[st
     """The columns DIRECTION of an attitude."""
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
     z = np.array([0.0, 0.0, 1.0])
-    if isinstance(lab.scene.light, DomeConfig):
+    if lab.scene.dome:
         x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
         values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
         values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360
@@ -389,29 +400,22 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         y,
         roll,
         mean([one.nees for one in solved]),
-        min((one.stars for one in outcomes), default=math.nan),
-        mean([one.detected for one in outcomes]),
-        mean([one.matched for one in outcomes]),
-        mean(error < limit) if len(error) else mean(good),
-        rms(error),
-        float(error.max()) if len(error) else math.nan,
-        rms(error[-quarter:]) - rms(error[:quarter]) if quarter else math.nan,
-        rms(pointing),
-        float(pointing.max()) if len(pointing) else math.nan,
-        saturated_s(log, settle_s) if len(pointing) else math.nan,
-        sum(one.ambiguous for one in outcomes),
+        min((one.stars for one in outcomes), default=nan),
+        availability=mean(error < limit) if len(error) else mean(good),
+        filter_arcsec=rms(error),
+        filter_worst_arcsec=float(error.max()) if len(error) else nan,
+        drift_arcsec=rms(error[-quarter:]) - rms(error[:quarter]) if quarter else nan,
+        pointing_arcsec=rms(pointing),
+        pointing_worst_arcsec=float(pointing.max()) if len(pointing) else nan,
+        saturated_s=saturated_s(log, settle_s) if len(pointing) else nan,
+        ambiguous=sum(one.ambiguous for one in outcomes),
         **{
-            name: sum(getattr(one, name) for one in outcomes) if outcomes else math.nan
+            name: sum(getattr(one, name) for one in outcomes) if outcomes else nan
             for name in IDENTITY
         },
         centroid_px=rms(finite([one.centroid_px for one in outcomes])),
-        lights_detected=mean([one.lights_detected for one in outcomes]),
-        false_detections=mean([one.false_detections for one in outcomes]),
-        streak_px=mean(finite([one.streak_px for one in outcomes])),
-        angles_compared=mean(finite([one.angles_compared for one in outcomes])),
-        exposure_ms=outcomes[-1].exposure_ms if outcomes else math.nan,
-        detect_ms=mean(finite([one.detect_ms for one in outcomes])),
-        computer_ms=mean(finite([one.computer_ms for one in outcomes])),
+        **{name: mean(finite([getattr(one, name) for one in outcomes])) for name in MEANS},
+        exposure_ms=outcomes[-1].exposure_ms if outcomes else nan,
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 
@@ -441,9 +445,9 @@ def finite(values: list[float]) -> Floats:
 
 def rms(values: list[float] | Floats) -> float:
     """Root mean square; NaN without values."""
-    return float(metrics.rms(np.asarray(values))) if len(values) else math.nan
+    return float(metrics.rms(np.asarray(values))) if len(values) else nan
 
 
 def mean(values: list[Any] | NDArray[Any]) -> float:
     """Mean; NaN without values."""
-    return float(np.mean(values)) if len(values) else math.nan
+    return float(np.mean(values)) if len(values) else nan

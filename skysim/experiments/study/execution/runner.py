@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image
 from skysim.core.types import Frame, Truth
+from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.outcomes import FIELDS
@@ -173,7 +174,7 @@ def chunk_seconds(workers: int) -> float:
 
 
 def prepare_store(
-    plan: Plan, store: Store, resume: bool, overrides: Mapping[str, str] | None = None
+    plan: Plan, store: Store, resume: bool, overrides: OverrideTexts | None = None
 ) -> None:
     """Initialize a store for a plan, or check that it belongs to the plan.
 

@@ -32,7 +32,7 @@ from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.results.files import row_parts
-from skysim.results.files.row_parts import Part, Rows, Source
+from skysim.results.files.row_parts import Array, Part, Rows, Source
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 10  # raised when the columns of `trials` or `timings` change
@@ -417,12 +417,12 @@ class Store:
                 raise ValueError(f"replicates {replicates}")
             return replicates
 
-    def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, NDArray[Any]]:
+    def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, Array]:
         """The columns of rows in SQLite, in trial order."""
         query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
         cursor = self.db.execute(query, values)
         texts = dict[Any, Any]()
-        batches: list[list[NDArray[Any]]] = [[to_array(name, (), texts)] for name in COLUMNS]
+        batches: list[list[Array]] = [[to_array(name, (), texts)] for name in COLUMNS]
         with self.corruption_as_input_error():
             while rows := cursor.fetchmany(10_000):
                 for name, arrays, column in zip(
@@ -474,7 +474,7 @@ def to_sql(value: Any) -> Any:
     return value
 
 
-def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> NDArray[Any]:
+def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> Array:
     """A column as an array: objects for text, int64 for integers, otherwise floats with NaN for null.
 
     Parameters

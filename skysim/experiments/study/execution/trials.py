@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from estimator.core.errors import ImageError
@@ -57,7 +58,6 @@ from skysim.experiments.study.plan import (
     TrialSpec,
 )
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import StarCamera, UserParts
@@ -268,7 +268,7 @@ def solved_centroids(
     return list(zip(lights, reports, strict=True))
 
 
-def streams(setup: TrialSetup, seed: int) -> tuple[np.random.Generator, np.random.Generator]:
+def streams(setup: TrialSetup, seed: int) -> tuple[Generator, Generator]:
     """Random generators of a trial's attitude and of its noise; `noise_seed` changes only the noise."""
     trial = setup.trial
     assert isinstance(trial, CentroidTrial | FrameTrial)
@@ -339,12 +339,12 @@ TRIALS: dict[str, Callable[[TrialSetup, Sequence[int]], list[Outcome]]] = {
 # Parts of trials.
 
 
-def random_attitude(setup: TrialSetup, rng: np.random.Generator) -> Rotation:
+def random_attitude(setup: TrialSetup, rng: Generator) -> Rotation:
     """Random lab_from_body, see `random_attitudes`."""
     return random_attitudes(setup, [rng])[0]
 
 
-def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> Rotation:
+def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     """N random lab_from_body, each drawn by its own generator.
 
     Under a dome: tilt uniform in solid angle within `tilt_deg`, tilt direction and yaw uniform. Otherwise: boresight
@@ -356,7 +356,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[np.random.Generator]) -> 
     assert attitudes is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if isinstance(lab.scene.light, DomeConfig):
+    if lab.scene.dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         least = math.cos(math.radians(high))
@@ -467,7 +467,7 @@ def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     return MovingCamera(camera, trajectory, streak)
 
 
-def attitude_and_axis(setup: TrialSetup, rng: np.random.Generator) -> tuple[Rotation, Floats]:
+def attitude_and_axis(setup: TrialSetup, rng: Generator) -> tuple[Rotation, Floats]:
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
     lab_from_body = random_attitude(setup, rng)

@@ -15,7 +15,7 @@ from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
 from skysim.experiments.study.table import (
     Axis,
-    PointRow,
+    PointRows,
     axis,
     is_sampled,
     label,
@@ -118,7 +118,7 @@ GRAY = "#8fa1b3"
 ORANGE = "#d55e00"
 
 
-def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) -> bytes:
+def figure_png(lines: PointRows, figure: Curve | Heat, study: Study) -> bytes:
     """A curve or heat map as PNG. Raises InputError if its `where` names an unknown factor or level."""
     if isinstance(figure, Curve):
         return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
@@ -134,7 +134,7 @@ def figure_png(lines: Sequence[PointRow], figure: Curve | Heat, study: Study) ->
 # Curves.
 
 
-def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study) -> None:
+def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
     """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
     axes = fig.subplots()
     x_axis = axis(study, lines, figure.x)
@@ -170,7 +170,7 @@ def draw_curve(fig: Any, lines: Sequence[PointRow], figure: Curve, study: Study)
 
 
 def draw_thresholds(
-    axes: Any, figure: Curve, study: Study, lines: Sequence[PointRow], group_axis: Axis | None
+    axes: Any, figure: Curve, study: Study, lines: PointRows, group_axis: Axis | None
 ) -> None:
     """Draw the thresholds of this curve: the limit dashed, a tick at each crossing and a bar over its interval."""
     for threshold in thresholds_of(figure, study, lines):
@@ -397,7 +397,7 @@ def write_values(axes: Any, cells: Grid, image: Any) -> None:
         axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
 
 
-def draw_scatter(fig: Any, lines: Sequence[PointRow], figure: Heat, study: Study) -> None:
+def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None:
     """Draw sampled points over two factors, colored by response."""
     axes = fig.subplots()
     points = shown_points(lines, figure, study)

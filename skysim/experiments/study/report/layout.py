@@ -16,7 +16,7 @@ from skysim.core.types import Floats
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.experiments.study.table import (
     Axis,
-    PointRow,
+    PointRows,
     axis,
     distinct,
     fixed_levels,
@@ -108,7 +108,7 @@ def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
 # Selection of figures and of their points.
 
 
-def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
+def figures(study: Study, lines: PointRows) -> list[Figure]:
     """The figures of the study file; if it has none, automatic figures of the responses, about MOST_FIGURES at most.
 
     With sampled points and with one factor at a time, each response is drawn against each factor. Otherwise it is
@@ -140,7 +140,7 @@ def figures(study: Study, lines: Sequence[PointRow]) -> list[Figure]:
 
 
 def automatic_figure(
-    x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: Sequence[PointRow]
+    x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: PointRows
 ) -> Figure:
     """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
@@ -152,7 +152,7 @@ def automatic_figure(
     return Curve(kind="curve", x=x, y=y, by=by, log=log)
 
 
-def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Series]:
+def series(lines: PointRows, figure: Curve, study: Study) -> list[Series]:
     """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of GROUPS equal groups."""
     x_axis = axis(study, lines, figure.x)
     found = []
@@ -169,7 +169,7 @@ def series(lines: Sequence[PointRow], figure: Curve, study: Study) -> list[Serie
     return found
 
 
-def grid(lines: Sequence[PointRow], figure: Heat, study: Study) -> Grid:
+def grid(lines: PointRows, figure: Heat, study: Study) -> Grid:
     """The axes and cell values of a heat map."""
     x = axis(study, lines, figure.x)
     y = axis(study, lines, figure.y)
@@ -230,16 +230,14 @@ def expected_value(name: str) -> float | None:
 
 
 def panels(
-    lines: Sequence[PointRow], search: Search, costs: Mapping[int, float] | None
+    lines: PointRows, search: Search, costs: Mapping[int, float] | None
 ) -> dict[str, Panel]:
     """One panel per objective, constrained response and, if costs are given, cost; by name."""
     names = dict.fromkeys(search.responses + ["cost"] * (costs is not None))
     return {name: panel(name, lines, search, costs or {}) for name in names}
 
 
-def panel(
-    name: str, lines: Sequence[PointRow], search: Search, costs: Mapping[int, float]
-) -> Panel:
+def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
     """The panel of one response, or of `cost`, over the candidates."""
     nan = float("nan")
     if name == "cost":
@@ -261,7 +259,7 @@ def panel(
 # Captions.
 
 
-def caption(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
+def caption(figure: Figure, study: Study, lines: PointRows) -> str:
     """Caption of a figure: its axes, the fixed levels, the number of trials per point, and the markers used."""
     value = figure.response
     shown = shown_points(lines, figure, study)
@@ -298,7 +296,7 @@ def caption_title(figure: Figure) -> str:
     return f"{figure.value} by direction" + (f" and {figure.by}" if figure.by else "")
 
 
-def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
+def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
     varied = {
         name
@@ -311,7 +309,7 @@ def fixed_text(figure: Figure, study: Study, lines: Sequence[PointRow]) -> str:
 
 
 def curve_note(
-    figure: Curve, study: Study, lines: Sequence[PointRow], summaries: Sequence[Summary]
+    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[Summary]
 ) -> str:
     """The meaning of the lines and bars of a curve."""
     x_axis = axis(study, lines, figure.x)

@@ -21,7 +21,7 @@ from skysim.experiments.study.report.figures import (
     is_light,
 )
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.table import PointRow, group_points
+from skysim.experiments.study.table import PointRows, group_points
 from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
@@ -79,7 +79,7 @@ class DirectionMap(NamedTuple):
 
 
 def direction_maps(
-    lines: Sequence[PointRow], figure: Map, study: Study, columns_of: ColumnsOf
+    lines: PointRows, figure: Map, study: Study, columns_of: ColumnsOf
 ) -> list[DirectionMap]:
     """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
     panels = []
@@ -321,7 +321,7 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
 
 
 def caption(
-    panels: Sequence[DirectionMap], figure: Map, study: Study, lines: Sequence[PointRow]
+    panels: Sequence[DirectionMap], figure: Map, study: Study, lines: PointRows
 ) -> str:
     """Caption of a map: its response, the fixed levels, the meaning of directions, and the numbers in the cells."""
     text = caption_title(figure) + fixed_text(figure, study, lines)

@@ -14,19 +14,24 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.trials import rate_axis
-from skysim.experiments.study.factors import Distribution, Factor, Point, Range, make_point
+from skysim.experiments.study.factors import (
+    Distribution,
+    Factor,
+    Option,
+    Point,
+    Range,
+    make_point,
+)
 from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
 from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguity
 from skysim.experiments.study.table import format_level
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
-Level = tuple[object, dict[str, object]]  # value, settings
 MAX_CHECKED = (
     16  # maximum number of scenes that are checked: building one takes up to a second
 )
@@ -76,7 +81,7 @@ def overview(plan: Plan) -> Overview:
         except InputError:
             continue
         checked += 1
-        if isinstance(scene.light, DomeConfig):
+        if scene.dome:
             leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
@@ -93,11 +98,7 @@ def overview(plan: Plan) -> Overview:
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
     drawn = trial.start if isinstance(trial, FlightTrial) else trial
-    return (
-        None
-        if drawn is None or not isinstance(scene.light, DomeConfig)
-        else float(np.max(drawn.tilt_deg))
-    )
+    return None if drawn is None or not scene.dome else float(np.max(drawn.tilt_deg))
 
 
 def with_leds(levels: str, leds: Mapping[str, int]) -> str:
@@ -165,7 +166,7 @@ def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:
     yield from named.items()
 
 
-def ends(levels: list[Level]) -> list[Level]:
+def ends(levels: list[Option]) -> list[Option]:
     """The levels with the least and the greatest number; the first and the last one of levels without numbers."""
     numbers = [float(found[0]) for value, _ in levels if (found := NUMBER.match(str(value)))]
     if len(numbers) == len(levels):
@@ -173,7 +174,7 @@ def ends(levels: list[Level]) -> list[Level]:
     return [levels[0], levels[-1]] if len(levels) > 1 else levels
 
 
-def options(factor: Factor) -> list[Level]:
+def options(factor: Factor) -> list[Option]:
     """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
@@ -213,18 +214,17 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
 
 def light_text(scene: Scene, lab: Lab) -> str:
     """The light source in words."""
-    light = scene.light
-    if isinstance(light, DomeConfig):
-        surface = light.surface
-        layout = light.layout
+    if scene.dome:
+        surface = scene.dome.surface
+        layout = scene.dome.layout
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
         cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
         return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({layout.kind}){cap}"
-    if isinstance(light, StarsConfig):
+    if light := scene.stars:
         limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
         return f"{len(lab.camera.sources)} stars of {light.catalog}{limit}"
-    return light.kind.replace("_", " ")
+    return scene.light.kind.replace("_", " ")
 
 
 def camera_text(camera: CameraConfig) -> str:

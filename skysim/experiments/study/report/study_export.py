@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core import files
 from skysim.core.errors import InputError, unknown_name
 from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
-from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
+from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
 
 
 def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
@@ -47,7 +46,7 @@ def names_with_values(store: Store) -> list[str]:
     return [name for name in every if name not in empty] if some else every
 
 
-def has_values(column: NDArray[Any]) -> bool:
+def has_values(column: Array) -> bool:
     """Whether any value is neither None nor NaN."""
     return (
         any(value is not None for value in column)
@@ -56,7 +55,7 @@ def has_values(column: NDArray[Any]) -> bool:
     )
 
 
-def texts(column: NDArray[Any]) -> list[Any]:
+def texts(column: Array) -> list[Any]:
     """Values for CSV: an empty string for None and NaN."""
     values = column.tolist()
     return [value if value is not None and value == value else "" for value in values]

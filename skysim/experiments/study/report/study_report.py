@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from skysim.core.paths import STUDIES, shipped_files
 from skysim.core.types import Floats
+from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study import answer, search
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
@@ -20,7 +21,7 @@ from skysim.experiments.study.report.overview import Overview, overview
 from skysim.experiments.study.search import SearchResult
 from skysim.experiments.study.table import (
     Index,
-    PointRow,
+    PointRows,
     axis,
     cells,
     format_response,
@@ -92,7 +93,7 @@ class Analysis(NamedTuple):
         In place of the table of points: all points of a sampled design together
     """
 
-    lines: Sequence[PointRow]
+    lines: PointRows
     about: Overview
     verdict: str = ""
     headline: Sequence[str] = ()
@@ -139,9 +140,7 @@ def commands(
     return partial(shell_command, study, out, store.overrides())
 
 
-def shell_command(
-    study: str, out: Path | None, overrides: Mapping[str, str], verb: str
-) -> str:
+def shell_command(study: str, out: Path | None, overrides: OverrideTexts, verb: str) -> str:
     """The shell command that applies `verb` to a study."""
     words = ["skysim", "study", verb, study]
     if out:
@@ -296,7 +295,7 @@ def failures(store: Store, replay: str) -> Items:
 
 
 def points_section(
-    lines: Sequence[PointRow],
+    lines: PointRows,
     study: Study,
     front: Sequence[int],
     costs: Mapping[int, float] | None,
@@ -365,7 +364,7 @@ def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
     ]
 
 
-def range_table(study: Study, lines: Sequence[PointRow]) -> Table:
+def range_table(study: Study, lines: PointRows) -> Table:
     """The least and the largest value of each response, with their points."""
     heads = ("response", "least", "at", "largest", "at")
     return Table(
@@ -428,7 +427,7 @@ def runs_section(store: Store) -> Section:
 
 
 def study_figures(
-    lines: Sequence[PointRow], study: Study, columns_of: ColumnsOf, replay: str
+    lines: PointRows, study: Study, columns_of: ColumnsOf, replay: str
 ) -> list[Block]:
     """The study's figures: maps with tables of their worst trials, other figures with tables of their numbers.
 
@@ -478,7 +477,7 @@ def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
     return Table([*columns, text_column("repeat it")], rows)
 
 
-def pivot_table(figure: Curve | Heat, lines: Sequence[PointRow], study: Study) -> Table:
+def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
     """A figure's numbers: a column per level of x, a row per level of the other factor."""
     across = axis(study, lines, figure.x)
     other = figure.by if isinstance(figure, Curve) else figure.y
@@ -512,7 +511,7 @@ def sobol_figures(indices: Sequence[Index]) -> list[Figure]:
 
 
 def search_figures(
-    lines: Sequence[PointRow],
+    lines: PointRows,
     study: Study,
     front: Sequence[int],
     costs: Mapping[int, float] | None,
