@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -11,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from estimator.trackers.pipeline import Settings
+from skysim.apps.cli.options import command_line
 from skysim.apps.cli.terminal import print_error, progress, progress_callback
 from skysim.apps.plate_solver import read_camera
 from skysim.core import files
@@ -283,9 +282,7 @@ def write_report(
 
     path = request.folder / "report.html"
     statistics |= {"report": str(path)}
-    report = survey_report.survey_report(
-        statistics, run, shlex.join(["skysim", *sys.argv[1:]])
-    )
+    report = survey_report.survey_report(statistics, run, command_line())
     report.save(path)
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
     if not request.quiet:
