@@ -181,17 +181,24 @@ def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
     return texts
 
 
-def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
-    """A YAML mapping and its text. Raises InputError."""
+def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
+    """The text of a file. Raises InputError if it is too large, cannot be read or is not UTF-8."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(path, f"{path.stat().st_size} bytes", f"up to {MAX_BYTES}")
-        text = path.read_text(encoding="utf-8")
-        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
+        size = path.stat().st_size
+        if size > limit_bytes:
+            raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+        return path.read_text(encoding)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
         ) from error
+
+
+def read_yaml(path: Path) -> tuple[dict[str, Any], str]:
+    """A YAML mapping and its text. Raises InputError."""
+    text = read_limited(path, MAX_BYTES)
+    try:
+        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = Where(path, mark.line + 1 if mark else None)
