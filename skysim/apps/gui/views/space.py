@@ -6,6 +6,7 @@ A drag pulls at a point of the vehicle; frames show the motion.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -77,10 +78,7 @@ class Scene3D:
     def set_scene(self, scene_info: SceneInfo) -> None:
         lab = scene_info.geometry
         outside = lab.views["outside"]
-        distance_m = (
-            sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True))
-            ** 0.5
-        )
+        distance_m = math.dist(outside.eye_m, outside.target_m)
         self.canvas.run_method(
             "build",
             {
