@@ -250,13 +250,14 @@ class Guard:
         # The token is removed from the address.
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
-            response.set_cookie(
-                self.cookie, self.token, path="/", httponly=True, samesite="strict"
-            )
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            response.set_cookie(
-                USER, user, YEAR_S, path="/", httponly=True, samesite="strict"
-            )
+            for name, value, age_s in (
+                (self.cookie, self.token, None),
+                (USER, user, YEAR_S),
+            ):
+                response.set_cookie(
+                    name, value, age_s, path="/", httponly=True, samesite="strict"
+                )
             return response
         if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None

@@ -141,12 +141,13 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
-        names = [
+        names = sorted(
             child
-            for child in names
-            if child.name[0] != "." and not child.name.endswith(ANNOTATED)
-        ]
+            for child in path.iterdir()
+            if images.image_suffix(child.name)
+            and child.name[0] != "."
+            and not child.name.endswith(ANNOTATED)
+        )
         if not names:
             raise InputError(
                 path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES)
