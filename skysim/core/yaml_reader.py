@@ -393,15 +393,13 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     value = excerpt(repr(error["input"]))
     if kind not in EXPECTED:
         return InputError("", f"{value} is not allowed: {error['msg']}")
-    limits = {name: plain_number(limit) for name, limit in context.items()}
+    limits = {  # numbers without an exponent, such as 0.000001
+        name: f"{Decimal(repr(limit)).normalize():f}" if isinstance(limit, float) else limit
+        for name, limit in context.items()
+    }
     if kind == "string_pattern_mismatch":
         limits["pattern"] = PATTERNS[limits["pattern"]]
     return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
-
-
-def plain_number(value: Any) -> Any:
-    """The text of a float without an exponent, such as 0.000001; other values unchanged."""
-    return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
 
 
 def where_of(keys: list[str], files: Files, overrides: Mapping[str, str]) -> Where | None:

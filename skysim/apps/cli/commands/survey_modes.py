@@ -181,22 +181,16 @@ def followed(
             for complaint in news.complaints:
                 print_error(str(complaint))
             if news.read and not request.quiet:
-                print_so_far(request, watched.pictures, before, stages)
+                pictures = watched.pictures
+                found = survey_images.frames_with_attitude(
+                    pictures, before, request.uncertainty, stages
+                )
+                print(
+                    f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude"
+                )
+                if found:
+                    print_coverage(request, found, before, None)
     return watched.pictures
-
-
-def print_so_far(
-    request: Request,
-    pictures: list[survey_images.SurveyImage],
-    before: CalibrationPrior,
-    stages: Settings,
-) -> None:
-    """Print the number of images, the LEDs that they measure, and the attitudes to hold next."""
-
-    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
-    print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
-    if found:
-        print_coverage(request, found, before, None)
 
 
 @contextmanager

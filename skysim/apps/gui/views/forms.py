@@ -172,28 +172,13 @@ def section_fields(
         elif file_key == "kind" and kinds:
             yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
-            subtree = short_path(subtree)
-            text = (
-                yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            )
-            yield FormField(
-                key, text, display_unit(file_key), allowed_values(annotation), is_set
-            )
-
-
-def short_path(value: Any) -> Any:
-    """Shorten the path of a shipped file to its name in scenes/."""
-    return (
-        str(Path(value).relative_to(SCENES))
-        if isinstance(value, str) and value.startswith(str(SCENES))
-        else value
-    )
-
-
-def display_unit(file_key: str) -> str:
-    """The unit of a number without unit, from the suffix of its key."""
-    match = UNIT_SUFFIX.search(file_key)
-    return DISPLAY_UNITS[match[1]] if match else ""
+            # The path of a shipped file is shortened to its name in scenes/.
+            if isinstance(subtree, str) and subtree.startswith(str(SCENES)):
+                subtree = str(Path(subtree).relative_to(SCENES))
+            text = yaml_line(subtree if is_set else file_value(value, si_unit(name)))
+            match = UNIT_SUFFIX.search(file_key)
+            unit = DISPLAY_UNITS[match[1]] if match else ""
+            yield FormField(key, text, unit, allowed_values(annotation), is_set)
 
 
 def allowed_values(annotation: Any) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.style import DARK, color_scale
@@ -83,7 +83,12 @@ class Scene3D:
             "build",
             {
                 "shapes": [shape_fields(shape) for shape in lab.shapes],
-                "lights": light_fields(lab),
+                "lights": {
+                    "id": lab.ids.tolist(),
+                    "place": lab.lights_m.round(DIGITS).ravel().tolist(),
+                    "radius": lab.radius_m.round(DIGITS).tolist(),
+                    "lit": lab.lit.tolist(),
+                },
                 "views": {name: view._asdict() for name, view in lab.views.items()},
                 "background": DARK["ground"],
                 "prefix": scene_info.prefix,
@@ -225,14 +230,4 @@ def shape_fields(shape: Shape) -> dict[str, Any]:
         "on_vehicle": shape.on_vehicle,
         "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
         "faces": shape.faces.ravel().tolist(),
-    }
-
-
-def light_fields(lab: LabGeometry) -> dict[str, Any]:
-    """The lights for space.js."""
-    return {
-        "id": lab.ids.tolist(),
-        "place": lab.lights_m.round(DIGITS).ravel().tolist(),
-        "radius": lab.radius_m.round(DIGITS).tolist(),
-        "lit": lab.lit.tolist(),
     }

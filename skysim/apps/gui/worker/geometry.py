@@ -116,12 +116,9 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
     # Depths along the boresight; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
-    return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
-
-
-def rounded(depth_m: Floats) -> list[float | None]:
-    """Depths to 0.01 mm; None for a ray that meets nothing."""
-    return [None if np.isnan(value) else round(float(value), 5) for value in depth_m]
+    # To 0.01 mm; None for such a ray.
+    depths_m = (None if math.isnan(depth) else round(depth, 5) for depth in depth_m.tolist())
+    return Pose(rotation, tuple(place_m.tolist()), tuple(depths_m))
 
 
 def solved_pose(attitude: Attitude) -> Pose | None:
