@@ -328,16 +328,16 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     camera = solver.camera
     if camera is None:
         return
-    if camera.detector and image.ndim != 2:
-        raise InputError(
-            path, f"a color image of shape {image.shape}; this camera's are monochrome"
-        )
-    bits = camera.detector.bits if camera.detector else 0
-    if image.dtype == np.uint8 and bits > 8:
-        raise InputError(
-            path,
-            f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF",
-        )
+    if detector := camera.detector:
+        if image.ndim != 2:
+            raise InputError(
+                path, f"a color image of shape {image.shape}; this camera's are monochrome"
+            )
+        if image.dtype == np.uint8 and detector.bits > 8:
+            raise InputError(
+                path,
+                f"an 8-bit image; this camera's have {detector.bits} bits, in 16-bit FITS, PNG or TIFF",
+            )
     height_px, width_px = image.shape[:2]
     model = camera.model
     if (width_px, height_px) != (model.width_px, model.height_px):
