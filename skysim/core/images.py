@@ -6,7 +6,6 @@ read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`)
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import gzip
 import math
@@ -15,7 +14,7 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -106,7 +105,7 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
     from astropy.utils.exceptions import AstropyWarning
 
     packed = path.suffix.lower() == ".gz"
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         plain = path
         if packed:
             temporary = stack.enter_context(tempfile.NamedTemporaryFile(prefix="skysim-"))
@@ -216,10 +215,10 @@ def header_values(*headers: Any) -> dict[str, Any]:
     found: dict[str, str] = {}
     for header in reversed(headers):
         for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
-            with contextlib.suppress(Exception):  # of many types, for a damaged card
+            with suppress(Exception):  # of many types, for a damaged card
                 found[key] = str(header[key]).strip()
     date_utc = None
-    with contextlib.suppress(ValueError):
+    with suppress(ValueError):
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
     top_down = TOP_DOWN.get(found.get("ROWORDER", "").upper())
     return {
@@ -234,7 +233,7 @@ def header_values(*headers: Any) -> dict[str, Any]:
 def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
     """The first finite number under these keys."""
     for key in keys:
-        with contextlib.suppress(ValueError):
+        with suppress(ValueError):
             if math.isfinite(number := float(found.get(key, ""))):
                 return number
     return None
@@ -393,7 +392,7 @@ class LiveCamera:
 
 def video_numbers(path: Path) -> tuple[float, int]:
     """Frame rate in Hz and number of frames of a video, by its container. Raises InputError if it cannot be read."""
-    with contextlib.closing(LiveCamera(str(path))) as video:
+    with closing(LiveCamera(str(path))) as video:
         rate_hz = video.capture.get(cv2.CAP_PROP_FPS)
         count = int(video.capture.get(cv2.CAP_PROP_FRAME_COUNT))
     if not (rate_hz > 0 and count > 0):
@@ -403,5 +402,5 @@ def video_numbers(path: Path) -> tuple[float, int]:
 
 def grab_frame(source: str) -> NDArray:
     """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
-    with contextlib.closing(LiveCamera(source)) as camera:
+    with closing(LiveCamera(source)) as camera:
         return camera.frame()

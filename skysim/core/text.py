@@ -114,12 +114,14 @@ def seconds_since(
         try:
             times = Time(texts, format=kind, scale=scale).utc
         except ValueError:
-            n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
-            raise InputError(
-                source,
-                f"{excerpt(epochs[n])} is not a date and time",
-                where=Where(source, places[n], unit),
-            ) from None
+            for n, text in enumerate(texts):  # the first that is none by itself
+                try:
+                    Time(text, format=kind, scale=scale)
+                except ValueError:
+                    problem = f"{excerpt(epochs[n])} is not a date and time"
+                    where = Where(source, places[n], unit)
+                    raise InputError(source, problem, where=where) from None
+            raise
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
     try:
@@ -129,17 +131,6 @@ def seconds_since(
     except ValueError:
         raise InputError(source, "an epoch within a leap second", "other times") from None
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
-
-
-def is_time(text: str, kind: str, scale: str) -> bool:
-    """Whether astropy accepts the text as a time."""
-    from astropy.time import Time
-
-    try:
-        Time(text, format=kind, scale=scale)
-    except ValueError:
-        return False
-    return True
 
 
 def read_named_rows(
