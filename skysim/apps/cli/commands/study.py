@@ -250,6 +250,7 @@ def worst(
     json: Json = False,
 ) -> None:
     """Name the attitudes of the worst trials, and the commands that repeat them."""
+    from skysim.core.yaml_reader import parse_overrides, parse_yaml
     from skysim.experiments.study import worst as analysis
     from skysim.results import metrics
 
@@ -259,9 +260,11 @@ def worst(
         metrics.response(name, "response")
     with place.open() as stored:
         points = stored.points()
-        found = analysis.worst_of_levels(
-            plan.study, stored, name, chosen_levels(where or []), count
-        )
+        chosen = {
+            key: parse_yaml(text)[1]
+            for key, text in parse_overrides(where, "where", "FACTOR=LEVEL").items()
+        }
+        found = analysis.worst_of_levels(plan.study, stored, name, chosen, count)
     rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
     repeat = place.command("replay")
     if json:
@@ -270,16 +273,6 @@ def worst(
         instead = f"{place.command('worst')} --response roll_arcsec"
         levels = [points[one.point].levels for one in found]
         print_worst(analysis.ranked(name), found, levels, repeat, instead)
-
-
-def chosen_levels(words: list[str]) -> dict[str, Any]:
-    """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.yaml_reader import parse_overrides, parse_yaml
-
-    return {
-        key: parse_yaml(text)[1]
-        for key, text in parse_overrides(words, "where", "FACTOR=LEVEL").items()
-    }
 
 
 # Registered last to be the last in `skysim study --help`.

@@ -241,12 +241,12 @@ class MonteCarloPanel:
         ):
             return before
         self.run_number += 1
-        text = monte_carlo(*settings, self.run_number)
         folder = files.make_folder(
             self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}"
         )
-        files.write_text(folder / "monte_carlo.yaml", text)
-        return folder / "monte_carlo.yaml"
+        path = folder / "monte_carlo.yaml"
+        files.write_text(path, monte_carlo(*settings, self.run_number))
+        return path
 
     def effective_overrides(self, scene: str, trial: dict[str, Any]) -> dict[str, str]:
         """The changes of the scene that have an effect on a trial; a study with others would be refused."""

@@ -268,7 +268,7 @@ def with_kind(
 ) -> dict[str, str]:
     """Overrides that change a section's kind: to that of the file, or to another with the keys that it requires.
 
-    Keys that both kinds have keep their values.
+    Keys that both kinds have, with the same type, keep their values; sections do not.
     """
     rest = {
         key: text
@@ -289,16 +289,12 @@ def with_kind(
         )
         if field != "kind"
         and field in now.model_fields_set
-        and same_field(model, field, info.annotation)
+        and field in model.model_fields
+        and model.model_fields[field].annotation == info.annotation
+        and not models(info.annotation)
     }
     found = first_section(model, kind, kept) or first_section(model, kind)
     return rest | {section: yaml_line(found)}
-
-
-def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
-    """Whether a model has a field with this name and type that is not a section."""
-    field = model.model_fields.get(name)
-    return field is not None and field.annotation == annotation and not models(annotation)
 
 
 def section_at(scene: Scene, key: str) -> tuple[Any, Any]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude
 from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
@@ -119,13 +118,6 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     # To 0.01 mm; None for such a ray.
     depths_m = (None if math.isnan(depth) else round(depth, 5) for depth in depth_m.tolist())
     return Pose(rotation, tuple(place_m.tolist()), tuple(depths_m))
-
-
-def solved_pose(attitude: Attitude) -> Pose | None:
-    """The tracker's attitude of an image from elsewhere; None if it was not solved."""
-    if attitude.cam_from_ref is None:
-        return None
-    return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
 
 
 # Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity.
