@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
@@ -11,7 +10,7 @@ import re
 import shutil
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ TEMPORARY_NAME = re.compile(rf"\..+\.skysim-{HOST}-(\d{{1,9}})(\.\w+)?")
 ACTIVE_PATHS: set[Path] = set()  # temporary paths in use by this process
 
 
-@contextlib.contextmanager
+@contextmanager
 def temporary_path(path: Path) -> Iterator[Path]:
     """Yield a hidden path beside `path` with host and process id, for a file or a folder that is removed at the end."""
     temporary = path.with_name(f".{path.stem}.skysim-{HOST}-{os.getpid()}{path.suffix}")
@@ -46,7 +45,7 @@ def remove_stale_temporaries(folder: Path) -> None:
         match = TEMPORARY_NAME.fullmatch(path.name)
         if match and not writer_is_running(int(match[1]), path):
             # A permission error will surface at the next write.
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 remove(path)
 
 
@@ -169,8 +168,7 @@ def write_image(path: Path, image: NDArray) -> None:
             path,
             f"an image of {image.dtype} and shape {image.shape} cannot be encoded in this format",
         )
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(data.data)
+    write_bytes(path, data.data)
 
 
 def write_table(path: Path, table: Any) -> None:
@@ -217,7 +215,7 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Write a file of bytes."""
     with atomic_file(path) as temporary:
         temporary.write_bytes(data)

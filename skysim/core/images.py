@@ -6,7 +6,6 @@ read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`)
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import gzip
 import math
@@ -15,11 +14,11 @@ import tempfile
 import warnings
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, BinaryIO, NamedTuple
+from typing import IO, Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -61,31 +60,8 @@ TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
 ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
 
 
-class FitsImage(NamedTuple):
-    """The first image of a file.
-
-    Attributes
-    ----------
-    pixels
-        (H, W), or (H, W, 3) in OpenCV's order blue, green, red; rows as stored
-    top_down
-        Whether the first row is the highest, by ROWORDER; None without one: the lowest is, by
-        the standard, but programs that do not follow it leave the keyword out too
-    date_utc
-        DATE-OBS; None without a valid one
-    exposure_s, temperature_c
-        EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP; None without a number
-    """
-
-    pixels: NDArray
-    top_down: bool | None
-    date_utc: datetime.datetime | None
-    exposure_s: float | None
-    temperature_c: float | None
-
-
-def read_fits_image(path: Path) -> FitsImage:
-    """The first image, in the machine's byte order. Raises InputError with one line."""
+def read_fits_image(path: Path) -> ViewedImage:
+    """The first image of a FITS file, in the machine's byte order. Raises InputError with one line."""
     from astropy.io import fits
 
     try:
@@ -106,9 +82,11 @@ def read_fits_image(path: Path) -> FitsImage:
                     # The next one, before it is opened.
                     check_header(path, file, place["datLoc"] + place["datSpan"])
                     continue
-                return FitsImage(
-                    channels_last(path, pixels), *header_values(hdu.header, hdus[0].header)
-                )
+                values = header_values(hdu.header, hdus[0].header)
+                pixels = channels_last(path, pixels)
+                if values["flipped"]:
+                    pixels = np.ascontiguousarray(pixels[::-1])
+                return ViewedImage(pixels, **values)
     except InputError:
         raise
     except (
@@ -127,7 +105,7 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
     from astropy.utils.exceptions import AstropyWarning
 
     packed = path.suffix.lower() == ".gz"
-    with contextlib.ExitStack() as stack:
+    with ExitStack() as stack:
         plain = path
         if packed:
             temporary = stack.enter_context(tempfile.NamedTemporaryFile(prefix="skysim-"))
@@ -232,32 +210,30 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
     return pixels
 
 
-def header_values(
-    *headers: Any,
-) -> tuple[bool | None, datetime.datetime | None, float | None, float | None]:
-    """FitsImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
+def header_values(*headers: Any) -> dict[str, Any]:
+    """ViewedImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
     found: dict[str, str] = {}
     for header in reversed(headers):
         for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
-            with contextlib.suppress(Exception):  # of many types, for a damaged card
+            with suppress(Exception):  # of many types, for a damaged card
                 found[key] = str(header[key]).strip()
     date_utc = None
-    with contextlib.suppress(ValueError):
+    with suppress(ValueError):
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
-    exposure_s = first_number(found, EXPOSURE_KEYS)
-    temperature_c = first_number(found, TEMPERATURE_KEYS)
-    return (
-        TOP_DOWN.get(found.get("ROWORDER", "").upper()),
-        date_utc,
-        exposure_s,
-        temperature_c,
-    )
+    top_down = TOP_DOWN.get(found.get("ROWORDER", "").upper())
+    return {
+        "date_utc": date_utc,
+        "row_order_known": top_down is not None,
+        "exposure_s": first_number(found, EXPOSURE_KEYS),
+        "temperature_c": first_number(found, TEMPERATURE_KEYS),
+        "flipped": not top_down,
+    }
 
 
 def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
     """The first finite number under these keys."""
     for key in keys:
-        with contextlib.suppress(ValueError):
+        with suppress(ValueError):
             if math.isfinite(number := float(found.get(key, ""))):
                 return number
     return None
@@ -276,16 +252,16 @@ class ViewedImage:
     pixels
         (H, W) or (H, W, channels), blue first
     date_utc
-        DATE-OBS of a FITS file; None if unknown
+        DATE-OBS of a FITS file; None without a valid one
     focal_35mm
         Focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
     flipped
         Whether the file's first row is the lowest one here
     row_order_known
         False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
-        the standard recommends
+        the standard recommends; but programs that do not follow it leave the keyword out too
     exposure_s, temperature_c
-        Exposure time and temperature in a FITS header; None if unknown
+        EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP of a FITS header; None without a number
     """
 
     pixels: NDArray
@@ -316,15 +292,8 @@ def read_picture(path: Path) -> ViewedImage:
             focal_35mm=exif.focal_35mm,
         )
     image = read_fits_image(path)
-    pixels = image.pixels if image.top_down else np.ascontiguousarray(image.pixels[::-1])
-    return ViewedImage(
-        check_numbers(path, pixels),
-        image.date_utc,
-        row_order_known=image.top_down is not None,
-        exposure_s=image.exposure_s,
-        temperature_c=image.temperature_c,
-        flipped=not image.top_down,
-    )
+    check_numbers(path, image.pixels)
+    return image
 
 
 def read_image(path: Path) -> NDArray:
@@ -454,7 +423,7 @@ class LiveCamera:
 
 def video_numbers(path: Path) -> tuple[float, int]:
     """Frame rate in Hz and number of frames of a video, by its container. Raises InputError if it cannot be read."""
-    with contextlib.closing(LiveCamera(str(path))) as video:
+    with closing(LiveCamera(str(path))) as video:
         rate_hz = video.capture.get(cv2.CAP_PROP_FPS)
         count = int(video.capture.get(cv2.CAP_PROP_FRAME_COUNT))
     if not (rate_hz > 0 and count > 0):
@@ -464,5 +433,5 @@ def video_numbers(path: Path) -> tuple[float, int]:
 
 def grab_frame(source: str) -> NDArray:
     """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
-    with contextlib.closing(LiveCamera(source)) as camera:
+    with closing(LiveCamera(source)) as camera:
         return camera.frame()

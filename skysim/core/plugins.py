@@ -121,6 +121,8 @@ class RunningProcess:
     """A running process with its folder and the last lines of its standard error; `stop` cleans up all of them."""
 
     process: subprocess.Popen[bytes]
+    stdin: IO[bytes]
+    stdout: IO[bytes]
     folder: Path | None
     last_lines: deque[str] = field(default_factory=lambda: deque(maxlen=QUOTED_LINES))
     stderr_reader: threading.Thread | None = None
@@ -137,10 +139,8 @@ class RunningProcess:
         """Wait for the process to exit, kill its group after grace_s, remove its folder; return the exit code."""
         if self.process.returncode is not None:
             return self.process.returncode
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         with contextlib.suppress(OSError):
-            self.process.stdin.close()
+            self.stdin.close()
         until_s = time.monotonic() + grace_s
         # WNOWAIT leaves the process unreaped, so its id cannot be reused and killpg hits only this group.
         flags = os.WEXITED | os.WNOWAIT | os.WNOHANG
@@ -152,7 +152,7 @@ class RunningProcess:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
         code = self.process.wait()
-        self.process.stdout.close()
+        self.stdout.close()
         if self.stderr_reader:
             self.stderr_reader.join(GRACE_S)
         if self.folder:
@@ -232,18 +232,18 @@ class Program:
             raise ProgramError(
                 f"{arguments[0]!r} cannot be started: {error.strerror}"
             ) from None
-        running = RunningProcess(process, folder)
+        assert process.stdin is not None
+        assert process.stdout is not None
+        running = RunningProcess(process, process.stdin, process.stdout, folder)
         self.running = running
         self.received = bytearray()
         # Ends the program with this process; `atexit` does not run in a multiprocessing worker, Finalize does.
         self._finalizer = Finalize(self, running.stop, (0.0,), exitpriority=10)
-        assert process.stdin is not None
-        assert process.stdout is not None
         running.stderr_reader = threading.Thread(
             target=running.collect_stderr, args=(process.stderr,), daemon=True
         )
         running.stderr_reader.start()
-        for pipe_end in (process.stdin, process.stdout):
+        for pipe_end in (running.stdin, running.stdout):
             os.set_blocking(pipe_end.fileno(), False)
         reply = self.exchange([self.setup_message], START_LIMIT_S)
         if not isinstance(reply, dict) or reply.get("ready") is not True:
@@ -264,29 +264,26 @@ class Program:
         The program may answer before it has read the whole message, which must not cause a deadlock.
         """
         assert self.running is not None
-        process = self.running.process
-        assert process.stdin is not None
-        assert process.stdout is not None
+        stdin = self.running.stdin
+        stdout = self.running.stdout
         unsent = memoryview(message)
         with selectors.DefaultSelector() as pipes:
-            pipes.register(process.stdout, selectors.EVENT_READ)
-            pipes.register(process.stdin, selectors.EVENT_WRITE)
+            pipes.register(stdout, selectors.EVENT_READ)
+            pipes.register(stdin, selectors.EVENT_WRITE)
             while unsent or b"\n" not in self.received:
                 left_s = max(until_s - time.monotonic(), 0.0)
                 ready = {key.fileobj for key, _ in pipes.select(left_s)}
                 if time.monotonic() >= until_s:
                     raise self.fail(f"no answer within {limit_s:g} s", 0.0)
-                if process.stdin in ready and unsent:
+                if stdin in ready and unsent:
                     try:
-                        unsent = unsent[
-                            os.write(process.stdin.fileno(), unsent[:CHUNK_BYTES]) :
-                        ]
+                        unsent = unsent[os.write(stdin.fileno(), unsent[:CHUNK_BYTES]) :]
                     except BrokenPipeError:
                         unsent = unsent[:0]
                     if not unsent:
-                        pipes.unregister(process.stdin)
-                if process.stdout in ready:
-                    self.receive(os.read(process.stdout.fileno(), CHUNK_BYTES))
+                        pipes.unregister(stdin)
+                if stdout in ready:
+                    self.receive(os.read(stdout.fileno(), CHUNK_BYTES))
         line, _, rest = bytes(self.received).partition(b"\n")
         self.received = bytearray(rest)
         return line

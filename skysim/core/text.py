@@ -17,6 +17,7 @@ import numpy as np
 from skysim.core.errors import InputError, Where, printable
 from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
+from skysim.core.yaml_reader import read_limited
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
 MAX_EXCERPT = 40  # number of characters of a value in a message
@@ -29,15 +30,7 @@ Line = tuple[int, str]  # number, from 1, and content
 
 def read_lines(path: Path) -> list[Line]:
     """The numbered lines of a text file, without blank lines. Raises InputError if it is too large or not UTF-8."""
-    try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from None
+    text = read_limited(path, MAX_BYTES, "utf-8-sig")
     return [(n, line.strip()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
@@ -69,16 +62,13 @@ def to_numbers(
 def check_numbers(where: Where, words: Sequence[str]) -> None:
     """Raise InputError for the first word that is not a finite number."""
     for word in words:
+        kind = "finite number"
         try:
-            number = float(word)
+            if np.isfinite(float(word)):
+                continue
         except ValueError:
-            raise InputError(
-                where.file, f"{excerpt(word)} is not a number", where=where
-            ) from None
-        if not np.isfinite(number):
-            raise InputError(
-                where.file, f"{excerpt(word)} is not a finite number", where=where
-            )
+            kind = "number"
+        raise InputError(where.file, f"{excerpt(word)} is not a {kind}", where=where)
 
 
 def seconds_since(
@@ -124,12 +114,14 @@ def seconds_since(
         try:
             times = Time(texts, format=kind, scale=scale).utc
         except ValueError:
-            n = next(n for n, text in enumerate(texts) if not is_time(text, kind, scale))
-            raise InputError(
-                source,
-                f"{excerpt(epochs[n])} is not a date and time",
-                where=Where(source, places[n], unit),
-            ) from None
+            for n, text in enumerate(texts):  # the first that is none by itself
+                try:
+                    Time(text, format=kind, scale=scale)
+                except ValueError:
+                    problem = f"{excerpt(epochs[n])} is not a date and time"
+                    where = Where(source, places[n], unit)
+                    raise InputError(source, problem, where=where) from None
+            raise
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
     try:
@@ -139,17 +131,6 @@ def seconds_since(
     except ValueError:
         raise InputError(source, "an epoch within a leap second", "other times") from None
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
-
-
-def is_time(text: str, kind: str, scale: str) -> bool:
-    """Whether astropy accepts the text as a time."""
-    from astropy.time import Time
-
-    try:
-        Time(text, format=kind, scale=scale)
-    except ValueError:
-        return False
-    return True
 
 
 def read_named_rows(

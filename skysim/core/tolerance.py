@@ -123,31 +123,23 @@ class ToleranceConfig(ConfigModel):
     def check_distribution(self) -> Self:
         """Check that tolerance and sigma fit the distribution."""
         half_width, sigma = self.numbers()
-        if half_width is None and (
-            sigma is None or self.distribution not in (None, "normal")
-        ):
-            raise InputError(
-                "",
-                f"{self.distribution or 'an error'} requires a tolerance",
-                "tolerance, or sigma",
-            )
-        if half_width is not None and self.distribution == "normal":
+        if half_width is None:
+            if sigma is None or self.distribution not in (None, "normal"):
+                raise InputError(
+                    "",
+                    f"{self.distribution or 'an error'} requires a tolerance",
+                    "tolerance, or sigma",
+                )
+            return self
+        if self.distribution == "normal":
             raise InputError(
                 "tolerance", "a normal distribution has none", "uniform, truncated_normal"
             )
-        if (
-            half_width is not None
-            and sigma is not None
-            and self.distribution != "truncated_normal"
-        ):
+        if sigma is not None and self.distribution != "truncated_normal":
             raise InputError(
                 "sigma", "a uniform distribution has none", "distribution: truncated_normal"
             )
-        if (
-            half_width is not None
-            and sigma is not None
-            and not 0.01 <= half_width / sigma <= 100
-        ):
+        if sigma is not None and not 0.01 <= half_width / sigma <= 100:
             raise InputError("sigma", "", "a hundredth to a hundred times the tolerance")
         return self
 

@@ -38,7 +38,7 @@ class Mount:
     cam_from_body: Rotation
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Trajectory:
     """The vehicle's attitude history, sampled finely enough for interpolation.
 
@@ -55,9 +55,6 @@ class Trajectory:
     t_s: Floats
     lab_from_body: Rotation
     rate_body_rad_s: Floats
-    _segments: list[tuple[Floats, Floats]] = field(
-        init=False, repr=False, default_factory=list
-    )
 
     @classmethod
     def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
@@ -89,18 +86,17 @@ class Trajectory:
             np.concatenate([before.rate_body_rad_s, self.rate_body_rad_s]),
         )
 
+    @cached_property
     def hermite_segments(self) -> tuple[Floats, Floats]:
         """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.interpolate`; computed once."""
-        if not self._segments:
-            step = np.diff(self.t_s)[:, None]
-            rotvec = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
-            begin = self.rate_body_rad_s[:-1] * step
-            end = self.rate_body_rad_s[1:] * step
-            # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
-            end = end + np.cross(rotvec, end) / 2
-            wxyz = self.lab_from_body.as_quat(scalar_first=True)
-            self._segments.append((wxyz, np.stack([rotvec, begin, end], axis=1)))
-        return self._segments[0]
+        step = np.diff(self.t_s)[:, None]
+        rotvec = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
+        begin = self.rate_body_rad_s[:-1] * step
+        end = self.rate_body_rad_s[1:] * step
+        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
+        end = end + np.cross(rotvec, end) / 2
+        wxyz = self.lab_from_body.as_quat(scalar_first=True)
+        return wxyz, np.stack([rotvec, begin, end], axis=1)
 
     def attitude_at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time within the history. Raises ValueError outside of it.
@@ -118,7 +114,7 @@ class Trajectory:
         )
         fraction = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
         lab_from_body = Rotation.from_quat(
-            interpolate(*self.hermite_segments(), k, fraction), scalar_first=True
+            interpolate(*self.hermite_segments, k, fraction), scalar_first=True
         )
         return lab_from_body if np.ndim(t_s) else lab_from_body[0]
 

@@ -183,17 +183,24 @@ def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
     return texts
 
 
-def read_yaml(path: Path) -> tuple[Tree, str]:
-    """A YAML mapping and its text. Raises InputError."""
+def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
+    """The text of a file. Raises InputError if it is too large, cannot be read or is not UTF-8."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(path, f"{path.stat().st_size} bytes", f"up to {MAX_BYTES}")
-        text = path.read_text(encoding="utf-8")
-        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
+        size = path.stat().st_size
+        if size > limit_bytes:
+            raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+        return path.read_text(encoding)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
         ) from error
+
+
+def read_yaml(path: Path) -> tuple[Tree, str]:
+    """A YAML mapping and its text. Raises InputError."""
+    text = read_limited(path, MAX_BYTES)
+    try:
+        node, tree = (parse_kept if len(text) <= MAX_KEPT else parse_yaml)(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = Where(path, mark.line + 1 if mark else None)
@@ -388,15 +395,13 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     value = excerpt(repr(error["input"]))
     if kind not in EXPECTED:
         return InputError("", f"{value} is not allowed: {error['msg']}")
-    limits = {name: plain_number(limit) for name, limit in context.items()}
+    limits = {  # numbers without an exponent, such as 0.000001
+        name: f"{Decimal(repr(limit)).normalize():f}" if isinstance(limit, float) else limit
+        for name, limit in context.items()
+    }
     if kind == "string_pattern_mismatch":
         limits["pattern"] = PATTERNS[limits["pattern"]]
     return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
-
-
-def plain_number(value: Any) -> Any:
-    """The text of a float without an exponent, such as 0.000001; other values unchanged."""
-    return f"{Decimal(repr(value)).normalize():f}" if isinstance(value, float) else value
 
 
 def where_of(keys: list[str], files: Files, overrides: OverrideTexts) -> Where | None:

@@ -433,4 +433,4 @@ def test_every_fits_file_of_skysim_has_its_row_order(tmp_path: Path) -> None:
         "shefex2", {"camera.width_px": "16", "camera.height_px": "16"}
     ).camera
     for path in (tmp_path / "x.fits", next(frame_files.write_frames(camera, tmp_path, 1))):
-        assert images.read_fits_image(path).top_down
+        assert not images.read_fits_image(path).flipped

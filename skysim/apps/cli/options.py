@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import datetime
 import os
+import shlex
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skysim.core.errors import OVERRIDES, InputError, Where
+from skysim.core.paths import SCENES, STUDIES, shipped_files
 from skysim.scene.camera_sheet import QUESTIONS
 
 if TYPE_CHECKING:
@@ -26,21 +29,15 @@ TYPED: dict[str, str] = {}  # scene keys that an option has set, and the option
 
 def complete_scene(incomplete: str) -> list[str]:
     """Names of shipped scenes, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.paths import SCENES
-
     return complete_yaml(SCENES, incomplete)
 
 
 def complete_study(incomplete: str) -> list[str]:
     """Names of shipped studies, and YAML files and folders, that begin with what was typed."""
-    from skysim.core.paths import STUDIES
-
     return complete_yaml(STUDIES, incomplete)
 
 
 def complete_yaml(folder: Path, incomplete: str) -> list[str]:
-    from skysim.core.paths import shipped_files
-
     names = list(shipped_files(folder))
     found = Path(
         incomplete if incomplete.endswith("/") else os.path.dirname(incomplete)
@@ -190,6 +187,11 @@ def output_folder(out: Path | None, name: str) -> Path:
     return out or Path("out") / name
 
 
+def command_line() -> str:
+    """The command that the user has typed."""
+    return shlex.join(["skysim", *sys.argv[1:]])
+
+
 def selected_stages(**stages: str | None) -> dict[str, str]:
     """The tracker stages for which the command line names an algorithm."""
     return {stage: name for stage, name in stages.items() if name is not None}
@@ -212,41 +214,46 @@ OPTIONS = {  # the option of each function parameter, by the parameter's key in 
     "overrides": "--set",
     "programs": "--program",
     "trackers": "--tracker",
-    "engine": "--engine",
-    "scheduler": "--scheduler",
-    "workers": "--workers",
-    "where": "--where",
-    "response": "--response",
     "export.formats": "--to",
     "dataset.formats": "--to",
-    "dataset.frames": "--frames",
     "dataset.frames_per_shard": "--shard-frames",
-    "datasheet.fields": "--fields",
-    "datasheet.fmu": "--fmu",
     "survey.tilt_deg": "--tilt",
-    "survey.imu_sigma": "--imu-sigma",
-    "survey.led_sigma": "--led-sigma",
-    "survey.lever_sigma": "--lever-sigma",
-    "survey.focal_error": "--focal-error",
-    "balance.torque": "--torque",
-    "balance.offset_bar": "--offset-bar",
-    "balance.inertia_sigma": "--inertia-sigma",
-    "balance.offset_sigma": "--offset-sigma",
-    "balance.wheel_sigma": "--wheel-sigma",
-    "balance.mount_sigma": "--mount-sigma",
-    "balance.tacho_sigma": "--tacho-sigma",
-    "characterize.darks": "--darks",
-    "characterize.flats": "--flats",
-    "characterize.night": "--night",
     "solve.fov_deg": "--fov",
     "solve.near_deg": "--near",
     "solve.time_utc": "--time",
-    "solve.catalog": "--catalog",
-    "solve.detector": "--detector",
-    "solve.centroider": "--centroider",
-    "solve.identifier": "--identifier",
-    "solve.solver": "--solver",
-} | {f"answers.{name}": f"--{name.replace('_', '-')}" for name in QUESTIONS}
+} | {  # those with the parameter's name
+    key: f"--{key.rpartition('.')[2].replace('_', '-')}"
+    for key in (
+        "engine",
+        "scheduler",
+        "workers",
+        "where",
+        "response",
+        "dataset.frames",
+        "datasheet.fields",
+        "datasheet.fmu",
+        "survey.imu_sigma",
+        "survey.led_sigma",
+        "survey.lever_sigma",
+        "survey.focal_error",
+        "balance.torque",
+        "balance.offset_bar",
+        "balance.inertia_sigma",
+        "balance.offset_sigma",
+        "balance.wheel_sigma",
+        "balance.mount_sigma",
+        "balance.tacho_sigma",
+        "characterize.darks",
+        "characterize.flats",
+        "characterize.night",
+        "solve.catalog",
+        "solve.detector",
+        "solve.centroider",
+        "solve.identifier",
+        "solve.solver",
+        *(f"answers.{name}" for name in QUESTIONS),
+    )
+}
 
 
 def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
@@ -257,22 +264,17 @@ def as_typed(error: InputError, loaded: Loaded | None = None) -> InputError:
     loaded
         Name and overrides of the scene, by default those of the last one
     """
-    error = with_place(error, loaded or (LOADED[-1] if LOADED else None))
+    loaded = loaded or (LOADED[-1] if LOADED else None)
+    if loaded:
+        from skysim.scene.loader import located
+
+        error = located(error, *loaded)
     if error.where == OVERRIDES:
         typed = TYPED.get(error.key)
         if typed:
             return InputError(typed, error.problem, error.allowed)
         return error.at(Where("--set"))
     return InputError(option_of(error.key), error.problem, error.allowed, error.where)
-
-
-def with_place(error: InputError, loaded: Loaded | None) -> InputError:
-    """The error with file and line, if it is about a key of the loaded scene and has none."""
-    if loaded is None:
-        return error
-    from skysim.scene.loader import located
-
-    return located(error, *loaded)
 
 
 def option_of(key: str) -> str:

@@ -221,10 +221,10 @@ def print_titles(folder: Path, json: bool) -> None:
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")
 
 
-def print_error(message: str, code: int = 2) -> int:
+def print_error(message: str) -> int:
     """Print one line to stderr and return the exit code."""
     print(f"skysim: {printable(message)}", file=sys.stderr)
-    return code
+    return 2
 
 
 def write_3d_views(lab: Lab, log: Telemetry, folder: Path) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, overload
 
@@ -128,6 +128,11 @@ class Detection:
     flux: float
     id: int = -1
     residual_px: float = NAN
+
+
+def places_px(detections: Collection[Detection]) -> Floats:
+    """(N, 2) pixels of detections."""
+    return np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True)

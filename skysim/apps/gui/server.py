@@ -80,15 +80,12 @@ class ClosedPages:
     async def collect(self) -> None:
         end_s = time.monotonic() + PATIENCE_S
         await asyncio.sleep(QUIET_S)
-        while (now_s := time.monotonic()) < end_s and now_s - last_frame_s() < QUIET_S:
+        while (now_s := time.monotonic()) < end_s and any(
+            now_s - frames.added_s < QUIET_S for frames in FRAMES.values()
+        ):
             await asyncio.sleep(QUIET_S)
         self.waiting = None  # pages closed from now on need another collection
         await asyncio.to_thread(release_memory)
-
-
-def last_frame_s() -> float:
-    """Time at which a page last got a frame, by `time.monotonic`; minus infinity before the first."""
-    return max((frames.added_s for frames in FRAMES.values()), default=-float("inf"))
 
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
@@ -250,13 +247,14 @@ class Guard:
         # The token is removed from the address.
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
-            response.set_cookie(
-                self.cookie, self.token, path="/", httponly=True, samesite="strict"
-            )
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            response.set_cookie(
-                USER, user, YEAR_S, path="/", httponly=True, samesite="strict"
-            )
+            for name, value, age_s in (
+                (self.cookie, self.token, None),
+                (USER, user, YEAR_S),
+            ):
+                response.set_cookie(
+                    name, value, age_s, path="/", httponly=True, samesite="strict"
+                )
             return response
         if token_matches(request.cookies.get(self.cookie, ""), self.token):
             return None

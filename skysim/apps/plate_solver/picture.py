@@ -141,12 +141,13 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        names = sorted(child for child in path.iterdir() if images.image_suffix(child.name))
-        names = [
+        names = sorted(
             child
-            for child in names
-            if child.name[0] != "." and not child.name.endswith(ANNOTATED)
-        ]
+            for child in path.iterdir()
+            if images.image_suffix(child.name)
+            and child.name[0] != "."
+            and not child.name.endswith(ANNOTATED)
+        )
         if not names:
             raise InputError(
                 path, "a folder without images", ", ".join(images.IMAGE_SUFFIXES)
@@ -327,16 +328,16 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     camera = solver.camera
     if camera is None:
         return
-    if camera.detector and image.ndim != 2:
-        raise InputError(
-            path, f"a color image of shape {image.shape}; this camera's are monochrome"
-        )
-    bits = camera.detector.bits if camera.detector else 0
-    if image.dtype == np.uint8 and bits > 8:
-        raise InputError(
-            path,
-            f"an 8-bit image; this camera's have {bits} bits, in 16-bit FITS, PNG or TIFF",
-        )
+    if detector := camera.detector:
+        if image.ndim != 2:
+            raise InputError(
+                path, f"a color image of shape {image.shape}; this camera's are monochrome"
+            )
+        if image.dtype == np.uint8 and detector.bits > 8:
+            raise InputError(
+                path,
+                f"an 8-bit image; this camera's have {detector.bits} bits, in 16-bit FITS, PNG or TIFF",
+            )
     height_px, width_px = image.shape[:2]
     model = camera.model
     if (width_px, height_px) != (model.width_px, model.height_px):

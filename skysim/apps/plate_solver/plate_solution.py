@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
 from estimator.core.types import Attitude, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
@@ -108,6 +107,27 @@ def attitude_fields(
     assert attitude.covariance_rad2 is not None
     assert attitude.match is not None
     assert attitude.camera is not None
+    star = attitude.match.star
+    xy_px = report.centroids.xy_px[attitude.match.observed]
+    # Measured minus expected.
+    residual_px = xy_px - attitude.camera.pixels(
+        attitude.cam_from_ref.apply(tracker.stars.vectors[star])
+    )
+    # The tracker's directions are apparent; the table has the catalog's.
+    by_id = np.argsort(stars.id)
+    x, y, z = stars.vectors[
+        by_id[np.searchsorted(stars.id, tracker.stars.id[star], sorter=by_id)]
+    ].T
+    columns = {
+        "name": map(star_name, tracker.stars.id[star].tolist()),
+        "ra_deg": (np.degrees(np.arctan2(y, x)) % 360).tolist(),
+        "dec_deg": np.degrees(np.arcsin(z)).tolist(),
+        "v_mag": tracker.stars.v_mag[star].tolist(),
+        "x_px": xy_px[:, 0].tolist(),
+        "y_px": xy_px[:, 1].tolist(),
+        "residual_x_px": residual_px[:, 0].tolist(),
+        "residual_y_px": residual_px[:, 1].tolist(),
+    }
     xyzw = attitude.cam_from_ref.as_quat(canonical=True)
     return {
         "cam_from_icrs_xyzw": tuple(xyzw.tolist()),
@@ -116,48 +136,11 @@ def attitude_fields(
         "center_px": attitude.camera.center_px,
         "distortion": attitude.camera.distortion,
         "log10_chance": attitude.match.log10_chance,
-        "stars": tuple(star_rows(report, tracker, stars)),
+        "stars": tuple(
+            dict(zip(columns, row, strict=True))
+            for row in zip(*columns.values(), strict=True)
+        ),
     }
-
-
-def star_rows(
-    report: Report, tracker: StarTracker, stars: StarCatalog
-) -> list[dict[str, Any]]:
-    """The matched stars of a solved image with their pixels and residuals, measured minus expected."""
-    attitude = report.attitude
-    assert attitude.cam_from_ref is not None
-    assert attitude.match is not None
-    assert attitude.camera is not None
-    star = attitude.match.star
-    xy_px = report.centroids.xy_px[attitude.match.observed]
-    expected_px = attitude.camera.pixels(
-        attitude.cam_from_ref.apply(tracker.stars.vectors[star])
-    )
-    # The tracker's directions are apparent; the table has the catalog's.
-    by_id = np.argsort(stars.id)
-    catalog_row = by_id[np.searchsorted(stars.id, tracker.stars.id[star], sorter=by_id)]
-    rows = []
-    for n, k in enumerate(star):
-        x_px, y_px = xy_px[n].tolist()
-        residual_x_px, residual_y_px = (xy_px[n] - expected_px[n]).tolist()
-        rows.append(
-            {
-                "name": star_name(int(tracker.stars.id[k])),
-                **sky_place(stars.vectors[catalog_row[n]]),
-                "v_mag": float(tracker.stars.v_mag[k]),
-                "x_px": x_px,
-                "y_px": y_px,
-                "residual_x_px": residual_x_px,
-                "residual_y_px": residual_y_px,
-            }
-        )
-    return rows
-
-
-def sky_place(vector: Floats) -> dict[str, float]:
-    """Right ascension and declination of a direction."""
-    ra_deg = float(np.degrees(np.arctan2(vector[1], vector[0])) % 360)
-    return {"ra_deg": ra_deg, "dec_deg": float(np.degrees(np.arcsin(vector[2])))}
 
 
 def star_name(number: int) -> str:

@@ -146,8 +146,8 @@ class KnownCamera(NamedTuple):
 class Solver:
     """Settings of the plate solver.
 
-    Either a field of view is known to 5 %, or a camera exactly or by calibration; with neither, `search` defines the
-    fields that are tried.
+    Either a field of view is known to 5 %, or a camera exactly or by calibration; with neither, FIELD_SEARCH
+    defines the fields that are tried.
 
     Attributes
     ----------
@@ -176,7 +176,6 @@ class Solver:
     settings: Settings
     time_utc: datetime.datetime | None = None
     fov_uncertainty: float = FOV_UNCERTAINTY
-    search: FieldSearch = FIELD_SEARCH
     hypotheses: int = 1
     upper_half: bool = False
     size_px: tuple[int, int] | None = None
@@ -203,8 +202,8 @@ class Solver:
         if self.fov_deg:
             camera = Camera.from_fov(width_px, height_px, math.radians(self.fov_deg))
             return [(camera, self.fov_uncertainty)]
-        cameras = self.search.cameras(width_px, height_px)
-        return [one for one in cameras if self.mean_stars(one[0]) >= self.search.least_stars]
+        cameras = FIELD_SEARCH.cameras(width_px, height_px)
+        return [one for one in cameras if self.mean_stars(one[0]) >= FIELD_SEARCH.least_stars]
 
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
@@ -265,7 +264,7 @@ class Solver:
         narrowest = camera.zoomed(1 + uncertainty)
         field_sr = camera.width_px * camera.height_px / narrowest.focal_px**2
         bright = self.stars.v_mag <= star_catalog.limit_for_density(
-            self.stars, field_sr, self.search.stars
+            self.stars, field_sr, FIELD_SEARCH.stars
         )
         bright &= self.within_reach(camera.zoomed(1 - uncertainty), vectors)
         searches = () if self.field_is_known else QUAD_SEARCHES

@@ -11,7 +11,7 @@ import json
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -79,9 +79,7 @@ class FrameHub:
     def counters(self) -> dict[str, Any]:
         """Counters of each client, and the sums of the earlier ones."""
         with self.changed:
-            clients = [
-                {"sent": client.sent, "dropped": client.dropped} for client in self.clients
-            ]
+            clients = [asdict(client) for client in self.clients]
             return {"clients": clients, "earlier_clients": dict(self.earlier)}
 
     def publish(self, packet: Packet) -> None:

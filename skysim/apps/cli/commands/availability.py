@@ -51,6 +51,8 @@ def availability(
     json: Json = False,
 ) -> None:
     """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
+    import numpy as np
+
     config = load(scene, None, None, overrides)
     exclusion = config.orbit.exclusion if config.orbit else None
     if exclusion is None:
@@ -63,9 +65,12 @@ def availability(
     pointing = pointing_of(config, law, off_deg, around_deg)
     with progress_callback("availability", quiet=json) as watch:
         found = computed(config, pointing, SPANS_S[span], samples, watch)
-    fractions = fractions_of(found, exclusion)
+    outside = found.outside(exclusion)
+    available = np.all(list(outside.values()), axis=0)
+    holds = outside | {"all": available}
+    fractions = {name: float(times.mean()) for name, times in holds.items()}
     if picture is not None:
-        write_picture(picture, found, exclusion)
+        write_picture(picture, found, exclusion, available)
     if json:
         print_json(
             {"span": span, "law": law, "samples": len(found.t_s), "fractions": fractions}
@@ -160,23 +165,14 @@ def computed(
     )
 
 
-def fractions_of(found: SkySamples, exclusion: ExclusionConfig) -> dict[str, float]:
-    """The fraction of the times at which each condition holds, and at which all hold."""
-    outside = found.outside(exclusion)
-    each = {name: float(holds.mean()) for name, holds in outside.items()}
-    return {**each, "all": float(available(found, exclusion).mean())}
-
-
-def available(found: SkySamples, exclusion: ExclusionConfig) -> NDArray[np.bool_]:
-    """(N,) whether all conditions hold at a time."""
-    import numpy as np
-
-    return np.all(list(found.outside(exclusion).values()), axis=0)
-
-
-def write_picture(path: Path, found: SkySamples, exclusion: ExclusionConfig) -> None:
+def write_picture(
+    path: Path,
+    found: SkySamples,
+    exclusion: ExclusionConfig,
+    available: NDArray[np.bool_],
+) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
-    from skysim.core.files import atomic_file
+    from skysim.core.files import write_bytes
     from skysim.results.plots import INK, png
 
     hours = found.t_s / HOUR_S
@@ -195,7 +191,7 @@ def write_picture(path: Path, found: SkySamples, exclusion: ExclusionConfig) -> 
             hours,
             0,
             1,
-            where=available(found, exclusion),
+            where=available,
             transform=axes.get_xaxis_transform(),
             color="#009e73",
             alpha=0.15,
@@ -203,5 +199,4 @@ def write_picture(path: Path, found: SkySamples, exclusion: ExclusionConfig) -> 
         axes.set(xlabel="time [h]", ylabel="angle from the boresight [deg]")
         axes.legend()
 
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(png(draw, (7, 3.2)))
+    write_bytes(path, png(draw, (7, 3.2)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -195,36 +197,33 @@ def read_camera(
     }
 
 
-def sheet_option(name: str) -> Any:
-    """The option for a question of the data sheet."""
-    question = QUESTIONS[name]
-    return typer.Option(
-        OPTIONS[f"answers.{name}"], metavar="TEXT", help=f"{question.ask}: {question.where}."
-    )
-
-
-Answer = str | None
+def asking(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with an option for each question of the data sheet, before its own options."""
+    answers = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=Annotated[
+                str | None,
+                typer.Option(
+                    OPTIONS[f"answers.{name}"],
+                    metavar="TEXT",
+                    help=f"{question.ask}: {question.where}.",
+                ),
+            ],
+        )
+        for name, question in QUESTIONS.items()
+    ]
+    *own, _ = inspect.signature(command, eval_str=True).parameters.values()
+    command.__signature__ = inspect.Signature([*answers, *own])  # type: ignore[attr-defined]
+    return command
 
 
 @app.command("new")
+@asking
 def camera_new(
-    context: typer.Context,
-    pixels: Annotated[Answer, sheet_option("pixels")] = None,
-    pitch: Annotated[Answer, sheet_option("pitch")] = None,
-    focal_length: Annotated[Answer, sheet_option("focal_length")] = None,
-    f_number: Annotated[Answer, sheet_option("f_number")] = None,
-    transmission: Annotated[Answer, sheet_option("transmission")] = None,
-    blur: Annotated[Answer, sheet_option("blur")] = None,
-    shutter: Annotated[Answer, sheet_option("shutter")] = None,
-    row_time: Annotated[Answer, sheet_option("row_time")] = None,
-    quantum_efficiency: Annotated[Answer, sheet_option("quantum_efficiency")] = None,
-    bits: Annotated[Answer, sheet_option("bits")] = None,
-    black_level: Annotated[Answer, sheet_option("black_level")] = None,
-    full_well: Annotated[Answer, sheet_option("full_well")] = None,
-    gain: Annotated[Answer, sheet_option("gain")] = None,
-    read_noise: Annotated[Answer, sheet_option("read_noise")] = None,
-    dark_current: Annotated[Answer, sheet_option("dark_current")] = None,
-    prnu: Annotated[Answer, sheet_option("prnu")] = None,
+    *,
     name: Annotated[
         str,
         typer.Option(help="Name of camera, lens and data sheets, for the file's first line."),
@@ -233,6 +232,7 @@ def camera_new(
         Path, typer.Option(help="The file to write, for the key camera.preset.")
     ] = Path("camera.yaml"),
     json: Json = False,
+    **answers: str | None,
 ) -> None:
     """Write a camera file from the numbers of a data sheet: asks for each; with options, only those are used.
 
@@ -245,12 +245,8 @@ def camera_new(
         raise InputError(
             f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
         )
-    answers = {
-        key: context.params[key] for key in QUESTIONS if context.params[key] is not None
-    }
-    if not answers:
-        answers = ask_all()
-    filled = camera_sheet.fill(answers)
+    given = {key: text for key in QUESTIONS if (text := answers[key]) is not None}
+    filled = camera_sheet.fill(given or ask_all())
     files.make_folder(out.parent)
     files.write_text(out, camera_sheet.text(filled, name or out.stem))
     if json:

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from skysim.apps.cli.commands.camera import complete_camera
-from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.options import (
+    Json,
+    Out,
+    Overrides,
+    SceneArg,
+    Seed,
+    command_line,
+    load,
+    output_folder,
+)
 from skysim.apps.cli.terminal import print_json, progress, progress_callback
 from skysim.core.errors import InputError
 from skysim.results.report import print_wrapped
@@ -23,15 +29,8 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 
-class Excitation(StrEnum):
-    """How the vehicle is set in motion."""
-
-    WHEELS = "wheels"
-    SWING = "swing"
-
-
 ExcitedBy = Annotated[
-    Excitation,
+    Literal["wheels", "swing"],
     typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
 ]
 EstimateOnly = Annotated[
@@ -82,7 +81,7 @@ TachoSigma = Annotated[
 
 def balance(
     scene: SceneArg,
-    excite: ExcitedBy = Excitation.WHEELS,
+    excite: ExcitedBy = "wheels",
     estimate_only: EstimateOnly = False,
     tilt: Tilt = 8.0,
     torque: Torque = "5e-5 N m",
@@ -114,7 +113,7 @@ def balance(
     bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
     loaded = load(scene, None, seed, set_)
     plan = balance_procedure.BalancePlan(
-        excite.value, tilt, bars.torque_nm, flights or 6, not estimate_only
+        excite, tilt, bars.torque_nm, flights or 6, not estimate_only
     )
     assumed = balance_procedure.assumed(loaded, uncertainty)
     flown = fly(loaded, plan, uncertainty, json)
@@ -122,7 +121,7 @@ def balance(
     if in_flight:
         statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
     folder = output_folder(out, loaded.name)
-    command = shlex.join(["skysim", *sys.argv[1:]])
+    command = command_line()
     print_report(
         statistics, balance_report.write_all(folder, statistics, flown, command), json
     )
@@ -206,7 +205,7 @@ def calibrate(
             else home_calibration.measure_scene(loaded, watch)
         )
     found = home_calibration.calibrated(known, frames, clicks)
-    command = shlex.join(["skysim", *sys.argv[1:]])
+    command = command_line()
     folder = output_folder(out, f"{loaded.name}_calibration")
     print_report(*home_calibration.write_results(folder, known, found, command), json)
 

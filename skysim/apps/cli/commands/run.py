@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +23,7 @@ from skysim.apps.cli.options import (
     SceneArg,
     Seed,
     SolverName,
+    command_line,
     load,
     output_folder,
     scene_names,
@@ -89,9 +88,8 @@ def run(
             terminal.progress_callback(loaded.title) as update,
         ):
             rows = recorder.record(flight.shots(progress=update))
-        command = shlex.join(["skysim", *sys.argv[1:]])
         finished = recorder.finish(
-            command, plan, terminal.write_3d_views if scene_3d else None
+            command_line(), plan, terminal.write_3d_views if scene_3d else None
         )
     statistics = print_results(loaded, finished, rows, plan, json)
     if open_:

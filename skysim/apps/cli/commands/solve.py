@@ -141,7 +141,7 @@ def solve(
         raise InputError("", f"{len(paths)} images", "one with --annotate, --table or --wcs")
     results, warnings, errors = solve_all(paths, settings, chosen, out, json)
     if sequence:
-        plate_solver.add_rates(results, rate or video_rate(paths[0]))
+        plate_solver.add_rates(results, rate or video_numbers(paths[0])[0])
     files.write_text(out / "solutions.json", files.to_json(results))
     if json:
         print_json(results)
@@ -195,7 +195,7 @@ def solve_all(
     errors = []
     warnings = []
     annotated = plate_solver.annotated_paths(out, paths)
-    count = sum(video_length(path) for path in paths)
+    count = sum(video_numbers(path)[1] for path in paths)
     frames = (
         (name, picture, annotated[n])
         for n, path in enumerate(paths)
@@ -218,28 +218,17 @@ def frames_of(path: Path) -> Iterator[tuple[Path, ViewedImage | None]]:
     """Names and pictures of a video's frames; of another file its name, and None."""
     from skysim.core.images import LiveCamera, ViewedImage
 
-    if not is_video(path):
+    rate_hz, count = video_numbers(path)
+    if rate_hz is None:
         yield path, None
         return
     with closing(LiveCamera(str(path))) as video:
-        for n in range(video_length(path)):
+        for n in range(count):
             yield path.with_name(f"{path.name}#{n}"), ViewedImage(video.frame())
 
 
-def is_video(path: Path) -> bool:
-    """Whether a file's suffix is that of a video."""
-    return path.suffix.lower() in VIDEO_SUFFIXES
+def video_numbers(path: Path) -> tuple[float | None, int]:
+    """Frame rate in Hz and number of frames of a video; None and 1 of another file."""
+    from skysim.core import images
 
-
-def video_length(path: Path) -> int:
-    """Number of frames of a video; 1 of another file."""
-    from skysim.core.images import video_numbers
-
-    return video_numbers(path)[1] if is_video(path) else 1
-
-
-def video_rate(path: Path) -> float | None:
-    """Frame rate of a video, Hz; None of another file."""
-    from skysim.core.images import video_numbers
-
-    return video_numbers(path)[0] if is_video(path) else None
+    return images.video_numbers(path) if path.suffix.lower() in VIDEO_SUFFIXES else (None, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -101,9 +101,8 @@ def run(
         raise InputError(plan.path, "has no key optimize", "skysim study run")
     if not search and plan.study.optimize is not None:
         raise InputError(plan.path, "has the key optimize", "skysim study optimize")
-    run_and_report(
-        plan, study, out, create_engine(engine, workers, scheduler), overrides, json, open_
-    )
+    trial_engine = create_engine(engine, workers, scheduler)
+    run_and_report(plan, Place(study, out), trial_engine, overrides, json, open_)
 
 
 @app.command()
@@ -126,13 +125,11 @@ def resume(
     `--set replicates=N` adds replicates to a study; its trials are kept.
     """
     start_workers(engine)
-    study, out = located(study, out)
-    plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
+    place, plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
     run_and_report(
         plan,
-        study,
-        out,
+        place,
         trial_engine,
         overrides,
         json,
@@ -145,9 +142,8 @@ def resume(
 @app.command()
 def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     """Show the progress of a study, while it runs or after."""
-    study, out = located(study, out)
-    plan, _ = load_stored_plan(study, out)
-    with open_store(study, out) as stored:
+    place, plan, _ = load_stored_plan(study, out)
+    with place.open() as stored:
         progress = study_status(plan, stored)
         failures = [
             {"trial": trial, "error": error} for trial, error in stored.failures()[:10]
@@ -165,9 +161,8 @@ def report(
     study: StudyArg, out: Out = None, open_: OpenReport = False, json: Json = False
 ) -> None:
     """Write the report of a study, finished or not, and print its table."""
-    study, out = located(study, out)
-    plan, _ = load_stored_plan(study, out)
-    write_report(plan, study, out, json, open_)
+    place, plan, _ = load_stored_plan(study, out)
+    write_report(plan, place, json, open_)
 
 
 @app.command()
@@ -185,9 +180,8 @@ def export(
     """Write a study's results for other tools."""
     from skysim.experiments.study.report import study_export
 
-    study, out = located(study, out)
-    plan, _ = load_stored_plan(study, out)
-    with open_store(study, out) as stored:
+    place, plan, _ = load_stored_plan(study, out)
+    with place.open() as stored:
         for path in to:
             study_export.export(stored, plan.study.responses, path)
             print(path)
@@ -212,12 +206,9 @@ def replay(
     """Repeat one trial and write its frames."""
     from skysim.experiments.study.execution import runner
 
-    study, out = located(study, out)
-    plan, _ = load_stored_plan(study, out, program or [])
-    with open_store(study, out) as stored:
-        repeated = runner.replay(
-            plan, stored, trial, folder_of(study, out) / f"trial_{trial}"
-        )
+    place, plan, _ = load_stored_plan(study, out, program or [])
+    with place.open() as stored:
+        repeated = runner.replay(plan, stored, trial, place.folder / f"trial_{trial}")
     row = repeated.row
     result: dict[str, Any] = {
         "trial": trial,
@@ -259,37 +250,29 @@ def worst(
     json: Json = False,
 ) -> None:
     """Name the attitudes of the worst trials, and the commands that repeat them."""
+    from skysim.core.yaml_reader import parse_overrides, parse_yaml
     from skysim.experiments.study import worst as analysis
     from skysim.results import metrics
 
-    study, out = located(study, out)
-    plan, _ = load_stored_plan(study, out)
+    place, plan, _ = load_stored_plan(study, out)
     name = response or plan.study.responses[0]
     if name not in metrics.QUANTITIES:
         metrics.response(name, "response")
-    with open_store(study, out) as stored:
+    with place.open() as stored:
         points = stored.points()
-        found = analysis.worst_of_levels(
-            plan.study, stored, name, chosen_levels(where or []), count
-        )
+        chosen = {
+            key: parse_yaml(text)[1]
+            for key, text in parse_overrides(where, "where", "FACTOR=LEVEL").items()
+        }
+        found = analysis.worst_of_levels(plan.study, stored, name, chosen, count)
     rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
-    repeat = command(study, out, "replay")
+    repeat = place.command("replay")
     if json:
         print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
     else:
-        instead = f"{command(study, out, 'worst')} --response roll_arcsec"
+        instead = f"{place.command('worst')} --response roll_arcsec"
         levels = [points[one.point].levels for one in found]
         print_worst(analysis.ranked(name), found, levels, repeat, instead)
-
-
-def chosen_levels(words: list[str]) -> dict[str, Any]:
-    """Levels by factor from FACTOR=LEVEL. Raises InputError."""
-    from skysim.core.yaml_reader import parse_overrides, parse_yaml
-
-    return {
-        key: parse_yaml(text)[1]
-        for key, text in parse_overrides(words, "where", "FACTOR=LEVEL").items()
-    }
 
 
 # Registered last to be the last in `skysim study --help`.
@@ -302,8 +285,7 @@ app.command("optimize", help=SEARCH_HELP)(run)
 
 def run_and_report(
     plan: Plan,
-    study: str,
-    out: Path | None,
+    place: Place,
     engine: Engine,
     overrides: dict[str, str],
     json: bool,
@@ -323,11 +305,10 @@ def run_and_report(
     from skysim.experiments.study import search
     from skysim.experiments.study.execution import runner, store
 
-    path = folder_of(study, out) / store.STORE
     total = plan.study.trial_count(len(plan.points))
-    resume_command = command(study, out, "resume")
+    resume_command = place.command("resume")
     with (
-        store.writing(path) as stored,
+        store.writing(place.store) as stored,
         interruptible(resume_command, stored),
         closing(engine),
     ):
@@ -346,10 +327,8 @@ def run_and_report(
             f"{counts['done']} of {total} trials done within the budget; continue: {resume_command}"
         )
     if counts["failed"]:
-        print_error(
-            f"{counts['failed']} trials failed; list them: {command(study, out, 'status')}"
-        )
-    write_report(plan, study, out, json, open_)
+        print_error(f"{counts['failed']} trials failed; list them: {place.command('status')}")
+    write_report(plan, place, json, open_)
 
 
 @contextmanager
@@ -364,14 +343,14 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
         raise
 
 
-def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bool) -> None:
+def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
     from skysim.experiments.study import search, table
     from skysim.experiments.study.report import study_report
 
-    path = folder_of(study, out) / "report.html"
-    with open_store(study, out) as stored:
-        command = study_report.commands(plan, stored, study, out)
+    path = place.folder / "report.html"
+    with place.open() as stored:
+        command = study_report.commands(plan, stored, *place)
         found = study_report.analyze(plan, stored, command)
         report = study_report.compose(plan.study, stored, found, command)
         progress = study_status(plan, stored)
@@ -393,13 +372,42 @@ def write_report(plan: Plan, study: str, out: Path | None, json: bool, open_: bo
     print_json(progress | told | (search.front_columns(found.result) if found.result else {}))
 
 
-def located(study: str, out: Path | None) -> tuple[str, Path | None]:
-    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
-    from skysim.experiments.study.execution import store
+class Place(NamedTuple):
+    """A study's file or name, and the folder of --out; store and report are in its folder."""
 
-    if out is not None or not (Path(study) / store.STORE).is_file():
-        return study, out
-    with store.open_store(Path(study) / store.STORE) as stored:
+    study: str
+    out: Path | None
+
+    @property
+    def folder(self) -> Path:
+        return output_folder(self.out, Path(self.study).stem)
+
+    @property
+    def store(self) -> Path:
+        from skysim.experiments.study.execution import store
+
+        return self.folder / store.STORE
+
+    def open(self) -> AbstractContextManager[Store]:
+        """The study's store, opened for reading. Raises InputError if there is none."""
+        from skysim.experiments.study.execution import store
+
+        return store.open_store(self.store)
+
+    def command(self, verb: str) -> str:
+        """The shell command that applies `verb` to the study."""
+        from skysim.experiments.study.report.study_report import shell_command
+
+        return shell_command(*self, {}, verb)
+
+
+def located(study: str, out: Path | None) -> Place:
+    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
+    folder = Path(study)
+    inside = Place(study, folder)
+    if out is not None or not inside.store.is_file():
+        return Place(study, out)
+    with inside.open() as stored:
         file = stored.meta("file")
     if not Path(file).is_file():
         raise InputError(
@@ -407,7 +415,7 @@ def located(study: str, out: Path | None) -> tuple[str, Path | None]:
             f"no such file as its study, {file or 'not stored'}",
             f"STUDY --out {study}",
         )
-    return file, Path(study)
+    return Place(file, folder)
 
 
 def load_stored_plan(
@@ -416,8 +424,8 @@ def load_stored_plan(
     program: list[str] | None = None,
     set_: list[str] | None = None,
     grows: bool = False,
-) -> tuple[Plan, dict[str, str]]:
-    """Load the study with the overrides saved in its store; return the plan and the overrides.
+) -> tuple[Place, Plan, dict[str, str]]:
+    """Load the study with the overrides saved in its store; return its place, the plan and the overrides.
 
     Parameters
     ----------
@@ -438,20 +446,22 @@ def load_stored_plan(
     from skysim.experiments.study.execution import runner
     from skysim.tracking import tracker_interface
 
-    with open_store(study, out) as stored:
+    place = located(study, out)
+    with place.open() as stored:
         overrides = stored.overrides() | parse_overrides(set_)
         plan = study_file.load(
-            study,
+            place.study,
             overrides,
             None if program is None else tracker_interface.program_commands(program),
         )
         kept = runner.stored_replicates(plan, stored)
-        path = stored.path
     if not kept or (kept < plan.study.replicates and not grows):
         raise InputError(
-            path, "contains another study or an earlier version of this one", "another store"
+            place.store,
+            "contains another study or an earlier version of this one",
+            "another store",
         )
-    return plan, overrides
+    return place, plan, overrides
 
 
 def start_workers(engine: str) -> None:
@@ -477,22 +487,3 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
             "--scheduler", "required with --engine dask and only then", "tcp://HOST:PORT"
         )
     return ENGINES[name](workers, scheduler)
-
-
-def folder_of(study: str, out: Path | None) -> Path:
-    """The folder of a study's store and report."""
-    return output_folder(out, Path(study).stem)
-
-
-def open_store(study: str, out: Path | None) -> AbstractContextManager[Store]:
-    """The study's store, opened for reading. Raises InputError if there is none."""
-    from skysim.experiments.study.execution import store
-
-    return store.open_store(folder_of(study, out) / store.STORE)
-
-
-def command(study: str, out: Path | None, verb: str) -> str:
-    """The shell command that applies `verb` to the study."""
-    from skysim.experiments.study.report.study_report import shell_command
-
-    return shell_command(study, out, {}, verb)

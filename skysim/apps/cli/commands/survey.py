@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,13 +14,6 @@ from skysim.core.errors import InputError
 FRAMES = 150
 NEXT = 12
 CHECKS = 40
-
-
-class Attitudes(StrEnum):
-    """How the attitudes of a survey are chosen."""
-
-    PLAN = "plan"
-    RANDOM = "random"
 
 
 FrameCount = Annotated[
@@ -65,7 +57,8 @@ Repeat = Annotated[
     ),
 ]
 AttitudesBy = Annotated[
-    Attitudes | None, typer.Option(help="Attitudes: by the plan (default), or random.")
+    Literal["plan", "random"] | None,
+    typer.Option(help="Attitudes: by the plan (default), or random."),
 ]
 Next = Annotated[
     int | None,
@@ -144,7 +137,7 @@ def survey(
         survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error, distortion),
         output_folder(out, loaded.name),
         tilt,
-        (attitudes or Attitudes.PLAN).value,
+        attitudes or "plan",
         frames or FRAMES,
         next_ or NEXT,
         json,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -11,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from estimator.trackers.pipeline import Settings
+from skysim.apps.cli.options import command_line
 from skysim.apps.cli.terminal import print_error, progress, progress_callback
 from skysim.apps.plate_solver import read_camera
 from skysim.core import files
@@ -182,22 +181,16 @@ def followed(
             for complaint in news.complaints:
                 print_error(str(complaint))
             if news.read and not request.quiet:
-                print_so_far(request, watched.pictures, before, stages)
+                pictures = watched.pictures
+                found = survey_images.frames_with_attitude(
+                    pictures, before, request.uncertainty, stages
+                )
+                print(
+                    f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude"
+                )
+                if found:
+                    print_coverage(request, found, before, None)
     return watched.pictures
-
-
-def print_so_far(
-    request: Request,
-    pictures: list[survey_images.SurveyImage],
-    before: CalibrationPrior,
-    stages: Settings,
-) -> None:
-    """Print the number of images, the LEDs that they measure, and the attitudes to hold next."""
-
-    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
-    print(f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude")
-    if found:
-        print_coverage(request, found, before, None)
 
 
 @contextmanager
@@ -280,9 +273,7 @@ def write_report(
 
     path = request.folder / "report.html"
     statistics |= {"report": str(path)}
-    report = survey_report.survey_report(
-        statistics, run, shlex.join(["skysim", *sys.argv[1:]])
-    )
+    report = survey_report.survey_report(statistics, run, command_line())
     report.save(path)
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
     if not request.quiet:

@@ -241,12 +241,12 @@ class MonteCarloPanel:
         ):
             return before
         self.run_number += 1
-        text = monte_carlo(*settings, self.run_number)
         folder = files.make_folder(
             self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}"
         )
-        files.write_text(folder / "monte_carlo.yaml", text)
-        return folder / "monte_carlo.yaml"
+        path = folder / "monte_carlo.yaml"
+        files.write_text(path, monte_carlo(*settings, self.run_number))
+        return path
 
     def effective_overrides(self, scene: str, trial: dict[str, Any]) -> dict[str, str]:
         """The changes of the scene that have an effect on a trial; a study with others would be refused."""
@@ -378,11 +378,12 @@ class MonteCarloPanel:
                 done = time.strftime(
                     "%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime)
                 )
+                # The study's title if its file is in the report's folder, else the folder's name.
+                file = next(iter(sorted(folder.glob("*.yaml"))), None)
+                title = (title_of(file) if file else "") or folder.name
                 with ui.row().classes("w-full no-wrap gap-3"):
                     ui.label(done).classes("mono quiet flex-none")
-                    link = ui.link(
-                        report_title(folder), f"/report/{quote(folder.name)}", new_tab=True
-                    )
+                    link = ui.link(title, f"/report/{quote(folder.name)}", new_tab=True)
                     link.classes("ellipsis").props["title"] = folder.name
             if not folders:
                 widgets.quiet("none yet")
@@ -396,12 +397,6 @@ def stored_study(folder: Path) -> Plan | None:
         return loader.load(file) if (folder / STORE).is_file() else None
     except (InputError, ValueError, OSError):  # a name with a null byte, or too long
         return None
-
-
-def report_title(folder: Path) -> str:
-    """The study's title if its file is in the report's folder, else the folder's name."""
-    file = next(iter(sorted(folder.glob("*.yaml"))), None)
-    return (title_of(file) if file else "") or folder.name
 
 
 def format_interval(value: float, low: float, high: float) -> str:

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Detection, FrameView, LightRow, SceneInfo, TrackerResult
+from skysim.apps.gui.messages import (
+    Detection,
+    FrameView,
+    LightRow,
+    SceneInfo,
+    TrackerResult,
+    places_px,
+)
 from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
@@ -211,7 +218,7 @@ def rows(
         light, else `quiet`
     """
     found = list(detections)
-    found_px = np.array([(one.x, one.y) for one in found]).reshape(-1, 2)
+    found_px = places_px(found)
     left = set(range(len(found)))
     for light in lights:
         distance_px = np.hypot(*(found_px - (light.x, light.y)).T)

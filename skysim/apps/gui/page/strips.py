@@ -306,23 +306,21 @@ def decades(values: list[float]) -> dict[str, float]:
 
 def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
     """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
-    color = CURVE_COLORS[k % len(CURVE_COLORS)]
-    look: dict[str, Any] = {
+    is_band = curve.kind == "band"
+    is_dots = curve.kind == "dots"
+    color = BAND_COLOR if is_band else CURVE_COLORS[k % len(CURVE_COLORS)]
+    look = {"areaStyle": {"color": color, "opacity": 0.22}} if is_band else {"symbolSize": 5}
+    return look | {
+        "name": curve.name,
+        "type": "scatter" if is_dots else "line",
+        "data": curve.points,
+        "animation": False,
+        "showSymbol": is_dots,
         "itemStyle": {"color": color},
-        "symbolSize": 5,
-        "showSymbol": curve.kind == "dots",
+        "lineStyle": {"width": 0.8 if is_band else 1.5, "color": color},
+        "xAxisIndex": n,
+        "yAxisIndex": n,
     }
-    if curve.kind == "band":
-        color = BAND_COLOR
-        look = {
-            "areaStyle": {"color": color, "opacity": 0.22},
-            "showSymbol": False,
-            "itemStyle": {"color": color},
-        }
-    line = {"lineStyle": {"width": 0.8 if curve.kind == "band" else 1.5, "color": color}}
-    kind = "scatter" if curve.kind == "dots" else "line"
-    data = {"name": curve.name, "type": kind, "data": curve.points, "animation": False}
-    return data | look | line | {"xAxisIndex": n, "yAxisIndex": n}
 
 
 def rms_line(rows: Sequence[FlightRow]) -> str:

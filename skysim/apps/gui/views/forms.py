@@ -172,28 +172,13 @@ def section_fields(
         elif file_key == "kind" and kinds:
             yield FormField(key, value, "", tuple(dict.fromkeys((*kinds, value))), is_set)
         else:
-            subtree = short_path(subtree)
-            text = (
-                yaml_line(subtree) if is_set else yaml_line(file_value(value, si_unit(name)))
-            )
-            yield FormField(
-                key, text, display_unit(file_key), allowed_values(annotation), is_set
-            )
-
-
-def short_path(value: Any) -> Any:
-    """Shorten the path of a shipped file to its name in scenes/."""
-    return (
-        str(Path(value).relative_to(SCENES))
-        if isinstance(value, str) and value.startswith(str(SCENES))
-        else value
-    )
-
-
-def display_unit(file_key: str) -> str:
-    """The unit of a number without unit, from the suffix of its key."""
-    match = UNIT_SUFFIX.search(file_key)
-    return DISPLAY_UNITS[match[1]] if match else ""
+            # The path of a shipped file is shortened to its name in scenes/.
+            if isinstance(subtree, str) and subtree.startswith(str(SCENES)):
+                subtree = str(Path(subtree).relative_to(SCENES))
+            text = yaml_line(subtree if is_set else file_value(value, si_unit(name)))
+            match = UNIT_SUFFIX.search(file_key)
+            unit = DISPLAY_UNITS[match[1]] if match else ""
+            yield FormField(key, text, unit, allowed_values(annotation), is_set)
 
 
 def allowed_values(annotation: Any) -> tuple[str, ...]:
@@ -283,7 +268,7 @@ def with_kind(
 ) -> dict[str, str]:
     """Overrides that change a section's kind: to that of the file, or to another with the keys that it requires.
 
-    Keys that both kinds have keep their values.
+    Keys that both kinds have, with the same type, keep their values; sections do not.
     """
     rest = {
         key: text
@@ -304,16 +289,12 @@ def with_kind(
         )
         if field != "kind"
         and field in now.model_fields_set
-        and same_field(model, field, info.annotation)
+        and field in model.model_fields
+        and model.model_fields[field].annotation == info.annotation
+        and not models(info.annotation)
     }
     found = first_section(model, kind, kept) or first_section(model, kind)
     return rest | {section: yaml_line(found)}
-
-
-def same_field(model: type[BaseModel], name: str, annotation: Any) -> bool:
-    """Whether a model has a field with this name and type that is not a section."""
-    field = model.model_fields.get(name)
-    return field is not None and field.annotation == annotation and not models(annotation)
 
 
 def section_at(scene: Scene, key: str) -> tuple[Any, Any]:

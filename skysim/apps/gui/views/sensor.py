@@ -28,6 +28,7 @@ from skysim.apps.gui.messages import (
     Pose,
     SceneInfo,
     TrackerResult,
+    places_px,
 )
 from skysim.apps.gui.views import overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveText
@@ -286,11 +287,12 @@ class SensorView:
             return int(distance_px.argmin()) if (distance_px < radius_px).any() else None
 
         detections = self.result.detections if self.result else ()
-        spot = nearest(np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2))
+        spot = nearest(places_px(detections))
         light = nearest(self.lights.xy_px)
-        return None if spot is None else detections[
-            spot
-        ], None if light is None else self.lights[light]
+        return (
+            None if spot is None else detections[spot],
+            None if light is None else self.lights[light],
+        )
 
     def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
         """Text on a light: its true place, its detection and the error."""

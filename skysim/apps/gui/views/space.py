@@ -6,6 +6,7 @@ A drag pulls at a point of the vehicle; frames show the motion.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import FrameView, LabGeometry, SceneInfo, Triple
+from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.style import DARK, color_scale
@@ -77,15 +78,17 @@ class Scene3D:
     def set_scene(self, scene_info: SceneInfo) -> None:
         lab = scene_info.geometry
         outside = lab.views["outside"]
-        distance_m = (
-            sum((a - b) ** 2 for a, b in zip(outside.eye_m, outside.target_m, strict=True))
-            ** 0.5
-        )
+        distance_m = math.dist(outside.eye_m, outside.target_m)
         self.canvas.run_method(
             "build",
             {
                 "shapes": [shape_fields(shape) for shape in lab.shapes],
-                "lights": light_fields(lab),
+                "lights": {
+                    "id": lab.ids.tolist(),
+                    "place": lab.lights_m.round(DIGITS).ravel().tolist(),
+                    "radius": lab.radius_m.round(DIGITS).tolist(),
+                    "lit": lab.lit.tolist(),
+                },
                 "views": {name: view._asdict() for name, view in lab.views.items()},
                 "background": DARK["ground"],
                 "prefix": scene_info.prefix,
@@ -227,14 +230,4 @@ def shape_fields(shape: Shape) -> dict[str, Any]:
         "on_vehicle": shape.on_vehicle,
         "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
         "faces": shape.faces.ravel().tolist(),
-    }
-
-
-def light_fields(lab: LabGeometry) -> dict[str, Any]:
-    """The lights for space.js."""
-    return {
-        "id": lab.ids.tolist(),
-        "place": lab.lights_m.round(DIGITS).ravel().tolist(),
-        "radius": lab.radius_m.round(DIGITS).tolist(),
-        "lit": lab.lit.tolist(),
     }

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from estimator.core.types import Attitude
 from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
@@ -116,19 +115,9 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
     # Depths along the boresight; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
-    return Pose(rotation, tuple(place_m.tolist()), tuple(rounded(depth_m)))
-
-
-def rounded(depth_m: Floats) -> list[float | None]:
-    """Depths to 0.01 mm; None for a ray that meets nothing."""
-    return [None if np.isnan(value) else round(float(value), 5) for value in depth_m]
-
-
-def solved_pose(attitude: Attitude) -> Pose | None:
-    """The tracker's attitude of an image from elsewhere; None if it was not solved."""
-    if attitude.cam_from_ref is None:
-        return None
-    return Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
+    # To 0.01 mm; None for such a ray.
+    depths_m = (None if math.isnan(depth) else round(depth, 5) for depth in depth_m.tolist())
+    return Pose(rotation, tuple(place_m.tolist()), tuple(depths_m))
 
 
 # Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity.

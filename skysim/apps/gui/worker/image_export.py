@@ -15,7 +15,7 @@ import yaml
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import TrackerResult
+from skysim.apps.gui.messages import TrackerResult, places_px
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
@@ -61,7 +61,7 @@ def frame_files(
 
 def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
     """The files of an image that is not of the scene, by name: it has no truth, and the scene says nothing about it."""
-    detected = np.array([(spot.x, spot.y) for spot in photo.result.detections]).reshape(-1, 2)
+    detected = places_px(photo.result.detections)
     identified = np.array([spot.id >= 0 for spot in photo.result.detections], bool)
     record = solution_record(photo.result) | {"solution": photo.solution, "hint": photo.hint}
     buffer = BytesIO()

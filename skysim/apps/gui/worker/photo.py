@@ -168,7 +168,8 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)
     photo = Photo((width, height), result, solution, statistics)
-    if attitude.solved:
-        camera = attitude.camera or tracker.camera
-        photo = replace(photo, lens=lenses.lens_of(camera), pose=lenses.solved_pose(attitude))
+    if attitude.cam_from_ref is not None:
+        lens = lenses.lens_of(attitude.camera or tracker.camera)
+        pose = Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
+        photo = replace(photo, lens=lens, pose=pose)
     return replace(photo, saturation_dn=saturation_dn), image

@@ -200,13 +200,11 @@ def is_shown(name: str, user: str) -> bool:
 
 def finished(folder: Path, user: str) -> list[Path]:
     """Folders of the studies that have a report and are shown to a user, newest first."""
-    folders = [
-        path.parent
-        for path in folder.glob("*/report.html")
-        if (path.parent / STORE).is_file()
+    folders = (path.parent for path in folder.glob("*/report.html"))
+    shown = [
+        path for path in folders if (path / STORE).is_file() and is_shown(path.name, user)
     ]
-    folders = [path for path in folders if is_shown(path.name, user)]
-    return sorted(folders, key=lambda path: -(path / "report.html").stat().st_mtime)
+    return sorted(shown, key=lambda path: -(path / "report.html").stat().st_mtime)
 
 
 if __name__ == "__main__":
