@@ -148,7 +148,7 @@ def common_shifts_m(leds: LedMap, star: Ints, lever: Lever, cam_from_lab: Rotati
     shift_m = leds.common_m[:, star] @ cam_from_lab.as_matrix().T
     if leds.common_camera is not None:
         shift_m -= lever.cam_from_body.apply(leds.common_camera[:, :3])[:, None]
-    return np.asarray(shift_m)
+    return shift_m
 
 
 def common_images_px(leds: LedMap, camera: Camera, rays_cam: Floats) -> Floats:

@@ -100,7 +100,7 @@ def streak_factor(camera: Camera, velocity_tan_s: Floats) -> Floats:
         (N, 2) velocity of the tangents, 1/s
     """
     rows = camera.focal_px * camera.row_time_s * velocity_tan_s[:, 1]  # v_y tau
-    return np.asarray(1 / (1 - rows))
+    return 1 / (1 - rows)
 
 
 def at_middle_row(
@@ -147,7 +147,7 @@ def covariance_of(centroids: Centroids) -> Floats:
     """Return the (N, 2, 2) covariance of each centroid, px^2."""
     if centroids.covariance_px2 is not None:
         return centroids.covariance_px2
-    return np.asarray(centroids.sigma_px[:, None, None] ** 2 * np.eye(2))
+    return centroids.sigma_px[:, None, None] ** 2 * np.eye(2)
 
 
 # Angular rate from streaks.
@@ -217,7 +217,7 @@ def inverses(matrices: Floats) -> Floats:
 def aligned(chord: Floats, information: Floats, predicted: Floats) -> Floats:
     """Return the (N, 2) chords, each with the sign that is nearer to a predicted one."""
     along = np.einsum("ni,nij,nj->n", predicted, information, chord)
-    return np.asarray(chord * np.where(along < 0, -1.0, 1.0)[:, None])
+    return chord * np.where(along < 0, -1.0, 1.0)[:, None]
 
 
 def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
@@ -228,7 +228,7 @@ def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
     """
     distance2 = np.einsum("ni,nij,nj->n", residual, information, residual)
     excess = max(1.0, float(np.median(distance2)))
-    return np.asarray(distance2 < OUTLIER_CHI2 * excess)
+    return distance2 < OUTLIER_CHI2 * excess
 
 
 def _fit(

@@ -152,7 +152,7 @@ def _solve(normal: Floats, gradient: Floats, lights: int) -> Floats:
     sizes = np.outer(size, size)
     if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
         raise ValueError(f"{lights} lights do not determine attitude and rate")
-    return np.asarray(np.linalg.solve(normal / sizes, gradient / size) / size)
+    return np.linalg.solve(normal / sizes, gradient / size) / size
 
 
 def _place_rows(
@@ -215,4 +215,4 @@ def rate_covariance_rad2(
     products = np.swapaxes(jacobian, 1, 2) @ information @ jacobian  # J^T W J
     delay_s = camera.row_delays_s(centroids.xy_px)[:, None, None]
     gain = np.linalg.solve(np.sum(products, axis=0), np.sum(products * delay_s, axis=0))
-    return np.asarray(gain @ covariance_rad2_s2 @ gain.T)
+    return gain @ covariance_rad2_s2 @ gain.T

@@ -151,7 +151,7 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
 
     def value(sigma_m: float) -> Floats:
         variance_m2 = np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2
-        return np.asarray(np.sum(squared_m2 / variance_m2, axis=1))
+        return np.sum(squared_m2 / variance_m2, axis=1)
 
     # 2. Bisection: the median falls with s.
     low = 0.0
@@ -178,7 +178,7 @@ def found_displacements_m(covariance_m2: Floats, sigma_m: float) -> Floats:
     """
     measured = covariance_m2[np.isfinite(covariance_m2).all(axis=(1, 2))]
     greatest_m2 = np.linalg.eigvalsh(measured)[:, 2] + sigma_m**2
-    return np.asarray((np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2))
+    return (np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2)
 
 
 def _limit(count: int) -> float:
@@ -275,7 +275,7 @@ def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
     toward = place_m - origins
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    return np.asarray(np.linalg.norm(np.cross(toward, directions), axis=1))
+    return np.linalg.norm(np.cross(toward, directions), axis=1)
 
 
 def name_strays(
@@ -479,7 +479,7 @@ def _log_likelihood(table: LightTable) -> Floats:
     chi2 = (mean / between_sigma) ** 2 + within / within_sigma**2
     out = wrong * np.log(CHANCE) - chi2 / 2
     out[~tested] = 0.0
-    return np.asarray(out)
+    return out
 
 
 def _observable(

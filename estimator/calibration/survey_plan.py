@@ -354,4 +354,4 @@ def _reduction(row: _Row, blocks: Floats) -> Floats:
     own = np.arange(2 * count).reshape(count, 2)
     matrix[own[:, :, None], own[:, None, :]] += np.einsum("kaj,kbj->kab", gain, row.by_led)
     weight = np.linalg.inv(matrix)[own[:, :, None], own[:, None, :]]
-    return np.asarray(np.einsum("kai,kab,kbj->kij", gain, weight, gain))
+    return np.einsum("kai,kab,kbj->kij", gain, weight, gain)

@@ -276,7 +276,7 @@ class CodedTracker(DomeTracker):
         self.phases[:] = False
         for step in (-1, 0, 1):
             self.phases[(tried[allowed] + step) % len(self.phases)] = True
-        return np.asarray(each[:, allowed].swapaxes(0, 1))
+        return each[:, allowed].swapaxes(0, 1)
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """Return the (K, 3) rays of centroids and the (K,) errors of their tangents, map and lever included."""

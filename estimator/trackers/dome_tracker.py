@@ -181,13 +181,13 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
     along = leds.position_m / radius_m[:, None]
     total_m2 = np.trace(leds.covariance_m2, axis1=1, axis2=2)
     along_m2 = np.einsum("ni,nij,nj->n", along, leds.covariance_m2, along)
-    return np.asarray(np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m))
+    return np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m)
 
 
 def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
     """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
     tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
-    return np.asarray(camera.focal_sigma * tangent / np.sqrt(2))
+    return camera.focal_sigma * tangent / np.sqrt(2)
 
 
 class DomeTracker:

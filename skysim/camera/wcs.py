@@ -207,8 +207,8 @@ def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]
 
     def inside(out: float) -> NDArray[np.bool_]:
         # Distorted pixels within the chip and a fraction `out` of its sides.
-        return np.asarray(
-            ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1)
+        return ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(
+            axis=1
         )
 
     on_fit_area = inside(MARGIN)

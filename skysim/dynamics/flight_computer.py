@@ -50,7 +50,7 @@ def authority_nm(actuators: Actuators) -> float:
 def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
     """(N,) ratio of the greatest command to its limit, for torques (N, 3) on the body."""
     command_from_torque, limit = actuators.command_map()
-    return np.asarray(np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit)
+    return np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit
 
 
 def ideal_torque(vehicle: VehicleModel) -> IdealTorque:

@@ -147,7 +147,7 @@ def factors(variances: Floats, rng: np.random.Generator) -> Floats:
     """
     log_variance = np.log1p(variances)
     normal = rng.standard_normal(len(variances))
-    return np.asarray(np.exp(np.sqrt(log_variance) * normal - log_variance / 2))
+    return np.exp(np.sqrt(log_variance) * normal - log_variance / 2)
 
 
 # Extinction: the light that the air absorbs and scatters.
@@ -308,7 +308,7 @@ def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
         [-sin_l, cos_l, 0.0],
         [cos_b * cos_l, cos_b * sin_l, sin_b],
     ]
-    return np.asarray(np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0))
+    return np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0)
 
 
 def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
@@ -316,8 +316,8 @@ def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
     if config is None:
         return np.zeros(len(azimuth_rad))
     table_rad = np.radians(config.azimuth_deg)
-    return np.asarray(
-        np.interp(azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi)
+    return np.interp(
+        azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi
     )
 
 

@@ -185,7 +185,7 @@ class BodyLight:
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
         # On the tangent plane at the disc's center.
         vectors = center + np.tan(self.radius_rad) * offset
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
     def overlaps(self, other: BodyLight) -> bool:
         """Whether the disc overlaps another body's disc."""

@@ -53,7 +53,7 @@ class Pointing(NamedTuple):
         left = unit(np.cross(states.position_m, states.velocity_m_s))
         ahead = np.cross(left, up)
         level = np.cos(self.around_rad) * ahead + np.sin(self.around_rad) * left
-        return np.asarray(np.cos(self.off_rad) * up + np.sin(self.off_rad) * level)
+        return np.cos(self.off_rad) * up + np.sin(self.off_rad) * level
 
 
 class SkySamples(NamedTuple):
@@ -147,4 +147,4 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
 
 def unit(vectors: Floats) -> Floats:
     """Normalized (K, 3) vectors."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -248,7 +248,7 @@ def gcrs_from_teme(time: datetime.datetime) -> Floats:
     # The difference of both angles about the pole.
     ut1 = ut1_jd(time)
     angle = erfa.gmst82(ut1, 0.0) - erfa.era00(ut1, 0.0)
-    return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
+    return erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3))
 
 
 # OEM: segments of metadata (META_START ... META_STOP) and lines of an epoch, a position in km, a velocity in km/s and,
@@ -343,7 +343,7 @@ def gravity_m_s2(position_m: Floats) -> Floats:
     flattened = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
     polar = 5 * (position_m[:, 2:] / r) ** 2
     factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
-    return np.asarray(-EARTH_MU_M3_S2 / r**3 * position_m * factors)
+    return -EARTH_MU_M3_S2 / r**3 * position_m * factors
 
 
 def split_segments(path: str) -> list[TextSegment]:

@@ -353,7 +353,7 @@ def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
         next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray"
     )
     fainter_mag = gaia["v_mag"][pairs["j"]] - hip["v_mag"][pairs["i"]]
-    return np.asarray(pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)])
+    return pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)]
 
 
 def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray[Any]) -> None:
@@ -365,7 +365,7 @@ def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray[Any]
 def nearest(pairs: NDArray[Any], side: str) -> NDArray[Any]:
     """One pair for each star on a side (`i` or `j`): the pair with its nearest neighbor."""
     pairs = pairs[np.argsort(pairs["v"], kind="stable")]
-    return np.asarray(pairs[np.unique(pairs[side], return_index=True)[1]])
+    return pairs[np.unique(pairs[side], return_index=True)[1]]
 
 
 def mutual_nearest(pairs: NDArray[Any]) -> NDArray[Any]:
@@ -379,4 +379,4 @@ def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
     near = np.bincount(
         pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light)
     )
-    return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))
+    return -2.5 * np.log10(np.where(near < light / 2, light - near, light))

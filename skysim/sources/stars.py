@@ -73,9 +73,7 @@ def apparent(
     own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(
-        apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True)
-    )
+    return apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True)
 
 
 def varied(stars: Catalog, seed: int) -> Catalog:
@@ -107,7 +105,7 @@ def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Float
         np.asarray(to_m_s) / SPEED_OF_LIGHT_M_S,
     ):
         direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(direction)
+    return direction
 
 
 def sources(

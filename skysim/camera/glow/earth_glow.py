@@ -67,7 +67,7 @@ def earth_radiance(
     path_in_layer = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0])
     layers = path_in_layer * np.where(ground, 1, 2) * down
     airglow = float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band))
-    return np.asarray(day + layers * airglow)
+    return day + layers * airglow
 
 
 def earth_light(
@@ -90,7 +90,7 @@ def earth_light(
     toward, pixel_sr, shape = fine_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
     radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
-    return np.asarray((radiance * view.etendue_m2_sr()).reshape(shape))
+    return (radiance * view.etendue_m2_sr()).reshape(shape)
 
 
 @lru_cache(maxsize=4)

@@ -117,7 +117,7 @@ def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
         2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
     )
     values[0, 0] = 1.0
-    return np.asarray(values)
+    return values
 
 
 def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:

@@ -308,9 +308,7 @@ def round_error(
     gradient = np.minimum(
         gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px
     )
-    return np.asarray(
-        (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
-    )
+    return (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
 
 
 def ellipse_disks(

@@ -213,7 +213,7 @@ def read_cells(file: str) -> Floats:
             f"{path}: its numbers add up to {total:g}",
             "a finite sum above 0",
         )
-    return np.asarray(cells / total)
+    return cells / total
 
 
 def cell_response(u: Floats) -> Floats:

@@ -267,7 +267,7 @@ def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
             f"{len(names)}, one for each of {', '.join(names)}, or none",
         )
     position_m = np.array(config.position_m or (0.0,) * len(names))
-    return np.asarray(config.step_m * np.round(position_m / config.step_m))
+    return config.step_m * np.round(position_m / config.step_m)
 
 
 def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:

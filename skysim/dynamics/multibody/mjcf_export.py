@@ -255,7 +255,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
         radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
         panel_m = np.clip(radius_m * around, -half_m, half_m)
-        return np.asarray(inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T)
+        return inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T
     # 3. Any other surface.
     upright = inside.lab_from_own.magnitude() == 0
     if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
@@ -265,8 +265,8 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     half = inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
     polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
-    return np.asarray(
-        inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up)
+    return inside.center_m + inside.semi_axes_m * (
+        np.sin(polar) * around + np.cos(polar) * up
     )
 
 

@@ -249,9 +249,7 @@ def response_px(
 
     def image(offset_px: Floats) -> Floats:
         """(P, window) share of a Gaussian's light in each pixel, with its center displaced along x."""
-        return np.asarray(
-            np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2)
-        )
+        return np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2)
 
     own = image(np.zeros(1))
     other = image(apart_px[:, None])
@@ -260,7 +258,7 @@ def response_px(
     total_e = star_e + neighbor_e * np.exp(-(apart_px**2) / (4 * s2))
     pull = neighbor_e * (weight * slope * other).sum(axis=1)
     stiffness = total_e * (weight * slope**2).sum(axis=1)
-    return np.asarray(pull / stiffness)
+    return pull / stiffness
 
 
 def common(

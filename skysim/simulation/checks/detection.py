@@ -161,7 +161,7 @@ def detected_radius_px(view: View, context: Context) -> Floats:
 def detected_area_px(view: View, context: Context) -> Floats:
     """(n,) area pi r^2 + 2 r L in px^2 of each image above the detection threshold, on a path of length L."""
     radius = detected_radius_px(view, context)
-    return np.asarray(np.pi * radius**2 + 2 * radius * view.streak_length_px)
+    return np.pi * radius**2 + 2 * radius * view.streak_length_px
 
 
 def usable(view: View, context: Context) -> View:
@@ -230,7 +230,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     along_path = unit[:, :, None] * unit[:, None, :]
     # 4. Timing.
     moved = (view.streak_px / lab.scene.exposure.time_s) * context.timing_s[view.row, None]
-    return np.asarray(
+    return (
         ((across + pattern + plateau)[:, None] + floor)[:, :, None] * np.eye(2)
         + (along - across)[:, None, None] * along_path
         + moved[:, :, None] * moved[:, None, :]
@@ -249,7 +249,7 @@ def fit(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) ->
 
 def window(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
     """A Gaussian of twice the image's variance."""
-    return np.asarray(u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum())))
+    return u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum()))
 
 
 WEIGHTS: dict[str, Weight] = {
@@ -351,4 +351,4 @@ def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:
         total = lit.sum(axis=1)
         mean = (lit * (first + last) / 2).sum(axis=1)[total > 0] / total[total > 0]
         sigma[k] = np.std(mean) if len(mean) else 0.0
-    return np.asarray(sigma[index.ravel()])
+    return sigma[index.ravel()]

@@ -274,15 +274,15 @@ def gains(view: View, covariance_px2: Floats, fitted: Floats | None = None) -> F
     if np.linalg.cond(information) > 1e14:
         raise np.linalg.LinAlgError("singular")
     inverse = np.linalg.inv(information) / np.outer(size, size)
-    return np.asarray((inverse @ np.swapaxes(weighted, 1, 2))[:, :3])
+    return (inverse @ np.swapaxes(weighted, 1, 2))[:, :3]
 
 
 def covariance(gain: Floats, errors: Independent | Common) -> Floats:
     """(3, 3) covariance of the rotation in camera axes in rad^2: sum K_i S_i K_i', or B B' with B = sum K_i E_i."""
     if isinstance(errors, Independent):
-        return np.asarray(np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain))
+        return np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain)
     response = np.einsum("nij,njk->ik", gain, errors.displacement_px)
-    return np.asarray(response @ response.T)
+    return response @ response.T
 
 
 def believed_px2(view: View, context: Context, prnu: float | None = None) -> Floats:
@@ -300,7 +300,7 @@ def believed_px2(view: View, context: Context, prnu: float | None = None) -> Flo
         camera, leds, lever = beliefs.dome
         survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
     added_px2 = settings.centroid_sigma_px**2 + survey_px**2
-    return np.asarray(own + added_px2[:, None, None] * np.eye(2))
+    return own + added_px2[:, None, None] * np.eye(2)
 
 
 def believed_sigma_px(view: View, context: Context) -> Floats:
@@ -404,7 +404,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     except (ValueError, np.linalg.LinAlgError):
         return None
     error = cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()
-    return np.asarray(error.as_rotvec())
+    return error.as_rotvec()
 
 
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:

@@ -526,7 +526,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
     moved = thermal_motion.camera_at(config, mount, optics, t_s)
     drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
-    return np.asarray(np.einsum("nij,nj->i", gain, drifted_px - surveyed_px))
+    return np.einsum("nij,nj->i", gain, drifted_px - surveyed_px)
 
 
 def image_px(

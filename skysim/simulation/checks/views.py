@@ -291,9 +291,7 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
-    return np.asarray(
-        np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
-    )
+    return np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
 
 
 def peak_share(
@@ -317,4 +315,4 @@ def peak_share(
     # With x = L / (2 sqrt 2 S) the factor is sqrt(pi) / 2 erf(x) / x.
     sigma = 1 / np.sqrt(2 * np.pi * still)
     x = np.maximum(streak_px, 1e-9) / (2 * np.sqrt(2) * sigma)
-    return np.asarray(still * np.sqrt(np.pi) / 2 * special.erf(x) / x)
+    return still * np.sqrt(np.pi) / 2 * special.erf(x) / x

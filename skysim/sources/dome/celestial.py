@@ -227,4 +227,4 @@ def led_levels(
     brightest_mag = -np.inf if config.brightest_mag is None else config.brightest_mag
     shown_mag = np.maximum(stars.shown_mag, brightest_mag)
     needed = 10 ** (-0.4 * shown_mag) / gain
-    return np.asarray(needed / needed.max())
+    return needed / needed.max()

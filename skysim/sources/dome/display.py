@@ -98,7 +98,7 @@ def gray_transmission(config: layouts.PixelsConfig, level: Floats) -> Floats:
     Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
     """
     top = config.gray_levels - 1
-    return np.asarray((np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma)
+    return (np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma
 
 
 def min_level(config: layouts.PixelsConfig) -> float:
@@ -400,14 +400,14 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
         [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
     )
     own /= np.linalg.norm(own, axis=1, keepdims=True)
-    return np.asarray(own_from_lab(config).inv().apply(own))
+    return own_from_lab(config).inv().apply(own)
 
 
 def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
     """(N,) solid angles w of pixels at these cosines from the axis."""
     tangent2 = 1 / cos_axis**2 - 1
     stretch = (1 + config.distortion * tangent2) * (1 + 3 * config.distortion * tangent2)
-    return np.asarray((config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch)
+    return (config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch
 
 
 def spot_radius_m(
@@ -437,7 +437,7 @@ def spot_radius_m(
     for axis in R_own_from_lab[:2]:
         on_wall = axis - (normal @ axis / np.sum(normal * ray, axis=1))[:, None] * ray
         square_m2 += blur_m**2 / 2 * np.sum(on_wall**2, axis=1)
-    return np.asarray(np.sqrt(square_m2))
+    return np.sqrt(square_m2)
 
 
 def projector_sources(

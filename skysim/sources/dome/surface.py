@@ -60,9 +60,7 @@ class Rim:
         # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
         slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
-        return np.asarray(
-            (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
-        )
+        return (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,7 @@ class Surface(ABC):
         along = rays @ R_lab_from_own
         distance = self.distance(start, along)
         within = self.within(start + distance[:, None] * along)
-        return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
+        return origin_m + np.where(within, distance, np.nan)[:, None] * rays
 
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
@@ -125,7 +123,7 @@ class Surface(ABC):
         gradient = (
             self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
         )
-        return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+        return -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point (3,) of the lab is inside; the rim is ignored."""
@@ -172,7 +170,7 @@ def perpendicular(unit: Floats) -> Floats:
     """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
     # The axis on which the vector has its least component is never parallel to it.
     across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
-    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
 
 
 def exit_distance(start: Floats, along: Floats) -> Floats:
@@ -198,10 +196,10 @@ class Ellipsoid(Surface):
     semi_axes_m: Floats
 
     def level(self, own_m: Floats) -> Floats:
-        return np.asarray(np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1)
+        return np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1
 
     def gradient(self, own_m: Floats) -> Floats:
-        return np.asarray(own_m / self.semi_axes_m**2)
+        return own_m / self.semi_axes_m**2
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m, along / self.semi_axes_m)
@@ -244,7 +242,7 @@ class Plane(Surface):
         return np.where(distance > 0, distance, np.nan)
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
-        return np.asarray(np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1))
+        return np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1)
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
@@ -275,17 +273,17 @@ class Cylinder(Surface):
         return np.where(np.arange(3) == self.axis, along_m, self.radius_m)
 
     def level(self, own_m: Floats) -> Floats:
-        return np.asarray(np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1)
+        return np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1
 
     def gradient(self, own_m: Floats) -> Floats:
-        return np.asarray(own_m / self.semi_axes_m() ** 2)
+        return own_m / self.semi_axes_m() ** 2
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
 
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
-        return np.asarray(self.rim.contains(own_m) & inside_ends)
+        return self.rim.contains(own_m) & inside_ends
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
@@ -374,7 +372,7 @@ class Radial(Surface):
     def within(self, own_m: Floats) -> NDArray[np.bool_]:
         """(N,) whether points are within the rim and in directions for which the radius is defined."""
         cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
-        return np.asarray(self.rim.contains(own_m) & (cosine >= -SLACK_M))
+        return self.rim.contains(own_m) & (cosine >= -SLACK_M)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """Newton's method within a bracket, for all rays at once.

@@ -109,9 +109,7 @@ def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
 def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Floats:
     """(..., 3) places moved as a rigid body by the set-up's errors c and r: station's place, leveling, orientation."""
     station_m = np.array(config.position_m)
-    return np.asarray(
-        station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
-    )
+    return station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
 
 
 def surveyed_m(
@@ -252,7 +250,7 @@ def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
     """
     along = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
     along_m2 = np.einsum("ni,nij,nj->n", along, covariance_m2, along)
-    return np.asarray(np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2))
+    return np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2)
 
 
 def common_displacements_m(

@@ -341,10 +341,10 @@ def marked_m(
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line
     # 3.
     drill_m = scaled_errors(config.drill_sigma_m, rng.standard_normal((len(line), 2)))
-    return np.asarray(mark_m + along_two_axes(normal, drill_m))
+    return mark_m + along_two_axes(normal, drill_m)
 
 
 def along_two_axes(unit: Floats, size: Floats) -> Floats:
     """(N, 3) vectors perpendicular to unit vectors (N, 3), with components (N, 2) along two axes across them."""
     first = perpendicular(unit)
-    return np.asarray(size[:, :1] * first + size[:, 1:] * np.cross(unit, first))
+    return size[:, :1] * first + size[:, 1:] * np.cross(unit, first)
