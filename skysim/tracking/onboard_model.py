@@ -27,11 +27,11 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.sources.air import weather_of
 from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.catalog import require_catalog
-from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome import display, surface, survey_errors
 from skysim.sources.dome.codebooks import codebook, light_levels
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
@@ -306,6 +306,20 @@ def assumed_orbit(scene: Scene) -> CameraOrbit | None:
     return (
         build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
     )
+
+
+def assumed_stars(
+    scene: Scene, orbit: CameraOrbit | None
+) -> tuple[catalog.StarCatalog, Floats]:
+    """The tracker's stars and their apparent directions (N, 3) at the scene's start, in lab axes. Raises InputError."""
+    stars = catalog.brighter_than(
+        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
+    )
+    directions = catalog.apparent(stars, assumed_observer(scene, orbit))
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        # The mounting of the display defines the stars' directions in the lab frame.
+        directions = display.lab_from_icrs(scene.light).apply(directions)
+    return stars, directions
 
 
 def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:

@@ -21,17 +21,15 @@ from estimator.core.camera import Camera
 from skysim.core.types import Floats, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
-from skysim.sources.dome import display
 from skysim.tracking import dome_map_file
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import (
     assumed_camera,
-    assumed_observer,
     assumed_orbit,
-    onboard_catalog,
+    assumed_stars,
     onboard_dome,
 )
 
@@ -166,12 +164,7 @@ def believed_stars(lab: Lab) -> StarCatalog:
     Raises InputError for a catalog that cannot be read.
     """
     scene = lab.scene
-    stars = catalog.brighter_than(
-        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
-    )
-    directions = catalog.apparent(stars, assumed_observer(scene, assumed_orbit(scene)))
-    if isinstance(scene.light, CollimatedDisplayConfig):
-        directions = display.lab_from_icrs(scene.light).apply(directions)
+    stars, directions = assumed_stars(scene, assumed_orbit(scene))
     merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px
     return catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
 
