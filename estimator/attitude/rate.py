@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Bools, Floats
 from estimator.core.errors import ImageError
 from estimator.core.least_squares import misfit_factor
 from estimator.core.types import Centroids, RateEstimate
@@ -52,7 +52,7 @@ class Sight(NamedTuple):
     lever_cam_m: Floats
     radius_m: Floats | float
 
-    def take(self, which: NDArray[Any]) -> Sight:
+    def take(self, which: NDArray) -> Sight:
         """Select lights by mask or index."""
         if not isinstance(self.radius_m, np.ndarray):
             return self
@@ -220,7 +220,7 @@ def aligned(chord: Floats, information: Floats, predicted: Floats) -> Floats:
     return chord * np.where(along < 0, -1.0, 1.0)[:, None]
 
 
-def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
+def inliers(residual: Floats, information: Floats) -> Bools:
     """Return (N,) whether a residual (N, 2) is no outlier.
 
     The limit of the squared Mahalanobis distance is OUTLIER_CHI2, times the median of all where that is above 1: it

@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -25,10 +24,9 @@ from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
 
-Mask = NDArray[np.bool_]
 FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
 CHI2_MEDIAN = 2.366  # median of a chi-square of three degrees of freedom
@@ -52,7 +50,7 @@ class HeldFrames:
     lever: Lever
     body_from_lab: Rotation
 
-    def shown(self, margin_px: float | Floats, apart_px: float) -> Mask:
+    def shown(self, margin_px: float | Floats, apart_px: float) -> Bools:
         """Return (F, N) whether a frame must show an LED if that shines.
 
         It must if the LED is inside the frame by a margin, and far enough from all other LEDs.
@@ -105,7 +103,7 @@ class StrayLight:
     frames: int
 
 
-def dark(shown: Mask, seen: Mask) -> Ints:
+def dark(shown: Bools, seen: Bools) -> Ints:
     """Return the rows of the LEDs that never shine: seen in none of the n frames that must show them.
 
     With the share p of the other LEDs' images that are detected, chance leaves one of N LEDs unseen in N (1 - p)^n
@@ -320,7 +318,7 @@ class LightTable:
     """
 
     light: Floats
-    shown: Mask
+    shown: Bools
     expected: Floats
 
 
@@ -483,7 +481,7 @@ def _log_likelihood(table: LightTable) -> Floats:
 
 
 def _observable(
-    table: LightTable, likelihood: Floats, tested: Mask, least: float
+    table: LightTable, likelihood: Floats, tested: Bools, least: float
 ) -> float | None:
     """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
 

@@ -21,6 +21,7 @@ from estimator.core.errors import ImageError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def known(what: str, name: object, allowed: Iterable[str]) -> None:

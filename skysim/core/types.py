@@ -16,6 +16,8 @@ from skysim.core.jit import jit
 from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 

@@ -230,7 +230,7 @@ class StarCamera:
     optics: Optics
     detector: Detector
     band: Band
-    canvas: NDArray[Any]
+    canvas: NDArray
     lights: tuple[Light, ...]
     channels: tuple[ColorChannel, ...]
     orbit: CameraOrbit | None
@@ -419,7 +419,7 @@ def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
     return tuple(channels)
 
 
-def build_canvas(scene: Scene) -> NDArray[Any]:
+def build_canvas(scene: Scene) -> NDArray:
     """The (H, W) array in which a camera's frames are drawn, see `StarCamera`."""
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)

@@ -17,13 +17,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
-from skysim.core.types import Floats, Mounting, Telemetry, Trajectory
+from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
@@ -222,7 +221,7 @@ def shortfall(lab: Lab) -> str:
     )
 
 
-def at_limit(loads: Mapping[str, Floats]) -> dict[str, NDArray[np.bool_]]:
+def at_limit(loads: Mapping[str, Floats]) -> dict[str, Bools]:
     """Whether each actuator is at its limit, (K,) by name; actuators that never are left out."""
     found = {name: load >= AT_LIMIT for name, load in loads.items()}
     return {name: full for name, full in found.items() if full.any()}

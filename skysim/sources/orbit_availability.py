@@ -8,13 +8,12 @@ from typing import Literal, NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
@@ -75,9 +74,9 @@ class SkySamples(NamedTuple):
     sun_deg: Floats
     earth_deg: Floats
     moon_deg: Floats
-    stars: NDArray[np.int64]
+    stars: Ints
 
-    def outside(self, exclusion: ExclusionConfig) -> dict[str, NDArray[np.bool_]]:
+    def outside(self, exclusion: ExclusionConfig) -> dict[str, Bools]:
         """(K,) whether the boresight is outside each body's exclusion angle, and whether there are enough stars."""
         return {
             "Sun": self.sun_deg > exclusion.sun_deg,

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
 from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
@@ -35,7 +34,7 @@ from skysim.core.text import (
     to_numbers,
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 MAX_SATELLITES = 100_000  # in a file
 MAX_AGE_DAYS = 365  # of the elements that are nearest in time
@@ -216,7 +215,7 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
 
 def gcrs_states(
     elements: MeanElements, time: datetime.datetime, after_s: Floats
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Ints]:
     """States of N satellites at K times after a time, by SGP4.
 
     SGP4's error grows by 1 to 3 km a day from the elements' epoch in low orbits.

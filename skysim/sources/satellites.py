@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats, SatelliteTruth, Sources
+from skysim.core.types import Floats, Ints, SatelliteTruth, Sources
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.camera_orbit import (
@@ -248,7 +247,7 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
     """The satellites as moving points with the Sun's color."""
     v_mag = np.array([light.truth.v_mag for light in lights])
     flux = np.array([reflected_flux_e_s_m2(one, WHITE, band) for one in v_mag])
-    ids: NDArray[np.int64] = np.array([light.truth.id for light in lights], np.int64)
+    ids: Ints = np.array([light.truth.id for light in lights], np.int64)
     colors = reflected_chromatic(WHITE, band)
     chromatic = None if colors is None else np.tile(colors, (len(lights), 1))
     points = steady_points(

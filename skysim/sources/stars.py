@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import (
@@ -18,7 +17,7 @@ from skysim.core.constants import (
 )
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
-from skysim.core.types import Floats, Sources, StarSources
+from skysim.core.types import Floats, Ints, Sources, StarSources
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
@@ -143,7 +142,7 @@ def sources(
 
 
 def steady_points(
-    ids: NDArray[np.int64],
+    ids: Ints,
     direction: Floats,
     flux_e_s_m2: Floats,
     magnitude: Floats,

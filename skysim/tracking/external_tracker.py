@@ -153,7 +153,7 @@ class FunctionTracker:
         (4,) scalar last, or to None for no attitude
     """
 
-    def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
+    def __init__(self, name: str, function: Callable[[NDArray], Any]) -> None:
         self.name = name
         self.function = function
 

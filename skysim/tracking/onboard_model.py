@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -280,7 +279,7 @@ class OrbitStarTracker(StarTracker):
 
     def solve(
         self,
-        image: NDArray[Any],
+        image: NDArray,
         streak_px: tuple[float, float] | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,

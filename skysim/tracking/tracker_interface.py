@@ -31,7 +31,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.dynamics.controllers import CONTROLLERS
 
 OWN = "own"  # the name of skysim's own estimator
@@ -64,7 +64,7 @@ class Stars:
         (N,) magnitudes in V
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     direction: Floats
     magnitude: Floats
 
@@ -85,7 +85,7 @@ class Leds:
         (4,) rotation from body axes to camera axes, scalar last
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     position_m: Floats
     camera_body_m: Floats
     cam_from_body_xyzw: Floats
@@ -166,7 +166,7 @@ class Picture:
         Motion (dx, dy) of the images in the exposure, if a gyro measures it; else None
     """
 
-    image_dn: NDArray[Any]
+    image_dn: NDArray
     frame: int
     t_s: float
     exposure_s: float

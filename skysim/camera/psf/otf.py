@@ -31,7 +31,7 @@ from skysim.scene.sections.camera import (
     Psf,
 )
 
-Otf = NDArray[Any]  # real, or complex where the PSF is not symmetric
+Otf = NDArray  # real, or complex where the PSF is not symmetric
 
 WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 

@@ -16,12 +16,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Floats, Ints, Mount, Sources
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
@@ -346,7 +345,7 @@ def add_mesh(
     body: Any,
     name: str,
     vertices_m: Floats,
-    faces: NDArray[np.int64],
+    faces: Ints,
     rgba: Any,
     group: int,
     **more: Any,
@@ -397,7 +396,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
         )
 
 
-def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, Ints]:
     """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
     # Corners 0 to 2 are on the positive axes, 3 to 5 on the negative ones.
     corners = np.concatenate([np.eye(3), -np.eye(3)])

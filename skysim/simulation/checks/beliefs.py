@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig
@@ -180,9 +179,7 @@ def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sour
     return sources.take(row), place[row] + shift - stars.vectors[star]
 
 
-def neighbor_shift(
-    place: Floats, rate_e_s: Floats, row: NDArray[np.int64], camera: CameraModel
-) -> Floats:
+def neighbor_shift(place: Floats, rate_e_s: Floats, row: Ints, camera: CameraModel) -> Floats:
     """(N, 3) displacement of the directions of some stars by the images of their neighbors.
 
     Parameters
@@ -254,9 +251,7 @@ def response_px(
     return pull / stiffness
 
 
-def common(
-    first: NDArray[np.int64], second: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def common(first: Ints, second: Ints) -> tuple[Ints, Ints]:
     """Rows of the numbers that are in both lists, in the order of the first list."""
     _, a, b = np.intersect1d(first, second, return_indices=True)
     order = np.argsort(a)

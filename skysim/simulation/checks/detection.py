@@ -14,7 +14,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from estimator.centroiding.gaussian_fit import HALF_WINDOW_PX
@@ -28,7 +27,7 @@ from estimator.detection.detect import (
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import beliefs
@@ -78,11 +77,11 @@ class Context(NamedTuple):
     beliefs: Beliefs
     camera: CameraModel
     surface: Surface | None
-    known_id: NDArray[np.int64]
-    known_row: NDArray[np.int64]
+    known_id: Ints
+    known_row: Ints
     timing_s: Floats
 
-    def rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def rows_of(self, ids: Ints) -> Ints:
         """(M,) rows in the tracker's beliefs of lights with these numbers; -1 for lights that it does not know."""
         if not len(self.known_id):
             return np.full(len(ids), -1)
@@ -285,7 +284,7 @@ def weighted_variance(
 
 def shapes_of(
     view: View, filter_px2: float = 0.0
-) -> Iterator[tuple[NDArray[np.bool_], Floats, tuple[Floats, ...]]]:
+) -> Iterator[tuple[Bools, Floats, tuple[Floats, ...]]]:
     """Lights with images of one shape: their mask (n,), the blur of each, filtered or not, and the shape."""
     large = np.maximum(view.disk_px, view.defocus_px)
     small = np.minimum(view.disk_px, view.defocus_px)

@@ -12,12 +12,11 @@ import datetime
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources
 from skysim.scene.sections import layouts, leds, light
 from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
@@ -34,7 +33,6 @@ from skysim.sources.dome.led import (
 from skysim.sources.dome.surface import Plane, Surface
 from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
 
-Ints = NDArray[np.int64]
 PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 
 
@@ -374,7 +372,7 @@ def own_from_lab(config: ProjectorConfig) -> Rotation:
     return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
 
 
-def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, Bools]:
     """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and (N,) whether they are on its pixels.
 
     A direction beyond the fold of the distortion, where 1 + 3 k t^2 = 0, is not on them.

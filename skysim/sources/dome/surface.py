@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -55,7 +55,7 @@ class Rim:
         """Whether the surface has no end."""
         return self.lowest_m == -math.inf and self.half_rad == math.pi
 
-    def contains(self, own_m: Floats) -> NDArray[np.bool_]:
+    def contains(self, own_m: Floats) -> Bools:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
@@ -96,7 +96,7 @@ class Surface(ABC):
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never leaves."""
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         """(N,) whether points of the level set belong to the surface."""
         return self.rim.contains(own_m)
 
@@ -152,7 +152,7 @@ class Surface(ABC):
         return nearest.center_m, nearest.semi_axes_m
 
 
-def unit_vectors(z: NDArray[Any], azimuth: NDArray[Any]) -> Floats:
+def unit_vectors(z: NDArray, azimuth: NDArray) -> Floats:
     """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
     ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
@@ -241,7 +241,7 @@ class Plane(Surface):
         distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
         return np.where(distance > 0, distance, np.nan)
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         return np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1)
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
@@ -281,7 +281,7 @@ class Cylinder(Surface):
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
         return self.rim.contains(own_m) & inside_ends
 
@@ -369,7 +369,7 @@ class Radial(Surface):
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
         return distance_m[:, 0] - radius, unit - across / distance_m
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         """(N,) whether points are within the rim and in directions for which the radius is defined."""
         cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
         return self.rim.contains(own_m) & (cosine >= -SLACK_M)

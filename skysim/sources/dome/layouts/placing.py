@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.ambiguity import unique_levels
@@ -28,8 +27,6 @@ from skysim.sources.dome.led import (
 )
 from skysim.sources.dome.surface import Surface, directions, unit_vectors
 from skysim.sources.photometry import Band
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,14 +18,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
@@ -93,7 +92,7 @@ class Wound(NamedTuple):
     """The LEDs of all tapes in order: (N, 3) places, (N,) number of the tape, and length from its first LED."""
 
     place_m: Floats
-    tape: NDArray[np.int64]
+    tape: Ints
     tape_m: Floats
 
 
