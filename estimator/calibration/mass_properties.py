@@ -50,6 +50,7 @@ from estimator.calibration.mass_dynamics import (
 )
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
@@ -190,8 +191,7 @@ def considered(
     # 3. Sum over all pairs of attitudes, of all records
     effect = np.concatenate(varying)
     if len(lights) == len(varying):
-        used = np.concatenate(lights)
-        used = used / np.linalg.norm(used, axis=1, keepdims=True)
+        used = normalized(np.concatenate(lights))
         shared = used @ used.T
     else:
         quaternion = Rotation.concatenate(attitudes).as_quat()

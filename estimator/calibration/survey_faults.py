@@ -26,6 +26,7 @@ from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
+from estimator.core.vectors import normalized
 
 FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
@@ -271,8 +272,7 @@ def _meeting_point(
 
 def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
-    toward = place_m - origins
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    toward = normalized(place_m - origins)
     return np.linalg.norm(np.cross(toward, directions), axis=1)
 
 

@@ -38,6 +38,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.vectors import normalized
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
@@ -152,7 +153,7 @@ def assumed_directions(
     lab_from_cam = lab_from_body * lever.cam_from_body.inv()
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
-    points_m /= np.linalg.norm(points_m, axis=1, keepdims=True)
+    points_m = normalized(points_m)
     return lab_from_cam.inv().apply(points_m)
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import BodyTruth, Bools, Floats
+from skysim.core.types import BodyTruth, Bools, Floats, normalized
 from skysim.scene.sections.light import BodiesConfig
 from skysim.sources.body_discs import (
     LAMBERT,
@@ -184,7 +184,7 @@ class BodyLight:
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
         # On the tangent plane at the disc's center.
         vectors = center + np.tan(self.radius_rad) * offset
-        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        return normalized(vectors)
 
     def overlaps(self, other: BodyLight) -> bool:
         """Whether the disc overlaps another body's disc."""

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.time import tt_jd
-from skysim.core.types import Bools, Floats, Ints
+from skysim.core.types import Bools, Floats, Ints, normalized
 from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
@@ -48,8 +48,8 @@ class Pointing(NamedTuple):
         if self.law == "inertial":
             return np.broadcast_to(self.direction, states.position_m.shape)
         # Local axes: up, left of the flight direction, ahead.
-        up = unit(states.position_m)
-        left = unit(np.cross(states.position_m, states.velocity_m_s))
+        up = normalized(states.position_m)
+        left = normalized(np.cross(states.position_m, states.velocity_m_s))
         ahead = np.cross(left, up)
         level = np.cos(self.around_rad) * ahead + np.sin(self.around_rad) * left
         return np.cos(self.off_rad) * up + np.sin(self.off_rad) * level
@@ -142,8 +142,3 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
     earth_km = [ephemeris.position_km("earth", jd) for jd in dates]
     body_km = [ephemeris.barycentric_km(name, jd) for jd in dates]
     return CubicSpline(nodes_s, 1e3 * (np.array(body_km) - np.array(earth_km)))
-
-
-def unit(vectors: Floats) -> Floats:
-    """Normalized (K, 3) vectors."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

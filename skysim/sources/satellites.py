@@ -19,7 +19,7 @@ import numpy as np
 from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats, Ints, SatelliteTruth, Sources
+from skysim.core.types import Floats, Ints, SatelliteTruth, Sources, normalized
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.camera_orbit import (
@@ -163,7 +163,7 @@ def path(
     # 3. Aberration; lengths keep the ratios of the ranges, so that the path is that of a place in space.
     own_m_s = np.array([state.velocity_m_s for state in states])
     toward = to_m / range_m + own_m_s / SPEED_OF_LIGHT_M_S
-    toward = toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
+    toward = normalized(toward) * range_m / range_m[1]
     before, place, after = toward
     # 4. Velocity and acceleration by central differences.
     motion = np.stack(

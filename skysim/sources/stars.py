@@ -17,7 +17,7 @@ from skysim.core.constants import (
 )
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
-from skysim.core.types import Floats, Ints, Sources, StarSources
+from skysim.core.types import Floats, Ints, Sources, StarSources, normalized
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
@@ -72,7 +72,7 @@ def apparent(
     own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
-    return apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True)
+    return normalized(apparent_direction)
 
 
 def varied(stars: Catalog, seed: int) -> Catalog:

@@ -24,7 +24,7 @@ from scipy.special import erfc
 
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -365,7 +365,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     # 3.
     toward = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
+    return np.asarray(normalized(toward))
 
 
 def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:

@@ -18,7 +18,7 @@ from skysim.camera.glow.background import (
 )
 from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
@@ -49,7 +49,7 @@ def earth_radiance(
     # 1. Impact parameter, and distance to the ground or to the tangent point.
     place = observer_m * TO_SPHERE
     along = toward * TO_SPHERE
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    along = normalized(along)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
     down = inward > 0

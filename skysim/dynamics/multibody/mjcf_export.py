@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Ints, Mount, Sources
+from skysim.core.types import Floats, Ints, Mount, Sources, normalized
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
@@ -429,7 +429,7 @@ def field_corners(
     )
     rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
-    rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))
+    rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
     length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
     return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)

@@ -17,7 +17,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Ints, Sources
+from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import DomeConfig
@@ -172,7 +172,7 @@ def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sour
     """The N stars that the tracker knows, and measured minus believed direction (N, 3) of each, in lab axes."""
     sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
-    place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
+    place = normalized(sources.place[:, :3])
     shift = neighbor_shift(
         place, sources.strength * lab.camera.optics.collecting_m2, row, camera
     )

@@ -49,7 +49,7 @@ from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -394,7 +394,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     center_m, semi_axes_m = surface.as_ellipsoid()
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
     lever = Lever(lab.camera.mount.camera_body_m, lab.camera.mount.cam_from_body, 0.0)
-    rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
+    rays = normalized(view.offset_m)
     cam_from_body = lab.camera.mount.cam_from_body
     body_from_lab = cam_from_body.inv() * lab_from_cam.inv()
     try:

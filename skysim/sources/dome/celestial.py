@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, normalized
 from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
@@ -92,8 +92,7 @@ def project_stars(
     projected = ProjectedStars(stars.hip, stars.v_mag, mag, place_m)
     selected = select_brightest(projected, config, led.disk_diameter_m)
     # 4.
-    rays = selected.place_m - camera_m
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = normalized(selected.place_m - camera_m)
     return selected._replace(place_m=surface.meet(camera_m, rays))
 
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Ints, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections import layouts, leds, light
 from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
@@ -322,7 +322,7 @@ def beam_sources(
 
     At the distance D a source has the strength F D^2, which gives the flux F at the bearing.
     """
-    direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
+    direction = normalized(beam)
     zeros = np.zeros(len(beam))
     ones = np.ones(len(beam))
     place = np.column_stack([direction, zeros])
@@ -397,7 +397,7 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
     own = np.column_stack(
         [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
     )
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
+    own = normalized(own)
     return own_from_lab(config).inv().apply(own)
 
 

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
@@ -140,7 +140,7 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
         with np.errstate(invalid="ignore", divide="ignore"):
             step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
         toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        toward = normalized(toward)
     # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in the field.
     offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
     rays = reflect(wall, camera_m, toward)
@@ -246,7 +246,7 @@ def linearized(
     axes = axes_across(toward)
     first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
     shifted = toward + np.stack([0 * toward, first, -first, second, -second])
-    shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
+    shifted = normalized(shifted)
     rays = reflect(wall, camera_m, shifted.reshape(-1, 3))
     wall_m = rays.wall_m.reshape(shifted.shape)
     along = rays.along.reshape(shifted.shape)

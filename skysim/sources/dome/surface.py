@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -123,7 +123,7 @@ class Surface(ABC):
         gradient = (
             self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
         )
-        return -gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+        return -normalized(gradient)
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point (3,) of the lab is inside; the rim is ignored."""
@@ -170,7 +170,7 @@ def perpendicular(unit: Floats) -> Floats:
     """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
     # The axis on which the vector has its least component is never parallel to it.
     across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
-    return across / np.linalg.norm(across, axis=1, keepdims=True)
+    return normalized(across)
 
 
 def exit_distance(start: Floats, along: Floats) -> Floats:

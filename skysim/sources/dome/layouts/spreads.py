@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -198,7 +198,7 @@ def geodesic_vertices(frequency: int, class_: str) -> Floats:
     points = np.array(
         [sum(n * corners[corner] for corner, n in each) for each in sorted(weights)]
     )
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
+    return normalized(points)
 
 
 def lattice_points(frequency: int, class_: str) -> Iterator[tuple[int, int, int]]:

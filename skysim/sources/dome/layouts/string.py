@@ -24,7 +24,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Ints, Sources
+from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
@@ -318,7 +318,7 @@ def marked_m(
         )
     # 1.
     sight_m = place_m - laser_m
-    line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
+    line = normalized(sight_m)
     common = (
         scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
     )
@@ -327,7 +327,7 @@ def marked_m(
     )
     line = line + along_two_axes(line, pointing * ARCSEC_RAD)
     line = Rotation.from_rotvec(common).apply(line)
-    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    line = normalized(line)
     # 2.
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
