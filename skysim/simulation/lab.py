@@ -388,18 +388,32 @@ def build_camera(
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
     plan = LightPlan(scene, band, vehicle, viewpoint, shown)
+    return camera_of(MAIN, plan, mount, orbit, scene.seed)
+
+
+def camera_of(
+    name: str,
+    plan: LightPlan,
+    mount: Mount,
+    orbit: CameraOrbit | None,
+    run_seed: int,
+    mount_error: Rotation | None = None,
+) -> StarCamera:
+    """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
+    scene = plan.scene
     return StarCamera(
-        name=MAIN,
-        scene=scene,
-        mount=mount,
-        optics=Optics.from_camera(scene.camera),
-        detector=Detector.from_camera(scene.camera),
-        band=band,
-        canvas=build_canvas(scene),
-        lights=build_lights(plan),
-        channels=color_channels(plan),
-        orbit=orbit,
-        run_seed=scene.seed,
+        name,
+        scene,
+        mount,
+        Optics.from_camera(scene.camera),
+        Detector.from_camera(scene.camera),
+        plan.band,
+        build_canvas(scene),
+        build_lights(plan),
+        color_channels(plan),
+        orbit,
+        run_seed,
+        mount_error,
     )
 
 
@@ -461,23 +475,10 @@ def build_head(
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
         plan = LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
-        lights = build_lights(plan)
-        channels = color_channels(plan)
+        turned = Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD)
+        return camera_of(head.name, plan, mount, main.orbit, main.run_seed, turned)
     except InputError as error:
         raise error.under(f"heads.{n}") from None
-    return replace(
-        main,
-        name=head.name,
-        scene=scene,
-        mount=mount,
-        optics=Optics.from_camera(scene.camera),
-        detector=Detector.from_camera(scene.camera),
-        band=band,
-        canvas=build_canvas(scene),
-        lights=lights,
-        channels=channels,
-        mount_error=Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD),
-    )
 
 
 def lab_from_body_start(
