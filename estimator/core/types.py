@@ -167,7 +167,10 @@ class Blobs:
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
-OPTIONAL_SHAPES = {
+# Shape of a light's value; only numbers are required.
+SHAPES: dict[str, tuple[int, ...]] = {
+    "sigma_px": (),
+    "flux": (),
     "covariance_px2": (2, 2),
     "streak_px": (2,),
     "streak_covariance_px2": (2, 2),
@@ -219,15 +222,9 @@ class Centroids:
     def __post_init__(self) -> None:
         xy_px = checks.floats("centroids: xy_px", self.xy_px, (None, 2))
         object.__setattr__(self, "xy_px", xy_px)
-        for name in ("sigma_px", "flux"):
-            object.__setattr__(
-                self,
-                name,
-                checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)),
-            )
-        for name, shape in OPTIONAL_SHAPES.items():
+        for name, shape in SHAPES.items():
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or not shape:
                 object.__setattr__(
                     self,
                     name,
@@ -255,14 +252,8 @@ class Centroids:
 
     def take(self, which: NDArray[Any]) -> Centroids:
         """Select centroids by mask or index."""
-        optional = (
-            self.covariance_px2,
-            self.streak_px,
-            self.streak_covariance_px2,
-            self.moments_px2,
-        )
-        taken = (None if array is None else array[which] for array in optional)
-        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
+        arrays = (getattr(self, name) for name in self.__slots__)
+        return Centroids(*(None if array is None else array[which] for array in arrays))
 
 
 NO_SPREAD = np.empty((0, 2, 2))

@@ -175,14 +175,7 @@ class Settings:
             value = getattr(self, name)
             if value is None and name in OPTIONAL:
                 continue
-            value = checks.number(
-                f"settings: {name}",
-                value,
-                allowed.low,
-                allowed.high,
-                allowed.words,
-                allowed.whole,
-            )
+            value = checks.number(f"settings: {name}", value, *allowed)
             object.__setattr__(
                 self, name, value
             )  # a plain float or int, which compiled code knows
