@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,7 +160,7 @@ class Blobs:
     def __len__(self) -> int:
         return len(self.flux)
 
-    def take(self, which: NDArray[Any]) -> Blobs:
+    def take(self, which: NDArray) -> Blobs:
         """Select blobs by mask or index."""
         names = ("box_px", "xy_px", "flux", "peak", "area_px", "flag")
         return replace(self, **{name: getattr(self, name)[which] for name in names})
@@ -250,7 +249,7 @@ class Centroids:
         """Return no centroids."""
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
-    def take(self, which: NDArray[Any]) -> Centroids:
+    def take(self, which: NDArray) -> Centroids:
         """Select centroids by mask or index."""
         arrays = (getattr(self, name) for name in self.__slots__)
         return Centroids(*(None if array is None else array[which] for array in arrays))

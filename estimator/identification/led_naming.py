@@ -19,7 +19,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.attitude.solvers import rotation
 from estimator.core import vectors
@@ -251,7 +250,7 @@ def _evaluate(
     R_cam_from_lab: Floats,
     pair: tuple[int, int],
     names: Ints,
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Step 4: the misfit of each hypothesis, and the names that it gives to the lights.
 
     Parameters

@@ -121,7 +121,7 @@ class CodedTracker(DomeTracker):
             )
         self.code = code
         self.decoder = decoder or DecoderSettings()
-        radius_m = np.linalg.norm(leds.position_m, axis=1)
+        radius_m = leds.radius_m
         pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
         position_m = np.asarray(leds.position_m, dtype=float)
         self.sphere = led_naming.Sphere(

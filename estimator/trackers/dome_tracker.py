@@ -107,7 +107,7 @@ def star_identifier(
     therefore has a stretch, from the spread of the radii and the lever. With an assumed attitude the rays meet the
     dome's surface as seen from there (`assumed_directions`), and the stretch is that of the calibration alone.
     """
-    radius = np.linalg.norm(leds.position_m, axis=1)
+    radius = leds.radius_m
     median_radius_m = float(np.median(radius))
     pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
     points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
@@ -175,7 +175,7 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
     Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
     line from the bearing is divided by the LED's own distance minus the lever.
     """
-    radius_m = np.linalg.norm(leds.position_m, axis=1)
+    radius_m = leds.radius_m
     lever_m = float(np.linalg.norm(lever.camera_body_m))
     if leds.covariance_m2 is None:
         return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))

@@ -71,7 +71,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     # The design's LEDs in the order of the map.
     order = np.argsort(nominal.id)
     nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
-    distance_m = np.linalg.norm(leds.position_m, axis=1) - np.linalg.norm(lever.camera_body_m)
+    distance_m = leds.radius_m - np.linalg.norm(lever.camera_body_m)
     strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
     light_e_s_m2 = irradiance_e_s_m2(
         strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m

@@ -29,10 +29,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources, normalized
+from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
@@ -70,7 +69,7 @@ class Image(NamedTuple):
         (K, 3) directions from there toward the LEDs
     """
 
-    led: NDArray[np.int64]
+    led: Ints
     toward: Floats
     distance_m: Floats
     cosine: Floats
@@ -109,7 +108,7 @@ def mirrored(
     )
 
 
-def numbered(led: NDArray[np.int64]) -> NDArray[np.int64]:
+def numbered(led: Ints) -> Ints:
     """(K,) number of each image among those of its LED, from 1, for `led` (K,) in ascending order."""
     return np.arange(len(led)) - np.searchsorted(led, led) + 1
 
@@ -158,9 +157,7 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
     return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
 
 
-def distinct(
-    led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:
     """Rows of the solutions, each image once, sorted by LED and direction."""
     rows = np.flatnonzero(solved)
     rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
@@ -180,7 +177,7 @@ def reflect(wall: Surface, camera_m: Floats, toward: Floats) -> Rays:
 
 def nearest_rays(
     wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """LEDs (K,) and rays (K,), as flat indices of the grid, at which an LED's angle from the reflected ray is least."""
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
     cosine = np.sum(grid[1:] * grid[:-1], axis=2)
