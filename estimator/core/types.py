@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -40,7 +40,7 @@ class FramePriors:
         For anything but such numbers.
     """
 
-    streak_px: tuple[float, float] | None = None
+    streak_px: Step | None = None
     saturation: float = float("inf")
     turn_rad: float = 0.0
     intensity_threshold: float = THESIS_INTENSITY
@@ -154,7 +154,7 @@ class Blobs:
     area_px: Ints
     background: Background
     flag: Ints
-    streak_px: tuple[float, float] | None = None
+    streak_px: Step | None = None
     turn_rad: float = 0.0
 
     def __len__(self) -> int:

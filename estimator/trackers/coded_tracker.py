@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
@@ -147,7 +147,7 @@ class CodedTracker(DomeTracker):
     def solve(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
         t_s: float | None = None,
