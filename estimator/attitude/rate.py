@@ -312,7 +312,7 @@ def from_moments(
     rows = exposure_s / camera.row_time_s  # k
     roots = np.stack([_roots(moments, rows, side) for side in (1, -1)])
     # 2. Errors of the roots, with 2 a to lowest order
-    twice_a = moments[:, 2] - np.hypot(moments[:, 0], moments[:, 1])
+    twice_a = moments[:, 2] - np.hypot(*moments.T[:2])
     sigma_px = MOMENT_ERROR * moments[:, 2] / np.abs(rows**2 / 6 * roots + 1j * twice_a)
     # 3. Rates
     by_rate = tangent_motion(camera.rays(centroids.xy_px), sight)

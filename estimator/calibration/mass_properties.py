@@ -54,9 +54,8 @@ from estimator.core.vectors import normalized
 from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
-CONVERGED_SIGMA = (
-    0.01  # largest step of a parameter at convergence, in its standard deviations
-)
+# Largest step of a parameter at convergence, in its standard deviations
+CONVERGED_SIGMA = 0.01
 # Tolerance of the logarithm of the misfit, and the largest number of fits to reach it.
 MISFIT_TOLERANCE = 0.1
 MAX_FACTORS = 8

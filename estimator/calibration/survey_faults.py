@@ -36,9 +36,8 @@ TINY_M2 = 1e-18  # added to variances, which could be 0
 SURFACE_SIGMA_M = 0.005
 GATE = 5.0  # largest distance of a ray from its light, in standard deviations
 MIN_SCATTER = 0.02  # least standard deviation of the logarithm of an LED's light
-CHANCE = (
-    0.02  # probability that a light is missed although it is on, or seen although it is off
-)
+# Probability that a light is missed although it is on, or seen although it is off
+CHANCE = 0.02
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 

@@ -36,7 +36,7 @@ from estimator.attitude.rotation_fit import fit_focal_ratio
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification import led_search
@@ -59,9 +59,8 @@ from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 
-MIN_ERROR_PX = (
-    0.3  # least centroid error of an LED, for effects outside of survey and calibration
-)
+# Least centroid error of an LED, for effects outside of survey and calibration
+MIN_ERROR_PX = 0.3
 FOCAL_UNCERTAINTY = 0.12  # largest relative error of a focal length that is not calibrated
 FOCAL_CHECKS = 10_000_000  # largest number of checks of its search, which take a second
 MAX_FOCAL_SIGMA = 0.5  # largest focal_sigma of a `Camera`
@@ -232,7 +231,7 @@ class DomeTracker:
     def solve(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
     ) -> Report:

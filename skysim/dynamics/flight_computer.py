@@ -33,9 +33,8 @@ from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
-GYRO_RATE_FRACTION = (
-    0.7  # return rate of the controller over the gyros' rate limit (`assumed`)
-)
+# Return rate of the controller over the gyros' rate limit (`assumed`)
+GYRO_RATE_FRACTION = 0.7
 
 
 def authority_nm(actuators: Actuators) -> float:

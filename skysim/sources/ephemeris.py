@@ -162,9 +162,8 @@ def earth_rate_rad_s(time: datetime.datetime) -> Floats:
 # Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.
 
 
-DEFLECTION_LIMIT = (
-    1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
-)
+# Of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
+DEFLECTION_LIMIT = 1e-6
 
 
 class Place(NamedTuple):

@@ -258,9 +258,8 @@ VERSION = "CCSDS_OEM_VERS"
 VERSIONS = ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
-SAME_M = (
-    1.0  # adjoining segments may share a sample; its positions then differ by less than this
-)
+# Adjoining segments may share a sample; its positions then differ by less than this
+SAME_M = 1.0
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 

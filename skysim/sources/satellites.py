@@ -34,9 +34,8 @@ from skysim.sources.photometry import Band
 from skysim.sources.stars import steady_points
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
-RANDOM_BASE = (
-    2_000_000_000  # the number of a random satellite is this + its number in the frame
-)
+# The number of a random satellite is this + its number in the frame
+RANDOM_BASE = 2_000_000_000
 STANDARD_M = 1e6  # range of the standard magnitude
 OWN_M = 10.0  # a satellite nearer than this is the camera's own
 MARGIN_RAD = 1e-3  # added to the field's radius, for light time and aberration
@@ -259,9 +258,8 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
 # Numbers of lights in the truth of frames that no star and no LED has: reflections of LEDs and ghosts of a lens.
 
 
-MIRRORED = (
-    10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
-)
+# The n-th image of an LED in the wall has n times this number and the LED's
+MIRRORED = 10_000_000
 GHOST = 1_000_000_000_000  # the n-th ghost of a light has n times this number and the light's
 
 

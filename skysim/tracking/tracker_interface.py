@@ -39,9 +39,8 @@ TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
 PROTOCOL = 1  # version of the protocol, the first key of the set-up
-UNIT_TOLERANCE = (
-    1e-3  # deviation of a quaternion's norm from 1: single precision passes and is normalized
-)
+# Deviation of a quaternion's norm from 1: single precision passes and is normalized
+UNIT_TOLERANCE = 1e-3
 MIN_RAD2 = 1e-24  # smallest eigenvalue of a covariance: (0.2 micro-arcseconds)^2
 MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
 MAX_CENTROIDS = 100_000

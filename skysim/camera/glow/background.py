@@ -365,7 +365,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     # 3.
     toward = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(normalized(toward))
+    return normalized(toward)
 
 
 def fill(image: NDArray, coarse: Floats, factor: float) -> None:

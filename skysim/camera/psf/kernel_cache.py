@@ -93,9 +93,8 @@ class KernelCache(NamedTuple):
 
 
 CACHE_BYTES = 1 << 27  # the cache is emptied when it is larger than this
-MAX_RADIUS_PX = (
-    500.0  # largest radius of an image; tables of larger ones would take too much memory
-)
+# Largest radius of an image; tables of larger ones would take too much memory
+MAX_RADIUS_PX = 500.0
 
 
 @lru_cache(maxsize=16)

@@ -37,9 +37,8 @@ from skysim.simulation.lab import Lab
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.factory import assumed_settings
 
-BINOMIAL_VARIANCE_PX2 = (
-    0.5  # variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
-)
+# Variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
+BINOMIAL_VARIANCE_PX2 = 0.5
 # Grid on which images are integrated, in standard deviations of the blur: its step, and its margin.
 STEP = 0.4
 MARGIN = 5.0
@@ -48,9 +47,8 @@ SHAPES = 10  # images whose sizes differ by less than one in this number count a
 COG_MARGIN_PX = 4.0  # margin of the window about the pixels above the threshold
 STILL_PX = np.zeros(2)
 PHASES = 64  # number of phases of the pulses relative to the exposure
-MAX_PULSES = (
-    500  # number of pulses in an exposure from which the mean time of the light does not vary
-)
+# Number of pulses in an exposure from which the mean time of the light does not vary
+MAX_PULSES = 500
 
 
 class Context(NamedTuple):

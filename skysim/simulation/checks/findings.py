@@ -39,9 +39,8 @@ from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning
-TARGET_FILL = (
-    0.7  # recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
-)
+# Recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
+TARGET_FILL = 0.7
 # Limits of exposure times and lenses that a warning recommends.
 SHORTEST_S = 10e-6
 LARGEST_F_NUMBER = 22.0
@@ -51,9 +50,8 @@ MIN_DETECTED = 0.5  # fraction of the lights on the detector that the tracker sh
 # Fraction of the directions in reach, or of the whole sky, that may have fewer than MIN_LIGHTS.
 MAX_FEW = 0.02
 MAX_FEW_SKY = 0.5
-HIGH_THRESHOLD = (
-    20.0  # threshold in sigma above which it is the reason for missing detections
-)
+# Threshold in sigma above which it is the reason for missing detections
+HIGH_THRESHOLD = 20.0
 MAX_BACKGROUND = 0.5  # fraction of full scale
 MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up to which frames are identified
 # A path that is longer than both gives a warning; the second is in widths of the image.

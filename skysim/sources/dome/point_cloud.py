@@ -279,7 +279,7 @@ def read(file: str, unit: str) -> Floats:
 
 def covered_rad(unit: Floats) -> tuple[float, float]:
     """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
-    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
+    angle = np.arctan2(np.hypot(*unit.T[:2]), unit[:, 2])
     azimuth = np.arctan2(unit[:, 1], unit[:, 0])
     sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Of the farthest point in each sector of azimuth, the least.

@@ -322,7 +322,7 @@ class Shell:
 
     def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient on the unit sphere."""
-        ring = np.hypot(unit[:, 0], unit[:, 1])
+        ring = np.hypot(*unit.T[:2])
         angle = np.arctan2(ring, unit[:, 2])
         # dr / d(angle) between apex and base.
         slope = (

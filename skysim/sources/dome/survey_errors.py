@@ -50,7 +50,7 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
         For an LED at the station.
     """
     sight_m = place_m - np.array(config.position_m)
-    level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
+    level_m = np.hypot(*sight_m.T[:2])
     distance_m = np.hypot(level_m, sight_m[:, 2])
     if not np.all(distance_m > 0):
         raise InputError(

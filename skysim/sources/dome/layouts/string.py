@@ -260,9 +260,8 @@ def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Fl
 # normal.
 
 
-SHELL_STREAM = (
-    2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
-)
+# Spawn key of the shell's own random stream, which leaves the fibers' places unchanged
+SHELL_STREAM = 2
 AIMING_STREAM = 5  # spawn key of the laser's errors
 
 
