@@ -251,8 +251,9 @@ class Centroids:
 
     def take(self, which: NDArray) -> Centroids:
         """Select centroids by mask or index."""
-        arrays = (getattr(self, name) for name in self.__slots__)
-        return Centroids(*(None if array is None else array[which] for array in arrays))
+        arrays = {name: getattr(self, name) for name in self.__slots__}
+        taken = {name: one[which] for name, one in arrays.items() if one is not None}
+        return replace(self, **taken)
 
 
 NO_SPREAD = np.empty((0, 2, 2))
