@@ -370,7 +370,9 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, parts.profile)
     # 3. Cameras.
-    shown = light_catalog(scene)
+    shown = None
+    if not isinstance(scene.light, DomeConfig):
+        shown = catalog.read_for("light.catalog", scene.light.catalog)
     main = build_camera(scene, vehicle, mount, shown)
     heads = [
         build_head(scene, n, vehicle, main, shown, parts.programs)
@@ -490,13 +492,6 @@ def lab_from_body_start(
         cam_from_icrs = stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg)
         return cam_from_icrs.inv() * mount.cam_from_body
     return guidance.start_attitude(scene.motion, profiles)
-
-
-def light_catalog(scene: Scene) -> catalog.Catalog | None:
-    """The catalog of the scene's light; None for a dome."""
-    if isinstance(scene.light, DomeConfig):
-        return None
-    return catalog.read_for("light.catalog", scene.light.catalog)
 
 
 def build_tracker(

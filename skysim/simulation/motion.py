@@ -279,10 +279,6 @@ class TelemetryRecorder:
         """Row of the control period that begins now."""
         return self.simulation.step // self.steps_per_tick
 
-    def record_disturbance(self, torque_nm: Floats) -> None:
-        """Record the mean disturbance torque (3,) of this control period; call it before `record`."""
-        self.disturbance_nm[self.row] = torque_nm
-
     def record(self, momentum_nms: Floats) -> None:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
         k = self.row
@@ -514,7 +510,8 @@ class Motion:
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
             control[:, simulation.vehicle.torques] += disturbance
             if self.recorder:
-                self.recorder.record_disturbance(disturbance.sum(axis=0) / len(control))
+                mean_nm = disturbance.sum(axis=0) / len(control)
+                self.recorder.disturbance_nm[self.recorder.row] = mean_nm
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.recorder:
             self.recorder.record(momentum)

@@ -65,11 +65,10 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     lab = context.lab
     lines = []
     values = {}
-    reach = (
-        "in the whole sky"
-        if isinstance(lab.scene.light, StarsConfig)
-        else reached(context, samples)
-    )
+    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
+    reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
+    if isinstance(lab.scene.light, StarsConfig):
+        reach = "in the whole sky"
     for key, what, sampled in (
         ("frames", "at the frames", samples.frames),
         ("reach", reach, samples.reach),
@@ -118,12 +117,6 @@ def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
         )
         values[name] = {"most": most, "share": frames / len(others)}
     return Fact("other lights", lines, values) if lines else None
-
-
-def reached(context: Context, samples: CheckedSamples) -> str:
-    """The directions in reach of the motion, in words."""
-    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
-    return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
 def spot(context: Context, samples: CheckedSamples) -> Fact:
