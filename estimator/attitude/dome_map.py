@@ -63,6 +63,11 @@ class LedMap:
     flux_s: Floats | None = None
     flux_sigma: float = 0.15
 
+    @property
+    def radius_m(self) -> Floats:
+        """(N,) distance of each LED from the bearing center."""
+        return np.linalg.norm(self.position_m, axis=1)
+
 
 @dataclass(frozen=True, slots=True)
 class Lever:
@@ -148,7 +153,7 @@ def common_shifts_m(leds: LedMap, star: Ints, lever: Lever, cam_from_lab: Rotati
     shift_m = leds.common_m[:, star] @ cam_from_lab.as_matrix().T
     if leds.common_camera is not None:
         shift_m -= lever.cam_from_body.apply(leds.common_camera[:, :3])[:, None]
-    return np.asarray(shift_m)
+    return shift_m
 
 
 def common_images_px(leds: LedMap, camera: Camera, rays_cam: Floats) -> Floats:
@@ -196,7 +201,7 @@ def check_lever(leds: LedMap, lever: Lever) -> None:
         raise ImageError("lever: camera_body_m has a NaN or infinity; allowed: finite")
     checks.one_rotation("lever: cam_from_body", lever.cam_from_body)
     checks.number("lever: sigma_m", lever.sigma_m, 0.0, 1e9, "finite, 0 or more")
-    nearest = np.linalg.norm(leds.position_m, axis=1).min()
+    nearest = leds.radius_m.min()
     lever_m = np.linalg.norm(lever.camera_body_m)
     if lever_m >= nearest:
         raise ImageError(

@@ -40,6 +40,7 @@ from estimator.attitude.rotation_fit import (
 )
 from estimator.attitude.solvers import quest
 from estimator.core.checks import Floats
+from estimator.core.vectors import normalized
 
 # Largest number of iterations of tappe and ray_on_surface, and the rotation below which they stop.
 MAX_UPDATES = 20
@@ -65,7 +66,7 @@ def _wahba(
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     observed = point_body_m / radius[:, None]
-    target = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
+    target = normalized(position_m)
     return quest(observed, target, sigma_rad * distance_m / radius)
 
 
@@ -103,7 +104,7 @@ def _with_covariance(
     """
     radius = np.linalg.norm(point_body_m, axis=1)
     d = point_body_m / radius[:, None]
-    a = body_from_lab.apply(position_m / np.linalg.norm(position_m, axis=1, keepdims=True))
+    a = body_from_lab.apply(normalized(position_m))
     weight = (radius / (sigma_rad * distance_m)) ** 2  # k
     # 1. Columns of G: derivative of a point's term k a x d by a shift along each axis.
     across_point = np.eye(3) - np.einsum("ni,nj->nij", d, d)

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Bools, Floats
 from estimator.core.errors import ImageError
 from estimator.core.least_squares import misfit_factor
 from estimator.core.types import Centroids, RateEstimate
@@ -52,7 +52,7 @@ class Sight(NamedTuple):
     lever_cam_m: Floats
     radius_m: Floats | float
 
-    def take(self, which: NDArray[Any]) -> Sight:
+    def take(self, which: NDArray) -> Sight:
         """Select lights by mask or index."""
         if not isinstance(self.radius_m, np.ndarray):
             return self
@@ -100,7 +100,7 @@ def streak_factor(camera: Camera, velocity_tan_s: Floats) -> Floats:
         (N, 2) velocity of the tangents, 1/s
     """
     rows = camera.focal_px * camera.row_time_s * velocity_tan_s[:, 1]  # v_y tau
-    return np.asarray(1 / (1 - rows))
+    return 1 / (1 - rows)
 
 
 def at_middle_row(
@@ -147,7 +147,7 @@ def covariance_of(centroids: Centroids) -> Floats:
     """Return the (N, 2, 2) covariance of each centroid, px^2."""
     if centroids.covariance_px2 is not None:
         return centroids.covariance_px2
-    return np.asarray(centroids.sigma_px[:, None, None] ** 2 * np.eye(2))
+    return centroids.sigma_px[:, None, None] ** 2 * np.eye(2)
 
 
 # Angular rate from streaks.
@@ -217,10 +217,10 @@ def inverses(matrices: Floats) -> Floats:
 def aligned(chord: Floats, information: Floats, predicted: Floats) -> Floats:
     """Return the (N, 2) chords, each with the sign that is nearer to a predicted one."""
     along = np.einsum("ni,nij,nj->n", predicted, information, chord)
-    return np.asarray(chord * np.where(along < 0, -1.0, 1.0)[:, None])
+    return chord * np.where(along < 0, -1.0, 1.0)[:, None]
 
 
-def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
+def inliers(residual: Floats, information: Floats) -> Bools:
     """Return (N,) whether a residual (N, 2) is no outlier.
 
     The limit of the squared Mahalanobis distance is OUTLIER_CHI2, times the median of all where that is above 1: it
@@ -228,7 +228,7 @@ def inliers(residual: Floats, information: Floats) -> NDArray[np.bool_]:
     """
     distance2 = np.einsum("ni,nij,nj->n", residual, information, residual)
     excess = max(1.0, float(np.median(distance2)))
-    return np.asarray(distance2 < OUTLIER_CHI2 * excess)
+    return distance2 < OUTLIER_CHI2 * excess
 
 
 def _fit(
@@ -312,7 +312,7 @@ def from_moments(
     rows = exposure_s / camera.row_time_s  # k
     roots = np.stack([_roots(moments, rows, side) for side in (1, -1)])
     # 2. Errors of the roots, with 2 a to lowest order
-    twice_a = moments[:, 2] - np.hypot(moments[:, 0], moments[:, 1])
+    twice_a = moments[:, 2] - np.hypot(*moments.T[:2])
     sigma_px = MOMENT_ERROR * moments[:, 2] / np.abs(rows**2 / 6 * roots + 1j * twice_a)
     # 3. Rates
     by_rate = tangent_motion(camera.rays(centroids.xy_px), sight)

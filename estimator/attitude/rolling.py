@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rate import (
@@ -26,7 +25,7 @@ from estimator.attitude.rate import (
 )
 from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Bools, Floats
 from estimator.core.types import Centroids, RateEstimate
 
 MAX_STEPS = 25
@@ -86,7 +85,7 @@ def fit(
     cam_from_ref, rate = start
     delay_s = camera.row_delays_s(centroids.xy_px)
     prior_information = np.linalg.inv(prior.covariance_rad2_s2)
-    keep: list[NDArray[np.bool_]] = []
+    keep: list[Bools] = []
     for n in range(MAX_STEPS):
         # 1. q = exp(-[w] t) A P - r of each light; residuals and slopes
         turn = Rotation.from_rotvec(-delay_s[:, None] * rate)
@@ -130,9 +129,7 @@ def _rows(
     return rows
 
 
-def _normal_equations(
-    rows: list[_Rows], keep: list[NDArray[np.bool_]]
-) -> tuple[Floats, Floats]:
+def _normal_equations(rows: list[_Rows], keep: list[Bools]) -> tuple[Floats, Floats]:
     """Return the (6, 6) normal matrix and the (6,) gradient of the rows that are kept."""
     normal = np.zeros((6, 6))
     gradient = np.zeros(6)
@@ -152,7 +149,7 @@ def _solve(normal: Floats, gradient: Floats, lights: int) -> Floats:
     sizes = np.outer(size, size)
     if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
         raise ValueError(f"{lights} lights do not determine attitude and rate")
-    return np.asarray(np.linalg.solve(normal / sizes, gradient / size) / size)
+    return np.linalg.solve(normal / sizes, gradient / size) / size
 
 
 def _place_rows(
@@ -215,4 +212,4 @@ def rate_covariance_rad2(
     products = np.swapaxes(jacobian, 1, 2) @ information @ jacobian  # J^T W J
     delay_s = camera.row_delays_s(centroids.xy_px)[:, None, None]
     gain = np.linalg.solve(np.sum(products, axis=0), np.sum(products * delay_s, axis=0))
-    return np.asarray(gain @ covariance_rad2_s2 @ gain.T)
+    return gain @ covariance_rad2_s2 @ gain.T

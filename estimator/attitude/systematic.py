@@ -69,7 +69,7 @@ def from_independent(view: Geometry, sigma_rad: Floats, covariance_rad2: Floats)
         (K, 2, 2) covariance C_i of each ray's tangents
     """
     gain = response(view, sigma_rad)
-    return np.asarray(np.einsum("kai,kij,kbj->ab", gain, covariance_rad2, gain))
+    return np.einsum("kai,kij,kbj->ab", gain, covariance_rad2, gain)
 
 
 def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
@@ -82,7 +82,7 @@ def from_common(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
     """
     # w_m = sum_i G_i e_mi: the solution's change by one standard deviation of each error
     rotation = np.einsum("kai,mki->ma", response(view, sigma_rad), error_rad)
-    return np.asarray(rotation.T @ rotation)
+    return rotation.T @ rotation
 
 
 def response(view: Geometry, sigma_rad: Floats) -> Floats:
@@ -92,7 +92,7 @@ def response(view: Geometry, sigma_rad: Floats) -> Floats:
     """
     weighted = view.jacobian / sigma_rad[:, None, None] ** 2
     information = np.einsum("kia,kib->ab", weighted, view.jacobian)  # the inverse of S
-    return np.asarray(np.linalg.solve(information, np.moveaxis(weighted, 2, 1)))
+    return np.linalg.solve(information, np.moveaxis(weighted, 2, 1))
 
 
 def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:
@@ -112,7 +112,7 @@ def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> F
     # The solution absorbs the part of an error that looks like a rotation; the rest is left in the residuals.
     absorbed = np.linalg.lstsq(jacobian, weighted, rcond=None)[0]
     left = weighted - jacobian @ absorbed
-    return np.asarray(left.T @ left)
+    return left.T @ left
 
 
 def isotropic(sigma_rad: Floats) -> Floats:
@@ -168,7 +168,7 @@ def with_survey(
 def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
     """Return the (N,) position errors from the focal length: its relative sigma times the distance from the center."""
     distance_px = np.linalg.norm(xy_px - camera.center_px, axis=1)
-    return np.asarray(camera.focal_sigma * distance_px)
+    return camera.focal_sigma * distance_px
 
 
 def with_focal_error(

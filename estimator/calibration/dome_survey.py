@@ -308,9 +308,8 @@ def _fit(
         if _has_prior_gauge(subset.bundle, gauge):
             common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     except LinAlgError:
-        covariances = (
-            None  # a singular matrix raises the same ValueError as a nearly singular one
-        )
+        # A singular matrix raises the same ValueError as a nearly singular one
+        covariances = None
     if covariances is None or not _determined(subset.bundle, covariances.shared):
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface
@@ -25,7 +24,7 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.catalog.catalog import unit
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.errors import ImageError
 
 
@@ -248,9 +247,7 @@ def calibrate(
     )
 
 
-def _brightest_first(
-    samples: _Samples, selected: NDArray[np.bool_]
-) -> tuple[Ints, Floats, Floats, Ints]:
+def _brightest_first(samples: _Samples, selected: Bools) -> tuple[Ints, Floats, Floats, Ints]:
     """Return the lights of the selected samples, brightest first.
 
     They are given as rows of their ids, mean positions (N, 3), mean brightness, and numbers of frames.

@@ -339,7 +339,7 @@ class EquationsOfMotion:
         measured = [
             np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
         ]
-        return np.asarray(self.axes @ (self.wheel_scale * np.array(measured)))
+        return self.axes @ (self.wheel_scale * np.array(measured))
 
     def rate(self, states: States, stored: Floats) -> Floats:
         """Return the rate relative to the lab, (3, B) in body axes: w = J^-1 (R^T H - stored) - R^T W."""
@@ -525,7 +525,7 @@ def torque_noise(
         @ inverse.T
     )
     noise[:, :3, :3] += walk * duration_s[:, None, None]
-    return np.asarray(noise)
+    return noise
 
 
 def momentum_scale(
@@ -534,4 +534,4 @@ def momentum_scale(
     """Return R J0 J^-1 R^T, (K, 3, 3): it converts a momentum to that of the assumed inertia at the same rate."""
     R_lab_from_body = states.rotation.as_matrix()
     scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))
-    return np.asarray(R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1))
+    return R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1)

@@ -50,12 +50,12 @@ from estimator.calibration.mass_dynamics import (
 )
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
-CONVERGED_SIGMA = (
-    0.01  # largest step of a parameter at convergence, in its standard deviations
-)
+# Largest step of a parameter at convergence, in its standard deviations
+CONVERGED_SIGMA = 0.01
 # Tolerance of the logarithm of the misfit, and the largest number of fits to reach it.
 MISFIT_TOLERANCE = 0.1
 MAX_FACTORS = 8
@@ -190,8 +190,7 @@ def considered(
     # 3. Sum over all pairs of attitudes, of all records
     effect = np.concatenate(varying)
     if len(lights) == len(varying):
-        used = np.concatenate(lights)
-        used = used / np.linalg.norm(used, axis=1, keepdims=True)
+        used = normalized(np.concatenate(lights))
         shared = used @ used.T
     else:
         quaternion = Rotation.concatenate(attitudes).as_quat()
@@ -201,15 +200,13 @@ def considered(
     np.fill_diagonal(shared, 0.0)
     total = np.concatenate(constant).sum(axis=0)
     added = np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True)
-    return np.asarray(added + total @ total.T)
+    return added + total @ total.T
 
 
 def symmetric_root(matrix: Floats) -> Floats:
     """Return the (N, 3, 3) symmetric roots of positive semi-definite matrices."""
     values, axes = np.linalg.eigh(matrix)
-    return np.asarray(
-        axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.transpose(0, 2, 1)
-    )
+    return axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.transpose(0, 2, 1)
 
 
 def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
@@ -296,7 +293,7 @@ def whitened_links(
     rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
     # Division by the Cholesky factor of the noise
     noise = scale @ link.noise @ scale.transpose(0, 2, 1)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows)
+    return np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows
 
 
 def add_measured(
@@ -337,7 +334,7 @@ def add_measured(
 def measured_minus(measured: Rotation, lab_from_body: Rotation, bias_rad: Floats) -> Floats:
     """Return the (N, 3) rotation vectors from the states' attitudes, with the tracker's bias, to the measured ones."""
     predicted = lab_from_body * Rotation.from_rotvec(bias_rad)
-    return np.asarray((predicted.inv() * measured).as_rotvec())
+    return (predicted.inv() * measured).as_rotvec()
 
 
 def lower_band(diagonal: Floats, beside: Floats) -> Floats:
@@ -469,4 +466,4 @@ def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
     kept = np.eye(len(covariance))
     kept[:, :3] -= gain
     kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain
-    return np.asarray(kept @ covariance @ kept.T + gain @ noise @ gain.T)
+    return kept @ covariance @ kept.T + gain @ noise @ gain.T

@@ -44,9 +44,8 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
-LEAST_STARS = (
-    3  # in a frame: two determine its attitude and leave only one coordinate for the lens
-)
+# In a frame: two determine its attitude and leave only one coordinate for the lens
+LEAST_STARS = 3
 START_ROUNDS = 30  # iterations of the robust start attitude
 # self_calibrate stops at a round with fewer than this fraction of the most stars so far.
 MIN_STAR_FRACTION = 0.9

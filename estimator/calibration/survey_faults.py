@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -25,10 +24,10 @@ from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
+from estimator.core.vectors import normalized
 
-Mask = NDArray[np.bool_]
 FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
 CHI2_MEDIAN = 2.366  # median of a chi-square of three degrees of freedom
@@ -37,9 +36,8 @@ TINY_M2 = 1e-18  # added to variances, which could be 0
 SURFACE_SIGMA_M = 0.005
 GATE = 5.0  # largest distance of a ray from its light, in standard deviations
 MIN_SCATTER = 0.02  # least standard deviation of the logarithm of an LED's light
-CHANCE = (
-    0.02  # probability that a light is missed although it is on, or seen although it is off
-)
+# Probability that a light is missed although it is on, or seen although it is off
+CHANCE = 0.02
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
@@ -52,7 +50,7 @@ class HeldFrames:
     lever: Lever
     body_from_lab: Rotation
 
-    def shown(self, margin_px: float | Floats, apart_px: float) -> Mask:
+    def shown(self, margin_px: float | Floats, apart_px: float) -> Bools:
         """Return (F, N) whether a frame must show an LED if that shines.
 
         It must if the LED is inside the frame by a margin, and far enough from all other LEDs.
@@ -105,7 +103,7 @@ class StrayLight:
     frames: int
 
 
-def dark(shown: Mask, seen: Mask) -> Ints:
+def dark(shown: Bools, seen: Bools) -> Ints:
     """Return the rows of the LEDs that never shine: seen in none of the n frames that must show them.
 
     With the share p of the other LEDs' images that are detected, chance leaves one of N LEDs unseen in N (1 - p)^n
@@ -151,7 +149,7 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
 
     def value(sigma_m: float) -> Floats:
         variance_m2 = np.maximum(eigenvalue, 0) + sigma_m**2 + TINY_M2
-        return np.asarray(np.sum(squared_m2 / variance_m2, axis=1))
+        return np.sum(squared_m2 / variance_m2, axis=1)
 
     # 2. Bisection: the median falls with s.
     low = 0.0
@@ -178,7 +176,7 @@ def found_displacements_m(covariance_m2: Floats, sigma_m: float) -> Floats:
     """
     measured = covariance_m2[np.isfinite(covariance_m2).all(axis=(1, 2))]
     greatest_m2 = np.linalg.eigvalsh(measured)[:, 2] + sigma_m**2
-    return np.asarray((np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2))
+    return (np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2)
 
 
 def _limit(count: int) -> float:
@@ -273,9 +271,8 @@ def _meeting_point(
 
 def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
-    toward = place_m - origins
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    return np.asarray(np.linalg.norm(np.cross(toward, directions), axis=1))
+    toward = normalized(place_m - origins)
+    return np.linalg.norm(np.cross(toward, directions), axis=1)
 
 
 def name_strays(
@@ -320,7 +317,7 @@ class LightTable:
     """
 
     light: Floats
-    shown: Mask
+    shown: Bools
     expected: Floats
 
 
@@ -479,11 +476,11 @@ def _log_likelihood(table: LightTable) -> Floats:
     chi2 = (mean / between_sigma) ** 2 + within / within_sigma**2
     out = wrong * np.log(CHANCE) - chi2 / 2
     out[~tested] = 0.0
-    return np.asarray(out)
+    return out
 
 
 def _observable(
-    table: LightTable, likelihood: Floats, tested: Mask, least: float
+    table: LightTable, likelihood: Floats, tested: Bools, least: float
 ) -> float | None:
     """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
@@ -23,9 +22,8 @@ from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints
 
-Mask = NDArray[np.bool_]
 MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
 # Least rms angle of crossing rays; with a smaller one, the errors of AFIT's LEDs are a third larger.
@@ -76,7 +74,7 @@ class SurveyModel:
                     f"survey: {name} is {getattr(self, name)}; allowed: 0 or more"
                 )
 
-    def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Mask:
+    def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Bools:
         """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
         rows = []
         for attitude in body_from_lab:
@@ -103,7 +101,7 @@ class SurveyAccuracy:
         Standard deviations of focal_px, center x and y, and of k1, k2, p1, p2 if they are fitted
     """
 
-    measured: Mask
+    measured: Bools
     led_sigma_m: Floats
     lever_sigma_m: Floats
     lens_sigma: Floats
@@ -114,7 +112,7 @@ class SurveyAccuracy:
         return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
 
 
-def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAccuracy:
+def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyAccuracy:
     """Return the errors that a survey will leave, from the Fisher information of its sightings.
 
     Parameters
@@ -148,7 +146,7 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Mask) -> SurveyAc
 
 
 def _bundle(
-    model: SurveyModel, body_from_lab: Rotation, seen: Mask
+    model: SurveyModel, body_from_lab: Rotation, seen: Bools
 ) -> tuple[Bundle, Sightings]:
     """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
     camera = model.camera
@@ -177,10 +175,10 @@ def _bundle(
 def choose(
     model: SurveyModel,
     candidates: Rotation,
-    shown: Mask,
+    shown: Bools,
     count: int,
     held: Rotation | None = None,
-    seen: Mask | None = None,
+    seen: Bools | None = None,
 ) -> list[int]:
     """Return the rows of up to `count` candidate attitudes to take frames at next, the most useful first.
 
@@ -235,7 +233,7 @@ def choose(
     return chosen
 
 
-def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Mask) -> int | None:
+def _best(rows: Sequence[_Row], blocks: Floats, bound: Floats, allowed: Bools) -> int | None:
     """Return the allowed candidate of the largest reduction; None if no candidate reduces anything.
 
     The bounds, (C,) last reductions, of the candidates that are evaluated are updated in place.
@@ -264,7 +262,7 @@ class _Reach:
     r^2 - |m|^2 - (a - (u.m)^2). The distance from the camera of an LED at R from the center is R - u.m.
     """
 
-    def __init__(self, model: SurveyModel, candidates: Rotation, shown: Mask) -> None:
+    def __init__(self, model: SurveyModel, candidates: Rotation, shown: Bools) -> None:
         place_m = model.leds.position_m
         self.arm_m = np.array(model.lever.camera_body_m)
         self.distance_m = np.linalg.norm(place_m, axis=1)
@@ -284,7 +282,7 @@ class _Reach:
         camera_m = np.atleast_2d(body_from_lab.inv().apply(self.arm_m))[row]
         return camera_m, np.sum(camera_m * self.toward[led], axis=1)
 
-    def add(self, body_from_lab: Rotation, seen: Mask) -> None:
+    def add(self, body_from_lab: Rotation, seen: Bools) -> None:
         """Add the sightings of the LEDs seen (F, N) at F attitudes to the sums."""
         row, led = np.nonzero(seen)
         camera_m, along_m = self.positions(body_from_lab, row, led)
@@ -292,7 +290,7 @@ class _Reach:
         np.add.at(self.sum_m, led, camera_m)
         np.add.at(self.along_m2, led, along_m**2)
 
-    def connected(self, useful: Mask) -> Mask:
+    def connected(self, useful: Bools) -> Bools:
         """Return (C,) whether a candidate shares enough LEDs with the attitudes so far.
 
         These are MIN_SHARED, or as many as any useful candidate shares. Only LEDs with crossing rays count. If no
@@ -320,7 +318,7 @@ class _Reach:
         is_crossing = (count > 1) & (across_m2 > least_m**2)
         return self.counted(is_crossing), self.counted(count > 1)
 
-    def counted(self, sightings: Mask) -> Ints:
+    def counted(self, sightings: Bools) -> Ints:
         """Return the (C,) numbers of the selected sightings of each candidate."""
         return np.bincount(self.row[sightings], minlength=len(self.candidates))
 
@@ -333,7 +331,7 @@ class _Row(NamedTuple):
     by_rotation: Floats
 
 
-def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Mask) -> list[_Row]:
+def _rows(model: SurveyModel, body_from_lab: Rotation, shown: Bools) -> list[_Row]:
     """Return the derivatives of each attitude's pixels."""
     bundle, sightings = _bundle(model, body_from_lab, shown)
     terms = ba.linearize(bundle, sightings)
@@ -354,4 +352,4 @@ def _reduction(row: _Row, blocks: Floats) -> Floats:
     own = np.arange(2 * count).reshape(count, 2)
     matrix[own[:, :, None], own[:, None, :]] += np.einsum("kaj,kbj->kab", gain, row.by_led)
     weight = np.linalg.inv(matrix)[own[:, :, None], own[:, None, :]]
-    return np.asarray(np.einsum("kai,kab,kbj->kij", gain, weight, gain))
+    return np.einsum("kai,kab,kbj->kij", gain, weight, gain)

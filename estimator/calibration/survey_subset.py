@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
 from estimator.core.checks import Ints
+from estimator.core.vectors import normalized
 
 # Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
 CROSSING_RAD = 0.005
@@ -131,8 +132,7 @@ def ray_angles(
     frame, led
         (K,) rows of each sighting's frame and light
     """
-    ray = position_m[led] - camera_m[frame]
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    ray = normalized(position_m[led] - camera_m[frame])
     lights = len(position_m)
     scatter = np.zeros((lights, 3, 3))
     count = np.bincount(led, minlength=lights)

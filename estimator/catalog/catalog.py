@@ -129,7 +129,7 @@ class StarCatalog:
         stars = from_columns(numbers, *place, pm_ra, pm_dec, parallax, magnitude, epoch_yr)
         return stars.take(np.argsort(stars.v_mag, kind="stable"))
 
-    def take(self, which: NDArray[Any]) -> StarCatalog:
+    def take(self, which: NDArray) -> StarCatalog:
         """Select stars by mask or index."""
         columns = [name for name in self.__slots__ if name != "epoch_yr"]
         return replace(self, **{name: getattr(self, name)[which] for name in columns})

@@ -277,7 +277,7 @@ def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
     expected = expected_px[measured]
     # A streak and its reverse are equal: give each the sign of the expected one.
     sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
-    return np.asarray(np.median(sign[:, None] * vectors - expected, axis=0))
+    return np.median(sign[:, None] * vectors - expected, axis=0)
 
 
 def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:

@@ -21,6 +21,8 @@ from estimator.core.errors import ImageError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Step = tuple[float, float]  # (dx, dy) in pixels
 
 
 def known(what: str, name: object, allowed: Iterable[str]) -> None:
@@ -82,7 +84,7 @@ def one_rotation(what: str, value: object) -> None:
         raise ImageError(f"{what} is NaN; allowed: a rotation")
 
 
-def pixel_step(what: str, value: object) -> tuple[float, float] | None:
+def pixel_step(what: str, value: object) -> Step | None:
     """Return (dx, dy) as two finite floats, or None. Raises ImageError for anything else."""
     if value is None:
         return None

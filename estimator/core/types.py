@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -41,7 +40,7 @@ class FramePriors:
         For anything but such numbers.
     """
 
-    streak_px: tuple[float, float] | None = None
+    streak_px: Step | None = None
     saturation: float = float("inf")
     turn_rad: float = 0.0
     intensity_threshold: float = THESIS_INTENSITY
@@ -155,19 +154,22 @@ class Blobs:
     area_px: Ints
     background: Background
     flag: Ints
-    streak_px: tuple[float, float] | None = None
+    streak_px: Step | None = None
     turn_rad: float = 0.0
 
     def __len__(self) -> int:
         return len(self.flux)
 
-    def take(self, which: NDArray[Any]) -> Blobs:
+    def take(self, which: NDArray) -> Blobs:
         """Select blobs by mask or index."""
         names = ("box_px", "xy_px", "flux", "peak", "area_px", "flag")
         return replace(self, **{name: getattr(self, name)[which] for name in names})
 
 
-OPTIONAL_SHAPES = {
+# Shape of a light's value; only numbers are required.
+SHAPES: dict[str, tuple[int, ...]] = {
+    "sigma_px": (),
+    "flux": (),
     "covariance_px2": (2, 2),
     "streak_px": (2,),
     "streak_covariance_px2": (2, 2),
@@ -219,15 +221,9 @@ class Centroids:
     def __post_init__(self) -> None:
         xy_px = checks.floats("centroids: xy_px", self.xy_px, (None, 2))
         object.__setattr__(self, "xy_px", xy_px)
-        for name in ("sigma_px", "flux"):
-            object.__setattr__(
-                self,
-                name,
-                checks.floats(f"centroids: {name}", getattr(self, name), (len(xy_px),)),
-            )
-        for name, shape in OPTIONAL_SHAPES.items():
+        for name, shape in SHAPES.items():
             value = getattr(self, name)
-            if value is not None:
+            if value is not None or not shape:
                 object.__setattr__(
                     self,
                     name,
@@ -253,16 +249,11 @@ class Centroids:
         """Return no centroids."""
         return cls(np.empty((0, 2)), np.empty(0), np.empty(0))
 
-    def take(self, which: NDArray[Any]) -> Centroids:
+    def take(self, which: NDArray) -> Centroids:
         """Select centroids by mask or index."""
-        optional = (
-            self.covariance_px2,
-            self.streak_px,
-            self.streak_covariance_px2,
-            self.moments_px2,
-        )
-        taken = (None if array is None else array[which] for array in optional)
-        return Centroids(self.xy_px[which], self.sigma_px[which], self.flux[which], *taken)
+        arrays = {name: getattr(self, name) for name in self.__slots__}
+        taken = {name: one[which] for name, one in arrays.items() if one is not None}
+        return replace(self, **taken)
 
 
 NO_SPREAD = np.empty((0, 2, 2))

@@ -12,6 +12,11 @@ from estimator.core.jit import jit
 Vector = tuple[float, float, float]
 
 
+def normalized(vectors: Floats) -> Floats:
+    """Return (..., K) vectors, divided by their lengths."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 @jit
 def row(array: Floats, n: int) -> Vector:
     """Return row n of an (N, 3) array as a tuple."""

@@ -51,12 +51,10 @@ MAX_GROWN_PX = 64
 # Length of the next filter over the last streak, and the growth of the streak that justifies it.
 LONGER = 1.5
 LENGTHENED = 1.15
-LARGE_PX = (
-    150  # a blob this large is not a faint streak, and a line filter finds many in its noise
-)
-MAX_STREAK_PX = (
-    1024  # longest streak that has a filter: a longer one spreads the star too thinly
-)
+# A blob this large is not a faint streak, and a line filter finds many in its noise
+LARGE_PX = 150
+# Longest streak that has a filter: a longer one spreads the star too thinly
+MAX_STREAK_PX = 1024
 # Largest difference of the streaks at the corners, from a roll, for which one filter serves all of them.
 MAX_TURN_PX = 4.0
 # Least area of a streak: noise averaged along a line is correlated, so that several pixels exceed the threshold.

@@ -11,14 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog.pair_index import PairIndex, build, k_vector
 from estimator.catalog.sky_index import cell_of
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.vectors import Vector
 
@@ -44,7 +43,7 @@ class DirectionGrid(NamedTuple):
     R_grid_from_lab: Floats
     cell: float
     side: int
-    first: NDArray[np.int64]
+    first: Ints
     direction: Floats
 
 

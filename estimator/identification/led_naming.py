@@ -19,13 +19,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.attitude.solvers import rotation
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
+from estimator.core.vectors import normalized
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.led_search import MARGIN_DEX
 
@@ -238,7 +238,7 @@ def _frames(u: Floats, v: Floats) -> Floats:
     """(M, 3, 3) axes of pairs of unit vectors, in rows: the bisector b, n x b, and the normal n to both vectors."""
     middle = u + v
     normal = np.cross(u, v)
-    middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    middle = normalized(middle)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     return np.stack([middle, np.cross(normal, middle), normal], axis=1)
 
@@ -250,7 +250,7 @@ def _evaluate(
     R_cam_from_lab: Floats,
     pair: tuple[int, int],
     names: Ints,
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """Step 4: the misfit of each hypothesis, and the names that it gives to the lights.
 
     Parameters

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
@@ -121,7 +121,7 @@ class CodedTracker(DomeTracker):
             )
         self.code = code
         self.decoder = decoder or DecoderSettings()
-        radius_m = np.linalg.norm(leds.position_m, axis=1)
+        radius_m = leds.radius_m
         pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
         position_m = np.asarray(leds.position_m, dtype=float)
         self.sphere = led_naming.Sphere(
@@ -147,7 +147,7 @@ class CodedTracker(DomeTracker):
     def solve(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
         t_s: float | None = None,
@@ -276,7 +276,7 @@ class CodedTracker(DomeTracker):
         self.phases[:] = False
         for step in (-1, 0, 1):
             self.phases[(tried[allowed] + step) % len(self.phases)] = True
-        return np.asarray(each[:, allowed].swapaxes(0, 1))
+        return each[:, allowed].swapaxes(0, 1)
 
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """Return the (K, 3) rays of centroids and the (K,) errors of their tangents, map and lever included."""

@@ -36,8 +36,9 @@ from estimator.attitude.rotation_fit import fit_focal_ratio
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.vectors import normalized
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
@@ -58,9 +59,8 @@ from estimator.trackers.refinement import mutual_nearest
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.star_tracker import NO_STARS
 
-MIN_ERROR_PX = (
-    0.3  # least centroid error of an LED, for effects outside of survey and calibration
-)
+# Least centroid error of an LED, for effects outside of survey and calibration
+MIN_ERROR_PX = 0.3
 FOCAL_UNCERTAINTY = 0.12  # largest relative error of a focal length that is not calibrated
 FOCAL_CHECKS = 10_000_000  # largest number of checks of its search, which take a second
 MAX_FOCAL_SIGMA = 0.5  # largest focal_sigma of a `Camera`
@@ -106,7 +106,7 @@ def star_identifier(
     therefore has a stretch, from the spread of the radii and the lever. With an assumed attitude the rays meet the
     dome's surface as seen from there (`assumed_directions`), and the stretch is that of the calibration alone.
     """
-    radius = np.linalg.norm(leds.position_m, axis=1)
+    radius = leds.radius_m
     median_radius_m = float(np.median(radius))
     pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
     points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
@@ -152,7 +152,7 @@ def assumed_directions(
     lab_from_cam = lab_from_body * lever.cam_from_body.inv()
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
-    points_m /= np.linalg.norm(points_m, axis=1, keepdims=True)
+    points_m = normalized(points_m)
     return lab_from_cam.inv().apply(points_m)
 
 
@@ -174,20 +174,20 @@ def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
     Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
     line from the bearing is divided by the LED's own distance minus the lever.
     """
-    radius_m = np.linalg.norm(leds.position_m, axis=1)
+    radius_m = leds.radius_m
     lever_m = float(np.linalg.norm(lever.camera_body_m))
     if leds.covariance_m2 is None:
         return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))
     along = leds.position_m / radius_m[:, None]
     total_m2 = np.trace(leds.covariance_m2, axis1=1, axis2=2)
     along_m2 = np.einsum("ni,nij,nj->n", along, leds.covariance_m2, along)
-    return np.asarray(np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m))
+    return np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m)
 
 
 def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
     """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
     tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
-    return np.asarray(camera.focal_sigma * tangent / np.sqrt(2))
+    return camera.focal_sigma * tangent / np.sqrt(2)
 
 
 class DomeTracker:
@@ -231,7 +231,7 @@ class DomeTracker:
     def solve(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
     ) -> Report:

@@ -25,7 +25,7 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
@@ -175,14 +175,7 @@ class Settings:
             value = getattr(self, name)
             if value is None and name in OPTIONAL:
                 continue
-            value = checks.number(
-                f"settings: {name}",
-                value,
-                allowed.low,
-                allowed.high,
-                allowed.words,
-                allowed.whole,
-            )
+            value = checks.number(f"settings: {name}", value, *allowed)
             object.__setattr__(
                 self, name, value
             )  # a plain float or int, which compiled code knows
@@ -251,7 +244,7 @@ def detect_and_centroid(
     camera: Camera,
     settings: Settings,
     clock: Clock,
-    streak_px: tuple[float, float] | None = None,
+    streak_px: Step | None = None,
     turn_rad: float = 0.0,
 ) -> Centroids:
     """Detect blobs and compute their centroids: the numbered steps of the module.
@@ -337,7 +330,7 @@ def process_frame(
     camera: Camera,
     settings: Settings,
     solve: Callable[[Centroids, Clock], Attitude],
-    streak_px: tuple[float, float] | None = None,
+    streak_px: Step | None = None,
     rate: RateEstimate | None = None,
     exposure_s: float | None = None,
 ) -> Report:

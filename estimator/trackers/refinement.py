@@ -37,9 +37,8 @@ NO_MATCH = "no identification beyond chance"
 # Least number of near misses per match for a wrong camera model; centroid errors that are claimed three times too small
 # give up to 0.75.
 MISFIT_SHARE = 0.8
-MAX_DISTORTION_SIGMA = (
-    1.5  # largest radial distortion of an undistorted lens, in standard deviations
-)
+# Largest radial distortion of an undistorted lens, in standard deviations
+MAX_DISTORTION_SIGMA = 1.5
 # A detection brighter than its star by this much is a mismatch: colors, variables and doubles explain less.
 TOO_BRIGHT_MAG = 2.0
 BEHIND = 1e-3  # least z of a direction in the lens fit

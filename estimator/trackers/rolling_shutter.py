@@ -39,15 +39,13 @@ from estimator.core.types import Attitude, Centroids, RateEstimate
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be measured
 # Standard deviation of a rate without streaks, if the exposure is unknown.
 SLOW_RAD_S = np.radians(0.5)
-SMALL_SHEAR_PX = (
-    1.0  # shear at the first and last row that is tried before the full range of slow rates
-)
+# Shear at the first and last row that is tried before the full range of slow rates
+SMALL_SHEAR_PX = 1.0
 # Factor of the slow rates' standard deviation in the prior of the fit: streaks that differ over the field are not
 # measured either.
 PRIOR_FACTOR = 4.0
-SAME_FOCAL = (
-    2e-3  # largest relative difference of focal lengths that a rate not yet fitted causes
-)
+# Largest relative difference of focal lengths that a rate not yet fitted causes
+SAME_FOCAL = 2e-3
 ROUNDS = 5  # largest number of fits: the matches change with the rate
 
 

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 from estimator.identification.star_search import WRONG_FOCAL
 
-MIN_ERROR_PX = (
-    0.005  # least centroid error of a star, for a calibrated lens and the catalog's positions
-)
+# Least centroid error of a star, for a calibrated lens and the catalog's positions
+MIN_ERROR_PX = 0.005
 
 
 class SearchModel(NamedTuple):

@@ -28,7 +28,7 @@ from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, Step
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
@@ -228,7 +228,7 @@ class StarTracker:
     def solve(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
         t_s: float = 0.0,

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.classify import Flag
@@ -40,9 +40,8 @@ from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
 
 WINDOW_SIGMA = 4.0  # detection threshold: lower than in a frame, as fewer pixels are searched
-LONGEST_STREAK_PX = (
-    4.0  # longer streaks are detected with the streak filter in the whole frame
-)
+# Longer streaks are detected with the streak filter in the whole frame
+LONGEST_STREAK_PX = 4.0
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 # Least share of the expected stars in a tracked solution. Where the prediction is wrong, three stars in the windows may
@@ -154,7 +153,7 @@ class TrackingMode:
         image: NDArray,
         t_s: float,
         now_from_then: Rotation | None = None,
-        streak_px: tuple[float, float] | None = None,
+        streak_px: Step | None = None,
         exposure_s: float | None = None,
     ) -> TrackedReport:
         """Solve the frame at t_s. Raises ImageError for bad input; the status reports any other failure.
@@ -206,7 +205,7 @@ class TrackingMode:
         cam_from_ref, xy_px, light = self.tracker.rich_field()
         follower = TrackingMode(self.tracker, self.reach_px, self.max_windows, self.max_age_s)
 
-        def look(image: NDArray, streak_px: tuple[float, float] | None) -> None:
+        def look(image: NDArray, streak_px: Step | None) -> None:
             follower.last = LastSolution(0.0, cam_from_ref, np.zeros(3))
             follower.solve(image, 0.0, None, streak_px)
 
@@ -260,7 +259,7 @@ class TrackingMode:
         self,
         image: NDArray,
         predicted: Rotation,
-        streak_px: tuple[float, float] | None,
+        streak_px: Step | None,
         clock: Clock,
     ) -> TrackedReport | None:
         """Solve from the detections in windows; None if that fails.
@@ -310,7 +309,7 @@ class TrackingMode:
     def _search(
         self,
         image: NDArray,
-        streak_px: tuple[float, float] | None,
+        streak_px: Step | None,
         clock: Clock,
         exposure_s: float | None,
     ) -> TrackedReport:
@@ -341,7 +340,7 @@ class TrackingMode:
         self,
         image: NDArray,
         window_centers_px: Floats,
-        streak_px: tuple[float, float] | None,
+        streak_px: Step | None,
         clock: Clock,
     ) -> tuple[Centroids, bool]:
         """Return the centroids of the detections in windows, and whether any of them is saturated."""
@@ -375,7 +374,7 @@ class TrackingMode:
         clock: Clock,
         expected: int,
         saturated: bool,
-        streak_px: tuple[float, float] | None,
+        streak_px: Step | None,
     ) -> TrackedReport:
         """Return the report with quality flags."""
         if attitude.match is None or attitude.cam_from_ref is None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Step
 from estimator.core.errors import ImageError
 from estimator.detection.detect import to_native
 
@@ -27,8 +27,6 @@ SPOT_SIGMA_PX = 1.0
 REACH_PX = 6
 STREAK_PX = (7.0, 4.0)
 MAX_SPOTS = 40
-
-Step = tuple[float, float]
 
 
 def loop_type(dtype: DTypeLike) -> np.dtype:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import erf, sqrt
-from typing import Any
 
 import numpy as np
 import scipy
@@ -38,12 +37,12 @@ TRACK = np.dtype(
 
 
 def add_particles(
-    electrons: NDArray[Any],
+    electrons: NDArray,
     exposure_s: float,
     pixel_m: float,
     particles: Sequence[ParticlesConfig],
     rng: np.random.Generator,
-) -> NDArray[Any]:
+) -> NDArray:
     """Add the particle tracks of an exposure to a frame of electrons, in place (float32 or float64).
 
     Returns the truth of the tracks that left charge on the chip, a structured array of dtype TRACK: entry at the
@@ -72,7 +71,7 @@ def draw_tracks(
     exposure_s: float,
     pixel_m: float,
     rng: np.random.Generator,
-) -> NDArray[Any]:
+) -> NDArray:
     """Draw every track that could reach a chip of this shape (H, W): its ends, length and charge.
 
     1. The number of tracks is a Poisson number: per_cm2_s counts the particles that cross a square centimeter of the
@@ -121,9 +120,7 @@ def draw_tracks(
 
 
 @jit
-def deposit(
-    image: NDArray[Any], ends_px: Floats, electrons: Floats, sigma_px: float
-) -> Floats:
+def deposit(image: NDArray, ends_px: Floats, electrons: Floats, sigma_px: float) -> Floats:
     """Spread each charge evenly along its track, in steps of at most STEP_PX, each a pixel-integrated Gaussian.
 
     Parameters

@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import image_tracks, in_view, poses, project, sample_times
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import Bools, Floats, Ints, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.bodies import BodyLight
 from skysim.sources.body_discs import disc_elements, lattice_light
 from skysim.sources.dome.led import Emitter
@@ -68,7 +68,7 @@ class DiscOnChip(NamedTuple):
     px_from_radius: Floats
 
 
-Hidden = Callable[[Floats], NDArray[np.bool_]]  # which of (M, 2) points of a disc are hidden
+Hidden = Callable[[Floats], Bools]  # which of (M, 2) points of a disc are hidden
 
 
 def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
@@ -112,7 +112,7 @@ class DisplacedImages(NamedTuple):
     """
 
     patches: Floats
-    corner_px: NDArray[np.int64]
+    corner_px: Ints
     speed_px_s: Floats
     streak_px: float
 
@@ -200,7 +200,7 @@ class DiscImage(NamedTuple):
     """
 
     electrons: Floats
-    corner_px: NDArray[np.int64]
+    corner_px: Ints
     streak_px: float
     streak_xy_px: Floats
 
@@ -275,7 +275,7 @@ FEW = 9  # poses in an exposure at which a body is looked for in the field
 
 
 def render_bodies(
-    image: NDArray[Any],
+    image: NDArray,
     bodies: Sequence[BodyLight],
     exposed: Exposed,
     occluded: OcclusionTest | None = None,
@@ -323,7 +323,7 @@ def centers_of(bodies: Sequence[BodyLight]) -> Sources:
 
 
 def render_points(
-    image: NDArray[Any],
+    image: NDArray,
     body: BodyLight,
     resolved: bool,
     exposed: Exposed,
@@ -345,7 +345,7 @@ def render_points(
 
 
 def add_disc(
-    image: NDArray[Any], disc: DiscImage, body: BodyLight, center_px: Floats
+    image: NDArray, disc: DiscImage, body: BodyLight, center_px: Floats
 ) -> list[SourceTruth]:
     """Add a disc's image to the chip's; return its truth, or an empty list if it misses the chip."""
     size = np.array(disc.electrons.shape[::-1])
@@ -362,8 +362,8 @@ def add_disc(
 
 
 def whole(
-    own_e: NDArray[Any],
-    corner_px: NDArray[np.int64],
+    own_e: NDArray,
+    corner_px: Ints,
     body: BodyLight,
     center_px: Floats,
     streak_px: float,
@@ -398,7 +398,7 @@ def behind(
 ) -> OcclusionTest | None:
     """The test whether nearer bodies' discs or the vehicle hide a source; None if nothing can."""
 
-    def hidden(place: Floats) -> NDArray[np.bool_]:
+    def hidden(place: Floats) -> Bools:
         by_discs = [body.hides(place[:, :3]) for body in bodies]
         return np.any([*by_discs, *([occluded(place)] if occluded else [])], axis=0)
 
@@ -419,7 +419,7 @@ def hidden_points(
         occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
     )
 
-    def hidden(xy: Floats) -> NDArray[np.bool_]:
+    def hidden(xy: Floats) -> Bools:
         column, row = np.clip(((xy + 1) * (COARSE / 2)).astype(int), 0, COARSE - 1).T
         directions = body.directions(xy)
         return np.any(

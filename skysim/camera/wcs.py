@@ -7,11 +7,10 @@ from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import field_rad, fold_r, radial, tangential
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 
 MAX_ORDER = 9  # the highest that SIP allows
 TARGET_ERROR_PX = 1e-4  # the fit stops at the first order with a smaller error
@@ -182,7 +181,7 @@ def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
     return np.column_stack([x[:, p] * y[:, q] for p, q in powers])
 
 
-def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, Bools]:
     """A grid of image points with their places without distortion.
 
     Returns
@@ -205,10 +204,10 @@ def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, NDArray[np.bool_]
     distorted_px = distorted(undistorted_px, camera)
     pixels = distorted_px + center
 
-    def inside(out: float) -> NDArray[np.bool_]:
+    def inside(out: float) -> Bools:
         # Distorted pixels within the chip and a fraction `out` of its sides.
-        return np.asarray(
-            ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(axis=1)
+        return ((pixels >= -0.5 - out * size) & (pixels <= size - 0.5 + out * size)).all(
+            axis=1
         )
 
     on_fit_area = inside(MARGIN)

@@ -17,8 +17,15 @@ from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
+Bools = NDArray[np.bool_]
+
+
+def normalized(vectors: Floats) -> Floats:
+    """(..., K) vectors, divided by their lengths."""
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 

@@ -33,9 +33,8 @@ from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 
-GYRO_RATE_FRACTION = (
-    0.7  # return rate of the controller over the gyros' rate limit (`assumed`)
-)
+# Return rate of the controller over the gyros' rate limit (`assumed`)
+GYRO_RATE_FRACTION = 0.7
 
 
 def authority_nm(actuators: Actuators) -> float:
@@ -50,7 +49,7 @@ def authority_nm(actuators: Actuators) -> float:
 def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
     """(N,) ratio of the greatest command to its limit, for torques (N, 3) on the body."""
     command_from_torque, limit = actuators.command_map()
-    return np.asarray(np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit)
+    return np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit
 
 
 def ideal_torque(vehicle: VehicleModel) -> IdealTorque:

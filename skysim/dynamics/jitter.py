@@ -18,12 +18,11 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Bools, Floats, Ints, Trajectory
 from skysim.dynamics.guidance import Reference, plan, vibration_intervals
 from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
@@ -152,7 +151,7 @@ class VibrationComponent:
         edge_hz = 1 / self.rise_s if math.isfinite(self.begin_s) else 0.0
         return float(self.sines.omega_rad_s.max()) / (2 * np.pi) + edge_hz
 
-    def active(self, t_s: Floats) -> NDArray[np.bool_]:
+    def active(self, t_s: Floats) -> Bools:
         """(N - 1,) whether the vibration is active between each of (N,) times and the next."""
         return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
 
@@ -243,7 +242,7 @@ class Vibration:
             vibration.inv().apply(rate) + rotvec_body_rate(phi, phi_rate),
         )
 
-    def subdivisions(self, t_s: Floats) -> NDArray[np.int64]:
+    def subdivisions(self, t_s: Floats) -> Ints:
         """(N - 1,) number of pieces of each step between (N,) times: SAMPLES_PER_PERIOD samples in every period.
 
         Before vibration is added piece by piece, call this once with all times: it counts all samples.
@@ -308,7 +307,7 @@ def concatenate(sets: Sequence[Sines]) -> Sines:
     )
 
 
-def subdivide(t_s: Floats, counts: NDArray[np.int64]) -> Floats:
+def subdivide(t_s: Floats, counts: Ints) -> Floats:
     """(M,) sample times: (N,) times with each step divided evenly into counts (N - 1,) pieces."""
     # For each new sample: the number of the first sample in its step, and the fraction of the step before it.
     begin = np.repeat(np.cumsum(counts) - counts, counts)

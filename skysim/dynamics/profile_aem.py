@@ -53,9 +53,8 @@ TYPES = {
 DIRECTIONS = ("A2B", "B2A")
 ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
-SAME_ATTITUDE_RAD = (
-    1e-6  # greatest difference of one sample that two adjoining segments share
-)
+# Greatest difference of one sample that two adjoining segments share
+SAME_ATTITUDE_RAD = 1e-6
 
 
 def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:

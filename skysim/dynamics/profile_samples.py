@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where
 from skysim.core.text import excerpt
 from skysim.core.time import J2000_JD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 MIN_SAMPLES = 4  # a not-a-knot cubic needs four
 MAX_SAMPLES = 1_000_000
@@ -48,7 +47,7 @@ class Samples:
 
     source: str
     unit: str
-    places: NDArray[np.int64]
+    places: Ints
     t_s: Floats
     a: str
     b: str
@@ -74,7 +73,7 @@ class Samples:
 def from_quaternions(
     source: str,
     unit: str,
-    places: Sequence[int] | NDArray[np.int64],
+    places: Sequence[int] | Ints,
     t_s: Floats,
     frames: tuple[str, str],
     xyzw: Floats,

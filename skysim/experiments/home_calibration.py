@@ -45,7 +45,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Floats, Ints, Mask, Record
+from skysim.core.types import Bools, Floats, Ints, Record
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -407,7 +407,7 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     }
 
 
-def spread(values: Floats, sets: Sequence[Mask]) -> Record:
+def spread(values: Floats, sets: Sequence[Bools]) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
     return {
         "mean": float(values.mean()),

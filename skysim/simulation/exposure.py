@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from skysim.camera.glow import background, stray
 from skysim.camera.projection import in_view, project, sample_times
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Floats, Frame, SourceTruth, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Ints, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import ColorChannel, StarCamera
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
 from skysim.simulation.timing import (
@@ -192,7 +191,7 @@ def expected_exposure(
     return exposure_of(camera, trajectory, 0, window, None)
 
 
-def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:
+def draw_glow(image: NDArray, beam: Beam, exposure_s: float) -> None:
     """Set the (H, W) image to the extended light of a beam in electrons: smooth light, then light with edges."""
     smooth = sum(lit.glow() for lit in beam.lits if lit.glow)
     background.fill(image, np.atleast_2d(smooth), exposure_s)
@@ -202,7 +201,7 @@ def draw_glow(image: NDArray[Any], beam: Beam, exposure_s: float) -> None:
             background.add(image, glow, edged.share * exposure_s)
 
 
-def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTruth:
+def draw_lights(image: NDArray, beam: Beam, exposure: Exposure) -> SourceTruth:
     """Add the points and discs of a beam to the (H, W) image in place, and the glare of the lens.
 
     Returns the truth of their images.
@@ -228,7 +227,7 @@ def draw_lights(image: NDArray[Any], beam: Beam, exposure: Exposure) -> SourceTr
 
 
 def draw_colors(
-    image: NDArray[Any], channels: Sequence[ColorChannel], exposure: Exposure
+    image: NDArray, channels: Sequence[ColorChannel], exposure: Exposure
 ) -> SourceTruth:
     """Set the (H, W) image of a color camera to all light: each pixel has that of the channel of its filter.
 
@@ -279,14 +278,14 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
     )
 
 
-def hidden_ids(beam: Beam, exposure: Exposure) -> NDArray[np.int64]:
+def hidden_ids(beam: Beam, exposure: Exposure) -> Ints:
     """(M,) ids of the points that something hides and that would otherwise be on the detector at mid-exposure."""
     return np.concatenate(
         [np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)]
     )
 
 
-def hidden_of(lit: Lit, exposure: Exposure) -> NDArray[np.int64]:
+def hidden_of(lit: Lit, exposure: Exposure) -> Ints:
     """(M,) ids of `hidden_ids` among the points of one light."""
     occludes = lit.occlusion
     if lit.points is None or occludes is None:

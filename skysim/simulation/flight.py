@@ -606,6 +606,6 @@ def open_flight(
     )
 
 
-def simulate_motion(scene: Scene, progress: Progress | None = None) -> Flight:
+def simulate_motion(scene: Scene) -> Flight:
     """A flight of the scene after its end. Only the frames that a filter needs are rendered."""
-    return open_flight(scene).simulate_motion(progress)
+    return open_flight(scene).simulate_motion()

@@ -230,7 +230,7 @@ class StarCamera:
     optics: Optics
     detector: Detector
     band: Band
-    canvas: NDArray[Any]
+    canvas: NDArray
     lights: tuple[Light, ...]
     channels: tuple[ColorChannel, ...]
     orbit: CameraOrbit | None
@@ -370,7 +370,9 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     mount = multibody.camera_mount(vehicle)
     profiles = load_profiles(scene, mount, parts.profile)
     # 3. Cameras.
-    shown = light_catalog(scene)
+    shown = None
+    if not isinstance(scene.light, DomeConfig):
+        shown = catalog.read_for("light.catalog", scene.light.catalog)
     main = build_camera(scene, vehicle, mount, shown)
     heads = [
         build_head(scene, n, vehicle, main, shown, parts.programs)
@@ -388,18 +390,32 @@ def build_camera(
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
     plan = LightPlan(scene, band, vehicle, viewpoint, shown)
+    return camera_of(MAIN, plan, mount, orbit, scene.seed)
+
+
+def camera_of(
+    name: str,
+    plan: LightPlan,
+    mount: Mount,
+    orbit: CameraOrbit | None,
+    run_seed: int,
+    mount_error: Rotation | None = None,
+) -> StarCamera:
+    """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
+    scene = plan.scene
     return StarCamera(
-        name=MAIN,
-        scene=scene,
-        mount=mount,
-        optics=Optics.from_camera(scene.camera),
-        detector=Detector.from_camera(scene.camera),
-        band=band,
-        canvas=build_canvas(scene),
-        lights=build_lights(plan),
-        channels=color_channels(plan),
-        orbit=orbit,
-        run_seed=scene.seed,
+        name,
+        scene,
+        mount,
+        Optics.from_camera(scene.camera),
+        Detector.from_camera(scene.camera),
+        plan.band,
+        build_canvas(scene),
+        build_lights(plan),
+        color_channels(plan),
+        orbit,
+        run_seed,
+        mount_error,
     )
 
 
@@ -419,7 +435,7 @@ def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
     return tuple(channels)
 
 
-def build_canvas(scene: Scene) -> NDArray[Any]:
+def build_canvas(scene: Scene) -> NDArray:
     """The (H, W) array in which a camera's frames are drawn, see `StarCamera`."""
     dtype = np.float32 if scene.camera.detector.noise else np.float64
     return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)
@@ -461,23 +477,10 @@ def build_head(
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
         plan = LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
-        lights = build_lights(plan)
-        channels = color_channels(plan)
+        turned = Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD)
+        return camera_of(head.name, plan, mount, main.orbit, main.run_seed, turned)
     except InputError as error:
         raise error.under(f"heads.{n}") from None
-    return replace(
-        main,
-        name=head.name,
-        scene=scene,
-        mount=mount,
-        optics=Optics.from_camera(scene.camera),
-        detector=Detector.from_camera(scene.camera),
-        band=band,
-        canvas=build_canvas(scene),
-        lights=lights,
-        channels=channels,
-        mount_error=Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD),
-    )
 
 
 def lab_from_body_start(
@@ -489,13 +492,6 @@ def lab_from_body_start(
         cam_from_icrs = stars.cam_from_icrs(start.ra_deg, start.dec_deg, start.roll_deg)
         return cam_from_icrs.inv() * mount.cam_from_body
     return guidance.start_attitude(scene.motion, profiles)
-
-
-def light_catalog(scene: Scene) -> catalog.Catalog | None:
-    """The catalog of the scene's light; None for a dome."""
-    if isinstance(scene.light, DomeConfig):
-        return None
-    return catalog.read_for("light.catalog", scene.light.catalog)
 
 
 def build_tracker(

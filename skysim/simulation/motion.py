@@ -17,13 +17,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
-from skysim.core.types import Floats, Mounting, Telemetry, Trajectory
+from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.controllers import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
@@ -222,7 +221,7 @@ def shortfall(lab: Lab) -> str:
     )
 
 
-def at_limit(loads: Mapping[str, Floats]) -> dict[str, NDArray[np.bool_]]:
+def at_limit(loads: Mapping[str, Floats]) -> dict[str, Bools]:
     """Whether each actuator is at its limit, (K,) by name; actuators that never are left out."""
     found = {name: load >= AT_LIMIT for name, load in loads.items()}
     return {name: full for name, full in found.items() if full.any()}
@@ -279,10 +278,6 @@ class TelemetryRecorder:
     def row(self) -> int:
         """Row of the control period that begins now."""
         return self.simulation.step // self.steps_per_tick
-
-    def record_disturbance(self, torque_nm: Floats) -> None:
-        """Record the mean disturbance torque (3,) of this control period; call it before `record`."""
-        self.disturbance_nm[self.row] = torque_nm
 
     def record(self, momentum_nms: Floats) -> None:
         """Record the rest of this control period, after the controls are set and before the vehicle moves."""
@@ -515,7 +510,8 @@ class Motion:
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
             control[:, simulation.vehicle.torques] += disturbance
             if self.recorder:
-                self.recorder.record_disturbance(disturbance.sum(axis=0) / len(control))
+                mean_nm = disturbance.sum(axis=0) / len(control)
+                self.recorder.disturbance_nm[self.recorder.row] = mean_nm
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.recorder:
             self.recorder.record(momentum)

@@ -8,12 +8,11 @@ from functools import lru_cache
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import RectBivariateSpline
 
 from skysim.core.time import tt_jd, ut1_jd
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources
 from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.bodies import ALBEDO, BodyLight
@@ -147,7 +146,7 @@ def factors(variances: Floats, rng: np.random.Generator) -> Floats:
     """
     log_variance = np.log1p(variances)
     normal = rng.standard_normal(len(variances))
-    return np.asarray(np.exp(np.sqrt(log_variance) * normal - log_variance / 2))
+    return np.exp(np.sqrt(log_variance) * normal - log_variance / 2)
 
 
 # Extinction: the light that the air absorbs and scatters.
@@ -187,7 +186,7 @@ class Air:
     config: AirConfig
     site: SiteConfig
     refraction: Refraction
-    star_id: NDArray[np.int64]
+    star_id: Ints
     b_v: Floats
     wavelength_m: float
 
@@ -205,7 +204,7 @@ class Air:
         """The sky at a time."""
         return Sky(self, time, topocentric_axes(time, self.site))
 
-    def b_v_of(self, ids: NDArray[np.int64]) -> Floats:
+    def b_v_of(self, ids: Ints) -> Floats:
         """(M,) B-V of lights by their numbers; lights that are no star of the catalog have the Sun's."""
         row = np.minimum(np.searchsorted(self.star_id, ids), len(self.star_id) - 1)
         return np.where(self.star_id[row] == ids, self.b_v[row], SUN[0])
@@ -241,7 +240,7 @@ class Sky:
         """(N,) air masses in apparent directions (N, 3)."""
         return air_mass(self.altitude_rad(directions))
 
-    def below_horizon(self, directions: Floats) -> NDArray[np.bool_]:
+    def below_horizon(self, directions: Floats) -> Bools:
         """(N,) whether apparent directions (N, 3) are below the skyline."""
         north, east, up = self.axes @ directions.T
         limit_rad = horizon_rad(self.air.config.horizon, np.arctan2(east, north))
@@ -308,7 +307,7 @@ def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
         [-sin_l, cos_l, 0.0],
         [cos_b * cos_l, cos_b * sin_l, sin_b],
     ]
-    return np.asarray(np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0))
+    return np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0)
 
 
 def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
@@ -316,8 +315,8 @@ def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:
     if config is None:
         return np.zeros(len(azimuth_rad))
     table_rad = np.radians(config.azimuth_deg)
-    return np.asarray(
-        np.interp(azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi)
+    return np.interp(
+        azimuth_rad, table_rad, np.radians(config.altitude_deg), period=2 * np.pi
     )
 
 

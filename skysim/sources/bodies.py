@@ -7,9 +7,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import BodyTruth, Floats
+from skysim.core.types import BodyTruth, Bools, Floats, normalized
 from skysim.scene.sections.light import BodiesConfig
 from skysim.sources.body_discs import (
     LAMBERT,
@@ -185,14 +184,14 @@ class BodyLight:
         offset = xy @ np.stack([x_axis, np.cross(center, x_axis)])
         # On the tangent plane at the disc's center.
         vectors = center + np.tan(self.radius_rad) * offset
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+        return normalized(vectors)
 
     def overlaps(self, other: BodyLight) -> bool:
         """Whether the disc overlaps another body's disc."""
         cosine = float(self.place.direction @ other.place.direction)
         return cosine > np.cos(self.radius_rad + other.radius_rad)
 
-    def hides(self, directions: Floats) -> NDArray[np.bool_]:
+    def hides(self, directions: Floats) -> Bools:
         """(M,) which of the unit vectors (M, 3) point to the disc, so that what is behind it is hidden."""
         return directions @ self.place.direction > np.cos(self.radius_rad)
 

@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.constants import (
     DAY_S,
@@ -20,7 +19,7 @@ from skysim.core.constants import (
 )
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.scene.sections.surroundings import (
     CircularOrbitConfig,
     OemOrbitConfig,
@@ -248,7 +247,7 @@ def sun_m(tt_jd: float) -> Floats:
 
 def hidden_by_earth(
     observer_m: Floats, direction: Floats, distance_m: Floats | float = np.inf
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether the Earth is between an observer and points in unit directions (..., 3) at these distances.
 
     On the stretched sphere the line p + s d comes nearest to the center at s = -p.d, where its distance is

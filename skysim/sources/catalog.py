@@ -22,7 +22,7 @@ from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
 EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
@@ -78,7 +78,7 @@ class Catalog:
         Epoch of the places, a Julian year (a number)
     """
 
-    hip: NDArray[np.int64]
+    hip: Ints
     ra_rad: Floats
     dec_rad: Floats
     pm_ra_rad_yr: Floats
@@ -93,7 +93,7 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def take(self, which: NDArray[Any]) -> Catalog:
+    def take(self, which: NDArray) -> Catalog:
         """The chosen stars, by mask or index."""
         # All fields but the epoch are arrays.
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
@@ -150,7 +150,7 @@ def header_text(datatype: list[dict[str, Any]], meta: dict[str, Any]) -> str:
     return "".join(f"# {line}\n" for line in lines)
 
 
-def write_selection(source: Path, path: Path, hip: NDArray[np.int64], rule: str) -> None:
+def write_selection(source: Path, path: Path, hip: Ints, rule: str) -> None:
     """Write the stars of a catalog file that have these numbers, their lines unchanged.
 
     Parameters

@@ -65,7 +65,7 @@ class Ephemeris(NamedTuple):
         coefficients = series.coefficients[:, :, int(interval)] * series.unit_km
         # T_k(x) = cos(k arccos x)
         angle = np.arccos(2 * offset_days / series.days - 1)
-        return np.asarray(np.cos(angle * np.arange(len(coefficients))) @ coefficients)
+        return np.cos(angle * np.arange(len(coefficients))) @ coefficients
 
     def barycentric_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km from the solar system's barycenter, for the Moon too."""
@@ -156,15 +156,14 @@ def site_in_gcrs(time: datetime.datetime, tt: float, site: SiteConfig) -> GcrsSt
 def earth_rate_rad_s(time: datetime.datetime) -> Floats:
     """(3,) rate of the Earth, ICRS axes: about the pole of the date (IAU 2006/2000A; no polar motion)."""
     pole = erfa.c2i06a(tt_jd(time), 0.0)[2]
-    return np.asarray(EARTH_RATE_RAD_S * pole)
+    return EARTH_RATE_RAD_S * pole
 
 
 # Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.
 
 
-DEFLECTION_LIMIT = (
-    1e-6  # of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
-)
+# Of `erfa.ld`: within 3' of the Sun's center its deflection is reduced
+DEFLECTION_LIMIT = 1e-6
 
 
 class Place(NamedTuple):

@@ -8,13 +8,12 @@ from typing import Literal, NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints, normalized
 from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
@@ -49,11 +48,11 @@ class Pointing(NamedTuple):
         if self.law == "inertial":
             return np.broadcast_to(self.direction, states.position_m.shape)
         # Local axes: up, left of the flight direction, ahead.
-        up = unit(states.position_m)
-        left = unit(np.cross(states.position_m, states.velocity_m_s))
+        up = normalized(states.position_m)
+        left = normalized(np.cross(states.position_m, states.velocity_m_s))
         ahead = np.cross(left, up)
         level = np.cos(self.around_rad) * ahead + np.sin(self.around_rad) * left
-        return np.asarray(np.cos(self.off_rad) * up + np.sin(self.off_rad) * level)
+        return np.cos(self.off_rad) * up + np.sin(self.off_rad) * level
 
 
 class SkySamples(NamedTuple):
@@ -75,9 +74,9 @@ class SkySamples(NamedTuple):
     sun_deg: Floats
     earth_deg: Floats
     moon_deg: Floats
-    stars: NDArray[np.int64]
+    stars: Ints
 
-    def outside(self, exclusion: ExclusionConfig) -> dict[str, NDArray[np.bool_]]:
+    def outside(self, exclusion: ExclusionConfig) -> dict[str, Bools]:
         """(K,) whether the boresight is outside each body's exclusion angle, and whether there are enough stars."""
         return {
             "Sun": self.sun_deg > exclusion.sun_deg,
@@ -143,8 +142,3 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
     earth_km = [ephemeris.position_km("earth", jd) for jd in dates]
     body_km = [ephemeris.barycentric_km(name, jd) for jd in dates]
     return CubicSpline(nodes_s, 1e3 * (np.array(body_km) - np.array(earth_km)))
-
-
-def unit(vectors: Floats) -> Floats:
-    """Normalized (K, 3) vectors."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

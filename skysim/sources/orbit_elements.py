@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
 from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
@@ -35,7 +34,7 @@ from skysim.core.text import (
     to_numbers,
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 MAX_SATELLITES = 100_000  # in a file
 MAX_AGE_DAYS = 365  # of the elements that are nearest in time
@@ -216,7 +215,7 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
 
 def gcrs_states(
     elements: MeanElements, time: datetime.datetime, after_s: Floats
-) -> tuple[Floats, Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Ints]:
     """States of N satellites at K times after a time, by SGP4.
 
     SGP4's error grows by 1 to 3 km a day from the elements' epoch in low orbits.
@@ -248,7 +247,7 @@ def gcrs_from_teme(time: datetime.datetime) -> Floats:
     # The difference of both angles about the pole.
     ut1 = ut1_jd(time)
     angle = erfa.gmst82(ut1, 0.0) - erfa.era00(ut1, 0.0)
-    return np.asarray(erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3)))
+    return erfa.c2i06a(tt_jd(time), 0.0).T @ erfa.rz(angle, np.eye(3))
 
 
 # OEM: segments of metadata (META_START ... META_STOP) and lines of an epoch, a position in km, a velocity in km/s and,
@@ -259,9 +258,8 @@ VERSION = "CCSDS_OEM_VERS"
 VERSIONS = ("1.0", "2.0", "3.0")
 FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
-SAME_M = (
-    1.0  # adjoining segments may share a sample; its positions then differ by less than this
-)
+# Adjoining segments may share a sample; its positions then differ by less than this
+SAME_M = 1.0
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 
@@ -343,7 +341,7 @@ def gravity_m_s2(position_m: Floats) -> Floats:
     flattened = 1.5 * EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
     polar = 5 * (position_m[:, 2:] / r) ** 2
     factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
-    return np.asarray(-EARTH_MU_M3_S2 / r**3 * position_m * factors)
+    return -EARTH_MU_M3_S2 / r**3 * position_m * factors
 
 
 def split_segments(path: str) -> list[TextSegment]:

@@ -183,7 +183,7 @@ def layer_rad(
         n, slope = layer(r_m)
         r_m = r_m - (n * r_m - invariant[:, None] / sine) / (n + slope)
     n, slope = layer(r_m)
-    return np.asarray(-(slope / (n + slope)) @ weight * half[:, 0])
+    return -(slope / (n + slope)) @ weight * half[:, 0]
 
 
 class Refraction:
@@ -206,7 +206,7 @@ class Refraction:
 
     def bending_rad(self, zenith_rad: Floats) -> Floats:
         """(N,) angles by which sources appear nearer to the zenith, at (N,) zenith distances without air."""
-        return np.asarray(self.spline(np.minimum(zenith_rad, self.last_rad)))
+        return self.spline(np.minimum(zenith_rad, self.last_rad))
 
     def apparent(self, directions: Floats, zenith: Floats) -> Floats:
         """Turn directions toward the zenith, each in its vertical plane.
@@ -228,4 +228,4 @@ class Refraction:
         sine = np.linalg.norm(across, axis=1)
         bending = self.bending_rad(np.arctan2(sine, cosine))
         along = np.sin(bending) / np.maximum(sine, 1e-12)
-        return np.asarray(np.cos(bending)[:, None] * directions + along[:, None] * across)
+        return np.cos(bending)[:, None] * directions + along[:, None] * across

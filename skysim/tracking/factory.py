@@ -14,7 +14,6 @@ import numpy as np
 
 from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.attitude.solvers import SOLVERS
-from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
@@ -36,8 +35,7 @@ from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
-from skysim.sources.dome import display
+from skysim.scene.sections.light import DomeConfig
 from skysim.tracking import external_tracker
 from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
 from skysim.tracking.onboard_model import (
@@ -45,9 +43,8 @@ from skysim.tracking.onboard_model import (
     assumed_air,
     assumed_camera,
     assumed_code,
-    assumed_observer,
     assumed_orbit,
-    onboard_catalog,
+    assumed_stars,
     onboard_dome,
     with_brightness,
     zero_point_mag,
@@ -194,14 +191,8 @@ def build_sky_tracker(
     """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
-    stars = catalog.brighter_than(
-        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
-    )
     orbit = assumed_orbit(scene)
-    directions = catalog.apparent(stars, assumed_observer(scene, orbit))
-    if isinstance(scene.light, CollimatedDisplayConfig):
-        # The mounting of the display defines the stars' directions in the lab frame.
-        directions = display.lab_from_icrs(scene.light).apply(directions)
+    stars, directions = assumed_stars(scene, orbit)
     if scene.tracker.name != OWN:
         return ExternalTracker.start(
             scene, camera, settings, external_tracker.star_map(stars, directions), programs

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +26,11 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
-from skysim.scene.sections.light import DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.sources.air import weather_of
 from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.catalog import require_catalog
-from skysim.sources.dome import surface, survey_errors
+from skysim.sources.dome import display, surface, survey_errors
 from skysim.sources.dome.codebooks import codebook, light_levels
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
@@ -72,7 +71,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     # The design's LEDs in the order of the map.
     order = np.argsort(nominal.id)
     nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
-    distance_m = np.linalg.norm(leds.position_m, axis=1) - np.linalg.norm(lever.camera_body_m)
+    distance_m = leds.radius_m - np.linalg.norm(lever.camera_body_m)
     strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
     light_e_s_m2 = irradiance_e_s_m2(
         strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m
@@ -280,7 +279,7 @@ class OrbitStarTracker(StarTracker):
 
     def solve(
         self,
-        image: NDArray[Any],
+        image: NDArray,
         streak_px: tuple[float, float] | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
@@ -306,6 +305,20 @@ def assumed_orbit(scene: Scene) -> CameraOrbit | None:
     return (
         build_orbit(scene.orbit, scene.start_time) if scene.tracker.orbit_velocity else None
     )
+
+
+def assumed_stars(
+    scene: Scene, orbit: CameraOrbit | None
+) -> tuple[catalog.StarCatalog, Floats]:
+    """The tracker's stars and their apparent directions (N, 3) at the scene's start, in lab axes. Raises InputError."""
+    stars = catalog.brighter_than(
+        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
+    )
+    directions = catalog.apparent(stars, assumed_observer(scene, orbit))
+    if isinstance(scene.light, CollimatedDisplayConfig):
+        # The mounting of the display defines the stars' directions in the lab frame.
+        directions = display.lab_from_icrs(scene.light).apply(directions)
+    return stars, directions
 
 
 def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:

@@ -31,7 +31,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.dynamics.controllers import CONTROLLERS
 
 OWN = "own"  # the name of skysim's own estimator
@@ -39,9 +39,8 @@ TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
 PROTOCOL = 1  # version of the protocol, the first key of the set-up
-UNIT_TOLERANCE = (
-    1e-3  # deviation of a quaternion's norm from 1: single precision passes and is normalized
-)
+# Deviation of a quaternion's norm from 1: single precision passes and is normalized
+UNIT_TOLERANCE = 1e-3
 MIN_RAD2 = 1e-24  # smallest eigenvalue of a covariance: (0.2 micro-arcseconds)^2
 MAX_RAD2 = (2 * np.pi) ** 2  # largest eigenvalue of a covariance: no information
 MAX_CENTROIDS = 100_000
@@ -64,7 +63,7 @@ class Stars:
         (N,) magnitudes in V
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     direction: Floats
     magnitude: Floats
 
@@ -85,7 +84,7 @@ class Leds:
         (4,) rotation from body axes to camera axes, scalar last
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     position_m: Floats
     camera_body_m: Floats
     cam_from_body_xyzw: Floats
@@ -166,7 +165,7 @@ class Picture:
         Motion (dx, dy) of the images in the exposure, if a gyro measures it; else None
     """
 
-    image_dn: NDArray[Any]
+    image_dn: NDArray
     frame: int
     t_s: float
     exposure_s: float

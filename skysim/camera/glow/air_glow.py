@@ -49,7 +49,7 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
             extinction_mag,
         )
     radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
-    return np.asarray(radiance * nanolamberts * above * view.etendue_m2_sr())
+    return radiance * nanolamberts * above * view.etendue_m2_sr()
 
 
 def seen_place(name: str, sky: Sky) -> Place:

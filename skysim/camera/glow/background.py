@@ -24,7 +24,7 @@ from scipy.special import erfc
 
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -365,10 +365,10 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     # 3.
     toward = np.column_stack([plane, np.ones(len(plane))])
-    return np.asarray(toward / np.linalg.norm(toward, axis=1, keepdims=True))
+    return normalized(toward)
 
 
-def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
+def fill(image: NDArray, coarse: Floats, factor: float) -> None:
     """Set an (H, W) frame to coarse * factor, bilinear between the nodes, in place; its old values are lost.
 
     Parameters
@@ -387,7 +387,7 @@ def fill(image: NDArray[Any], coarse: Floats, factor: float) -> None:
         _fill_bilinear(image, coarse * factor)
 
 
-def add(image: NDArray[Any], glow: Floats, factor: float) -> None:
+def add(image: NDArray, glow: Floats, factor: float) -> None:
     """Add extended light to an (H, W) frame in place: glow * factor, of all pixels or at nodes as in `fill`."""
     if glow.shape == image.shape:
         image += glow * factor
@@ -398,14 +398,14 @@ def add(image: NDArray[Any], glow: Floats, factor: float) -> None:
 
 
 @jit(parallel=True)
-def _fill_flat(image: NDArray[Any], value: float) -> None:
+def _fill_flat(image: NDArray, value: float) -> None:
     """Set all pixels to one value."""
     for y in numba.prange(image.shape[0]):
         image[y, :] = value
 
 
 @jit(parallel=True)
-def _fill_bilinear(image: NDArray[Any], coarse: Floats) -> None:
+def _fill_bilinear(image: NDArray, coarse: Floats) -> None:
     """Interpolate along y for the nodes of each row of pixels, then linearly along x from node to node."""
     (height, width), (h, w) = image.shape, coarse.shape
     # Cell of nodes in which each pixel is, and place in it from 0 to 1.

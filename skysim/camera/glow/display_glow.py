@@ -111,7 +111,7 @@ def panel_radiance_e_s_m2_sr(
     cos_emission = np.where(
         hits_panel, -toward_lab @ panel.inward(panel.center_m[None])[0], 1.0
     )
-    return np.asarray(
+    return (
         hits_panel * white_radiance(config.led, cos_emission, band) / config.layout.pitch_m**2
     )
 
@@ -166,7 +166,7 @@ def collimated_radiance_e_s_m2_sr(
     half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m
     within = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1)
     on_display = within & (toward_lab[:, 2] > 0)
-    return np.asarray(
+    return (
         on_display
         * white_e_s_m2
         / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)

@@ -18,7 +18,7 @@ from skysim.camera.glow.background import (
 )
 from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
@@ -49,7 +49,7 @@ def earth_radiance(
     # 1. Impact parameter, and distance to the ground or to the tangent point.
     place = observer_m * TO_SPHERE
     along = toward * TO_SPHERE
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    along = normalized(along)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
     down = inward > 0
@@ -67,7 +67,7 @@ def earth_radiance(
     path_in_layer = (half_chords[1] - half_chords[0]) / (LAYER[1] - LAYER[0])
     layers = path_in_layer * np.where(ground, 1, 2) * down
     airglow = float(sky_radiance_e_s_m2_sr(config.airglow_mag_arcsec2, band))
-    return np.asarray(day + layers * airglow)
+    return day + layers * airglow
 
 
 def earth_light(
@@ -90,7 +90,7 @@ def earth_light(
     toward, pixel_sr, shape = fine_directions(optics)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
     radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
-    return np.asarray((radiance * view.etendue_m2_sr()).reshape(shape))
+    return (radiance * view.etendue_m2_sr()).reshape(shape)
 
 
 @lru_cache(maxsize=4)

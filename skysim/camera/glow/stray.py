@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +64,7 @@ def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
 BLOCKS = 8
 
 
-def add_glare(light_e: NDArray[Any], config: GlareConfig) -> None:
+def add_glare(light_e: NDArray, config: GlareConfig) -> None:
     """Scatter the fraction `share` of the light of an (H, W) frame by the glare-spread function, in place.
 
     Polished surfaces scatter by the law of Harvey and Shack, BSDF = b (1 + (sin(theta) / l)^2)^(s / 2), the ABg law
@@ -117,7 +116,7 @@ def transfer(config: GlareConfig, shape: tuple[int, int], block: int) -> Floats:
         2 ** (1 - order) / special.gamma(order) * scaled**order * special.kv(order, scaled)
     )
     values[0, 0] = 1.0
-    return np.asarray(values)
+    return values
 
 
 def without_glare(sources: SourceTruth, config: GlareConfig) -> SourceTruth:

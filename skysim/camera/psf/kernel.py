@@ -22,13 +22,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 from scipy import fft, special
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.scene.sections.camera import CameraConfig, Psf
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular
@@ -384,7 +383,7 @@ class DiskImages(NamedTuple):
     center: Floats
     gradient: Floats
 
-    def take(self, which: NDArray[np.int64]) -> DiskImages:
+    def take(self, which: Ints) -> DiskImages:
         """The images in the chosen rows."""
         return DiskImages(*(part[which] for part in self))
 

@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.camera.psf import ellipse
 from skysim.camera.psf.kernel import QUANTUM_PX, DiskImages, Kernel, build_kernel
@@ -24,7 +23,7 @@ from skysim.camera.psf.otf import (
 )
 from skysim.camera.psf.splat import PER_PX, Singles
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 # Kinds of kernel.
@@ -62,11 +61,11 @@ class Kernels(NamedTuple):
         The table for `ellipse.jinc`; empty without ellipses
     """
 
-    kind: NDArray[np.int64]
+    kind: Ints
     sigma_px: Floats
     reach_px: Floats
     sharp_px: Floats
-    table: NDArray[np.int64]
+    table: Ints
     tables: Singles
     disk: Floats
     bessel: Singles
@@ -94,9 +93,8 @@ class KernelCache(NamedTuple):
 
 
 CACHE_BYTES = 1 << 27  # the cache is emptied when it is larger than this
-MAX_RADIUS_PX = (
-    500.0  # largest radius of an image; tables of larger ones would take too much memory
-)
+# Largest radius of an image; tables of larger ones would take too much memory
+MAX_RADIUS_PX = 500.0
 
 
 @lru_cache(maxsize=16)
@@ -109,7 +107,7 @@ def source_kernels(
     camera: CameraConfig,
     xy_px: Floats,
     radius_m: Floats,
-    is_led: NDArray[np.bool_],
+    is_led: Bools,
     distance_m: Floats,
     cos_field: Floats,
     disks: DiskImages | None = None,
@@ -186,7 +184,7 @@ def source_sizes(
     camera: CameraConfig,
     xy_px: Floats,
     radius_m: Floats,
-    is_led: NDArray[np.bool_],
+    is_led: Bools,
     distance_m: Floats,
     cos_field: Floats,
     blur_px: float,
@@ -227,7 +225,7 @@ def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
 
 
 def ellipses(
-    keys: NDArray[np.int64],
+    keys: Ints,
     camera: CameraConfig,
     disks: DiskImages | None,
     axes_px: Floats,
@@ -251,7 +249,7 @@ def ellipses(
     return disk
 
 
-def look_up(camera: CameraConfig, keys: NDArray[np.int64], disk: Floats) -> Kernels:
+def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     """The kernels of N keys (N, 3) in the camera's cache, with the ellipses `disk`; makes those that are missing."""
     cache = kernel_cache(camera)
     codes = keys @ PACKING
@@ -308,9 +306,7 @@ def round_error(
     gradient = np.minimum(
         gradient_px / np.maximum(axes_px[:, 1], 1e-9), 0.15 * gradient_px / s_px
     )
-    return np.asarray(
-        (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
-    )
+    return (np.minimum(0.4, drawn_px / 2 / s_px) * edge_px + 0.6 * shift_px) / s_px + gradient
 
 
 def ellipse_disks(
@@ -321,7 +317,7 @@ def ellipse_disks(
     blur_px: Floats,
     sigma_px: Floats,
     variance_px2: Floats,
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Ints]:
     """The fields of `ellipse.EllipseDisk` of M disks (M, 15), and the keys of their boxes (M, 3).
 
     Behind a Gaussian blur of variance s^2 a light I (1 + g x) becomes (1 + g x) I + s^2 g dI/dx: the blurred I, shifted

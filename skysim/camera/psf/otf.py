@@ -31,7 +31,7 @@ from skysim.scene.sections.camera import (
     Psf,
 )
 
-Otf = NDArray[Any]  # real, or complex where the PSF is not symmetric
+Otf = NDArray  # real, or complex where the PSF is not symmetric
 
 WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 
@@ -213,7 +213,7 @@ def read_cells(file: str) -> Floats:
             f"{path}: its numbers add up to {total:g}",
             "a finite sum above 0",
         )
-    return np.asarray(cells / total)
+    return cells / total
 
 
 def cell_response(u: Floats) -> Floats:

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 # Directions whose singular value is a smaller fraction of the largest get no torque.
 RANK_TOLERANCE = 1e-6
@@ -142,9 +141,9 @@ class Hinges:
     names: tuple[str, ...]
     axes: Floats
     inertia_kg_m2: Floats
-    qpos: NDArray[np.int64]
-    dof: NDArray[np.int64]
-    motor: NDArray[np.int64]
+    qpos: Ints
+    dof: Ints
+    motor: Ints
 
     @classmethod
     def from_model(cls, model: Any, prefix: str) -> Hinges:

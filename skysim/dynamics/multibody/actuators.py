@@ -12,10 +12,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
@@ -67,7 +66,7 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
 class IdealTorque:
     """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
 
-    def __init__(self, motor: NDArray[np.int64], limit_nm: float) -> None:
+    def __init__(self, motor: Ints, limit_nm: float) -> None:
         self.motor = motor
         self.limit_nm = limit_nm
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
@@ -48,7 +47,7 @@ class Fans:
     names: tuple[str, ...]
     axes: Floats
     positions_m: Floats
-    motor: NDArray[np.int64]
+    motor: Ints
 
     @classmethod
     def from_model(cls, model: Any) -> Fans:

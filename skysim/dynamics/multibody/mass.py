@@ -165,7 +165,7 @@ def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: P
         set_inertial(rotor, own.mass[0], center_m, inertia, subject)
 
 
-def is_possible(moments: NDArray[Any]) -> bool:
+def is_possible(moments: NDArray) -> bool:
     """Whether a rigid body can have these principal moments I1 <= I2 <= I3: 0 < I1 and I3 <= I1 + I2."""
     return bool(moments[0] > 0 and moments[2] <= (moments[0] + moments[1]) * (1 + 1e-12))
 
@@ -267,7 +267,7 @@ def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
             f"{len(names)}, one for each of {', '.join(names)}, or none",
         )
     position_m = np.array(config.position_m or (0.0,) * len(names))
-    return np.asarray(config.step_m * np.round(position_m / config.step_m))
+    return config.step_m * np.round(position_m / config.step_m)
 
 
 def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:

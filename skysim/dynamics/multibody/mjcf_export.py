@@ -16,12 +16,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Floats, Ints, Mount, Sources, normalized
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
@@ -255,7 +254,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
         radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
         panel_m = np.clip(radius_m * around, -half_m, half_m)
-        return np.asarray(inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T)
+        return inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T
     # 3. Any other surface.
     upright = inside.lab_from_own.magnitude() == 0
     if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
@@ -265,8 +264,8 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     half = inside.semi_axes_m[2]
     lowest = max(middle, 0.35 * (middle + half))
     polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
-    return np.asarray(
-        inside.center_m + inside.semi_axes_m * (np.sin(polar) * around + np.cos(polar) * up)
+    return inside.center_m + inside.semi_axes_m * (
+        np.sin(polar) * around + np.cos(polar) * up
     )
 
 
@@ -346,7 +345,7 @@ def add_mesh(
     body: Any,
     name: str,
     vertices_m: Floats,
-    faces: NDArray[np.int64],
+    faces: Ints,
     rgba: Any,
     group: int,
     **more: Any,
@@ -397,7 +396,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
         )
 
 
-def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, Ints]:
     """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
     # Corners 0 to 2 are on the positive axes, 3 to 5 on the negative ones.
     corners = np.concatenate([np.eye(3), -np.eye(3)])
@@ -430,7 +429,7 @@ def field_corners(
     )
     rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
-    rays = lab_from_cam.apply(rays_cam / np.linalg.norm(rays_cam, axis=1, keepdims=True))
+    rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
     length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
     return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)

@@ -22,13 +22,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Mount
+from skysim.core.types import Floats, Ints, Mount
 from skysim.dynamics.multibody.actuator_kind import Hinges, joints
 from skysim.dynamics.multibody.actuators import (
     KINDS,
@@ -90,7 +89,7 @@ class VehicleModel:
     model: Any
     config: VehicleConfig
     mass: MassProperties
-    torques: NDArray[np.int64]
+    torques: Ints
     wheels: Hinges
     gimbals: Hinges
     rotors: Hinges

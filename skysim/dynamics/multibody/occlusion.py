@@ -16,13 +16,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Mount
+from skysim.core.types import Bools, Floats, Mount
 from skysim.dynamics.multibody.actuators import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
@@ -87,9 +86,7 @@ def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstac
     return Obstacles(model, data, camera_body_m)
 
 
-def camera_housing(
-    model: Any, data: Any, camera_body_m: Floats, is_main: bool
-) -> NDArray[np.bool_]:
+def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) -> Bools:
     """(ngeom,) whether each geom belongs to the camera's housing. Overwrites the geoms' groups."""
     body = model.cam_bodyid[model.camera(CAMERA).id]
     is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id) & is_main
@@ -103,9 +100,7 @@ def camera_housing(
     return np.asarray(is_housing)
 
 
-def occluded(
-    obstacles: Obstacles, lab_from_body: Rotation, place: Floats
-) -> NDArray[np.bool_]:
+def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> Bools:
     """(N,) whether a part of the vehicle or the lab is between the pupil and each LED or star.
 
     Parameters

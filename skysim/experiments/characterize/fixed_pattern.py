@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from skysim.core.types import Floats, Mask
+from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     Estimate,
@@ -271,7 +271,7 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
     return base, rate, slopes
 
 
-def column_offset(first: Floats, second: Floats, usable: Mask, gain_e_dn: float) -> Estimate:
+def column_offset(first: Floats, second: Floats, usable: Bools, gain_e_dn: float) -> Estimate:
     """Standard deviation of the columns' black levels, in electrons, from the two dark frames at exposure 0."""
     count = np.maximum(usable.sum(axis=0), 1)
     means = [np.where(usable, one, 0.0).sum(axis=0) / count for one in (first, second)]
@@ -291,7 +291,7 @@ def prnu(
     first: Planes,
     second: Planes,
     dark_ratio: float,
-    usable: Mask,
+    usable: Bools,
 ) -> Estimate:
     """Relative standard deviation of the sensitivity, from the rate of every pixel in the light.
 
@@ -324,7 +324,7 @@ def light_rate(
     return total
 
 
-def smooth(image: Floats, usable: Mask) -> Floats:
+def smooth(image: Floats, usable: Bools) -> Floats:
     """The polynomial in x and y of total order ORDER, fitted to means of blocks of usable pixels."""
     height, width = image.shape
     rows = height // SAMPLE * SAMPLE

@@ -25,7 +25,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
-from skysim.core.types import Floats, Mask
+from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
@@ -400,7 +400,7 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
 
 
-def check_flats(flats: Stack, usable: Mask, black_dn: float) -> None:
+def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
     """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
     signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
     times = np.array([one.exposure_s for one in flats.levels])

@@ -30,7 +30,7 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Floats, Mask
+from skysim.core.types import Bools, Floats
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -145,7 +145,7 @@ class Level:
         """(H, W) mean of all frames."""
         return (self.first_dn.astype(np.float64) + self.second_dn) / 2
 
-    def moments(self, used: Mask) -> Moments:
+    def moments(self, used: Bools) -> Moments:
         """Mean and variance over the used pixels.
 
         Standard errors are empirical, from the scatter of the pixels' variances, since hot pixels have more noise.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Floats, Mask
+from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
 from skysim.experiments.characterize.photon_transfer import (
@@ -140,7 +140,7 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
     )
 
 
-def usable_pixels(darks: Sequence[Level]) -> Mask:
+def usable_pixels(darks: Sequence[Level]) -> Bools:
     """Pixels that no particle has hit, and that are not hot in any dark.
 
     Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
@@ -155,7 +155,7 @@ def usable_pixels(darks: Sequence[Level]) -> Mask:
     return usable
 
 
-def steady_pixels(one: Level, variance_dn2: float | Floats) -> Mask:
+def steady_pixels(one: Level, variance_dn2: float | Floats) -> Bools:
     """Pixels whose means over the two halves of the frames agree within HIT_SIGMAS: no particle has hit them.
 
     Each half is the mean of count / 2 frames, so their difference has the variance 4 variance_dn2 / count.

@@ -21,7 +21,7 @@ from skysim.camera import thermal_motion
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
-from skysim.core.types import Floats, Mask, Record
+from skysim.core.types import Bools, Floats, Record
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
@@ -446,11 +446,11 @@ class MeasuredFrames:
         """(cells, fields) values of a column in some cells."""
         return self.columns[name][rows]
 
-    def right(self, rows: list[int]) -> Mask:
+    def right(self, rows: list[int]) -> Bools:
         """(cells, fields) whether a frame was solved and is not false."""
         return (self.columns["solved"][rows] > 0) & ~self.false(rows)
 
-    def false(self, rows: list[int]) -> Mask:
+    def false(self, rows: list[int]) -> Bools:
         """(cells, fields) whether a frame has a false attitude."""
         return self.columns["wrong"][rows] > 0
 

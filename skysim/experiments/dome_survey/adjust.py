@@ -22,7 +22,7 @@ from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
 from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Mask
+from skysim.core.types import Bools, Floats
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
@@ -374,7 +374,7 @@ def adjust_connected(
 
 def led_visibility(
     pairs: Sequence[tuple[SurveyFrame, Correspondences]], prior: CalibrationPrior
-) -> Mask:
+) -> Bools:
     """(F, N) mask of the LEDs in each frame, without LEDs whose rays are nearly parallel in all frames.
 
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
@@ -390,7 +390,7 @@ def led_visibility(
     return visible & (angle_rad > survey_subset.CONNECTING_RAD)
 
 
-def largest_connected_group(visible: Mask, min_shared: int) -> list[int]:
+def largest_connected_group(visible: Bools, min_shared: int) -> list[int]:
     """Indices of the largest group of frames connected by shared LEDs.
 
     Frames outside the group have an undetermined position relative to it, which `dome_survey.survey` rejects. A group

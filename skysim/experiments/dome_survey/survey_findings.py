@@ -14,8 +14,8 @@ from estimator.attitude.dome_map import LedMap, project
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
-from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
-from skysim.core.types import Floats, Record
+from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
+from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import (
     GATE_SIGMAS,
@@ -88,7 +88,7 @@ class SurveyRun:
         ]
 
     @property
-    def seen(self) -> Mask:
+    def seen(self) -> Bools:
         """(F, N) mask of the LEDs identified in each frame."""
         return identified(self.inliers, len(self.listed.id))
 
@@ -122,7 +122,7 @@ class SurveyRun:
         return replace(before, lever_sigma_m=lever_m, focal_error=focal)
 
 
-def identified(matches: Sequence[Correspondences], leds: int) -> Mask:
+def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     """(F, N) mask of the LEDs in the correspondences of each frame."""
     out = np.zeros((len(matches), leds), dtype=bool)
     for row, match in zip(out, matches, strict=True):
@@ -212,11 +212,11 @@ class Coverage(NamedTuple):
 
     model: SurveyModel
     held: Rotation
-    seen: Mask
+    seen: Bools
     accuracy: SurveyAccuracy | None
 
     @property
-    def measured(self) -> Mask:
+    def measured(self) -> Bools:
         """(N,) LEDs that are surveyed."""
         return (
             np.zeros(len(self.model.leds.id), dtype=bool)
@@ -267,7 +267,7 @@ def next_stops(
 
 
 def predicted(
-    model: SurveyModel, body_from_lab: Rotation, seen: Mask
+    model: SurveyModel, body_from_lab: Rotation, seen: Bools
 ) -> SurveyAccuracy | None:
     """The accuracy predicted; None if the frames do not determine the unknowns."""
     try:
@@ -420,7 +420,7 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
     }
 
 
-def stop_rows(lab_from_body: Rotation, shown: Mask) -> list[dict[str, float | int]]:
+def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[dict[str, float | int]]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
     up = lab_from_body.apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))

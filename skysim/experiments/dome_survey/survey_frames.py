@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import survey_plan
-from estimator.calibration.survey_plan import Mask, SurveyModel
+from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
@@ -21,7 +21,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Ints, Truth
+from skysim.core.types import Bools, Floats, Frame, Ints, Truth
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
@@ -72,7 +72,7 @@ def planned_stops(
     count: int,
     tilt_deg: float,
     held: Rotation | None = None,
-    seen: Mask | None = None,
+    seen: Bools | None = None,
 ) -> Rotation:
     """lab_from_body at up to `count` stops that reduce the errors most, best first (`survey_plan.choose`).
 

@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.survey_plan import Mask, SurveyAccuracy, SurveyModel
+from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record
+from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
@@ -67,7 +67,7 @@ class HeldAttitudes(NamedTuple):
     """
 
     lab_from_body: Rotation
-    shown: Mask
+    shown: Bools
     model: SurveyModel
     margin_px: float
 

@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
-from estimator.calibration.survey_plan import Mask
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Frame, Mount, Record, Truth
+from skysim.core.types import Bools, Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -321,7 +320,7 @@ class LedErrors(NamedTuple):
     true_m: Floats
     before_m: Floats
     after_m: Floats
-    renamed: Mask
+    renamed: Bools
 
 
 def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
@@ -413,7 +412,7 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rota
     once = so_far.seen.any(axis=0) & ~measured
     unseen = ~measured & ~once
 
-    def dots(which: Mask, name: str, **style: Any) -> Any:
+    def dots(which: Bools, name: str, **style: Any) -> Any:
         return axes.scatter(
             x_m[which], y_m[which], s=14, label=f"{name}: {which.sum()}", **style
         )

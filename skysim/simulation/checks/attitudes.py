@@ -42,6 +42,11 @@ class CheckedAttitudes(NamedTuple):
     rate_body_rad_s: Floats
     t_s: Floats
 
+    @property
+    def speed_rad_s(self) -> Floats:
+        """(N,) lengths of the rates."""
+        return np.linalg.norm(self.rate_body_rad_s, axis=1)
+
 
 def of_frames(lab: Lab) -> CheckedAttitudes:
     """Attitudes at mid-exposure of some frames: evenly spaced ones, the fastest and the most tilted."""
@@ -54,7 +59,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     every = attitudes_at(lab, t_s)
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
-    chosen.add(int(np.linalg.norm(every.rate_body_rad_s, axis=1).argmax()))
+    chosen.add(int(every.speed_rad_s.argmax()))
     chosen.add(int(tilts_rad(every).argmax()))
     rows = np.array(sorted(chosen))
     # 3. Without a controller the vehicle may reach the stop; the frames before are checked.
@@ -135,17 +140,22 @@ def within_reach(
 
 def rates_text(attitudes: CheckedAttitudes) -> str:
     """The least and the greatest rate."""
-    rates_deg_s = np.degrees(np.linalg.norm(attitudes.rate_body_rad_s, axis=1))
+    rates_deg_s = np.degrees(attitudes.speed_rad_s)
     low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
     return f"at {high} deg/s" if low == high else f"at {low} to {high} deg/s"
 
 
-def describe(attitudes: CheckedAttitudes, n: int, scene: Scene, mount: Mount) -> str:
+def boresights(lab_from_body: Rotation, lab: Lab) -> Floats:
+    """(N, 3) or (3,) unit vectors of the boresight at some attitudes, in lab axes."""
+    return (lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+
+
+def describe(attitudes: CheckedAttitudes, n: int, lab: Lab) -> str:
     """Attitude n in words: RA and Dec of the boresight, or roll, pitch, yaw and tilt of the vehicle; and the time."""
     lab_from_body = attitudes.lab_from_body[n]
     t_s = attitudes.t_s[n]
-    if isinstance(scene.light, StarsConfig):
-        x, y, z = (lab_from_body * mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+    if isinstance(lab.scene.light, StarsConfig):
+        x, y, z = boresights(lab_from_body, lab)
         ra_deg = math.degrees(math.atan2(y, x)) % 360
         dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))
         where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"

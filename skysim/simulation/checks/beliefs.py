@@ -11,27 +11,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
-from skysim.sources.dome import display
 from skysim.tracking import dome_map_file
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import (
     assumed_camera,
-    assumed_observer,
     assumed_orbit,
-    onboard_catalog,
+    assumed_stars,
     onboard_dome,
 )
 
@@ -166,12 +163,7 @@ def believed_stars(lab: Lab) -> StarCatalog:
     Raises InputError for a catalog that cannot be read.
     """
     scene = lab.scene
-    stars = catalog.brighter_than(
-        onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
-    )
-    directions = catalog.apparent(stars, assumed_observer(scene, assumed_orbit(scene)))
-    if isinstance(scene.light, CollimatedDisplayConfig):
-        directions = display.lab_from_icrs(scene.light).apply(directions)
+    stars, directions = assumed_stars(scene, assumed_orbit(scene))
     merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px
     return catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
 
@@ -180,16 +172,14 @@ def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sour
     """The N stars that the tracker knows, and measured minus believed direction (N, 3) of each, in lab axes."""
     sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
-    place = sources.place[:, :3] / np.linalg.norm(sources.place[:, :3], axis=1, keepdims=True)
+    place = normalized(sources.place[:, :3])
     shift = neighbor_shift(
         place, sources.strength * lab.camera.optics.collecting_m2, row, camera
     )
     return sources.take(row), place[row] + shift - stars.vectors[star]
 
 
-def neighbor_shift(
-    place: Floats, rate_e_s: Floats, row: NDArray[np.int64], camera: CameraModel
-) -> Floats:
+def neighbor_shift(place: Floats, rate_e_s: Floats, row: Ints, camera: CameraModel) -> Floats:
     """(N, 3) displacement of the directions of some stars by the images of their neighbors.
 
     Parameters
@@ -249,9 +239,7 @@ def response_px(
 
     def image(offset_px: Floats) -> Floats:
         """(P, window) share of a Gaussian's light in each pixel, with its center displaced along x."""
-        return np.asarray(
-            np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2)
-        )
+        return np.exp(-((x - offset_px) ** 2 + y**2) / (2 * s2)) / (2 * math.pi * s2)
 
     own = image(np.zeros(1))
     other = image(apart_px[:, None])
@@ -260,12 +248,10 @@ def response_px(
     total_e = star_e + neighbor_e * np.exp(-(apart_px**2) / (4 * s2))
     pull = neighbor_e * (weight * slope * other).sum(axis=1)
     stiffness = total_e * (weight * slope**2).sum(axis=1)
-    return np.asarray(pull / stiffness)
+    return pull / stiffness
 
 
-def common(
-    first: NDArray[np.int64], second: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def common(first: Ints, second: Ints) -> tuple[Ints, Ints]:
     """Rows of the numbers that are in both lists, in the order of the first list."""
     _, a, b = np.intersect1d(first, second, return_indices=True)
     order = np.argsort(a)

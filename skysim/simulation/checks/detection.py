@@ -14,7 +14,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from estimator.centroiding.gaussian_fit import HALF_WINDOW_PX
@@ -28,7 +27,7 @@ from estimator.detection.detect import (
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import beliefs
@@ -38,9 +37,8 @@ from skysim.simulation.lab import Lab
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.factory import assumed_settings
 
-BINOMIAL_VARIANCE_PX2 = (
-    0.5  # variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
-)
+# Variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
+BINOMIAL_VARIANCE_PX2 = 0.5
 # Grid on which images are integrated, in standard deviations of the blur: its step, and its margin.
 STEP = 0.4
 MARGIN = 5.0
@@ -49,9 +47,8 @@ SHAPES = 10  # images whose sizes differ by less than one in this number count a
 COG_MARGIN_PX = 4.0  # margin of the window about the pixels above the threshold
 STILL_PX = np.zeros(2)
 PHASES = 64  # number of phases of the pulses relative to the exposure
-MAX_PULSES = (
-    500  # number of pulses in an exposure from which the mean time of the light does not vary
-)
+# Number of pulses in an exposure from which the mean time of the light does not vary
+MAX_PULSES = 500
 
 
 class Context(NamedTuple):
@@ -78,11 +75,11 @@ class Context(NamedTuple):
     beliefs: Beliefs
     camera: CameraModel
     surface: Surface | None
-    known_id: NDArray[np.int64]
-    known_row: NDArray[np.int64]
+    known_id: Ints
+    known_row: Ints
     timing_s: Floats
 
-    def rows_of(self, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    def rows_of(self, ids: Ints) -> Ints:
         """(M,) rows in the tracker's beliefs of lights with these numbers; -1 for lights that it does not know."""
         if not len(self.known_id):
             return np.full(len(ids), -1)
@@ -161,7 +158,7 @@ def detected_radius_px(view: View, context: Context) -> Floats:
 def detected_area_px(view: View, context: Context) -> Floats:
     """(n,) area pi r^2 + 2 r L in px^2 of each image above the detection threshold, on a path of length L."""
     radius = detected_radius_px(view, context)
-    return np.asarray(np.pi * radius**2 + 2 * radius * view.streak_length_px)
+    return np.pi * radius**2 + 2 * radius * view.streak_length_px
 
 
 def usable(view: View, context: Context) -> View:
@@ -230,7 +227,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     along_path = unit[:, :, None] * unit[:, None, :]
     # 4. Timing.
     moved = (view.streak_px / lab.scene.exposure.time_s) * context.timing_s[view.row, None]
-    return np.asarray(
+    return (
         ((across + pattern + plateau)[:, None] + floor)[:, :, None] * np.eye(2)
         + (along - across)[:, None, None] * along_path
         + moved[:, :, None] * moved[:, None, :]
@@ -249,7 +246,7 @@ def fit(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) ->
 
 def window(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
     """A Gaussian of twice the image's variance."""
-    return np.asarray(u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum())))
+    return u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum()))
 
 
 WEIGHTS: dict[str, Weight] = {
@@ -285,7 +282,7 @@ def weighted_variance(
 
 def shapes_of(
     view: View, filter_px2: float = 0.0
-) -> Iterator[tuple[NDArray[np.bool_], Floats, tuple[Floats, ...]]]:
+) -> Iterator[tuple[Bools, Floats, tuple[Floats, ...]]]:
     """Lights with images of one shape: their mask (n,), the blur of each, filtered or not, and the shape."""
     large = np.maximum(view.disk_px, view.defocus_px)
     small = np.minimum(view.disk_px, view.defocus_px)
@@ -351,4 +348,4 @@ def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:
         total = lit.sum(axis=1)
         mean = (lit * (first + last) / 2).sum(axis=1)[total > 0] / total[total > 0]
         sigma[k] = np.std(mean) if len(mean) else 0.0
-    return np.asarray(sigma[index.ravel()])
+    return sigma[index.ravel()]

@@ -269,5 +269,5 @@ def mirror_images(context: Context, samples: CheckedSamples) -> str:
     return (
         f"light.reflection.{key}: the tracker detects up to {len(found[n])} images of LEDs in the wall beside"
         f" {len(frames.used[n])} LEDs, the brightest {short(1 / share, 2)} times above its threshold, at"
-        f" {attitudes.describe(frames.attitudes, n, lab.scene, lab.camera.mount)}; {cure}"
+        f" {attitudes.describe(frames.attitudes, n, lab)}; {cure}"
     )

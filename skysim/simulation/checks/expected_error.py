@@ -49,7 +49,7 @@ from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -274,15 +274,15 @@ def gains(view: View, covariance_px2: Floats, fitted: Floats | None = None) -> F
     if np.linalg.cond(information) > 1e14:
         raise np.linalg.LinAlgError("singular")
     inverse = np.linalg.inv(information) / np.outer(size, size)
-    return np.asarray((inverse @ np.swapaxes(weighted, 1, 2))[:, :3])
+    return (inverse @ np.swapaxes(weighted, 1, 2))[:, :3]
 
 
 def covariance(gain: Floats, errors: Independent | Common) -> Floats:
     """(3, 3) covariance of the rotation in camera axes in rad^2: sum K_i S_i K_i', or B B' with B = sum K_i E_i."""
     if isinstance(errors, Independent):
-        return np.asarray(np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain))
+        return np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain)
     response = np.einsum("nij,njk->ik", gain, errors.displacement_px)
-    return np.asarray(response @ response.T)
+    return response @ response.T
 
 
 def believed_px2(view: View, context: Context, prnu: float | None = None) -> Floats:
@@ -300,7 +300,7 @@ def believed_px2(view: View, context: Context, prnu: float | None = None) -> Flo
         camera, leds, lever = beliefs.dome
         survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
     added_px2 = settings.centroid_sigma_px**2 + survey_px**2
-    return np.asarray(own + added_px2[:, None, None] * np.eye(2))
+    return own + added_px2[:, None, None] * np.eye(2)
 
 
 def believed_sigma_px(view: View, context: Context) -> Floats:
@@ -394,7 +394,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     center_m, semi_axes_m = surface.as_ellipsoid()
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
     lever = Lever(lab.camera.mount.camera_body_m, lab.camera.mount.cam_from_body, 0.0)
-    rays = view.offset_m / np.linalg.norm(view.offset_m, axis=1, keepdims=True)
+    rays = normalized(view.offset_m)
     cam_from_body = lab.camera.mount.cam_from_body
     body_from_lab = cam_from_body.inv() * lab_from_cam.inv()
     try:
@@ -404,7 +404,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     except (ValueError, np.linalg.LinAlgError):
         return None
     error = cam_from_body * solved * body_from_lab.inv() * cam_from_body.inv()
-    return np.asarray(error.as_rotvec())
+    return error.as_rotvec()
 
 
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:

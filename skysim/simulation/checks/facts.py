@@ -62,22 +62,20 @@ def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
 
 def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     """Number of lights that the tracker knows and detects in the field: mean, least, and the attitude of the least."""
-    scene = context.lab.scene
-    mount = context.lab.camera.mount
+    lab = context.lab
     lines = []
     values = {}
-    reach = (
-        "in the whole sky"
-        if isinstance(scene.light, StarsConfig)
-        else reached(context, samples)
-    )
+    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
+    reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
+    if isinstance(lab.scene.light, StarsConfig):
+        reach = "in the whole sky"
     for key, what, sampled in (
         ("frames", "at the frames", samples.frames),
         ("reach", reach, samples.reach),
     ):
         counts = sampled.counts()
         seen = np.array([len(view) for view in sampled.seen])
-        where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
+        where = attitudes.describe(sampled.attitudes, int(counts.argmin()), lab)
         limit = context.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = (
@@ -119,12 +117,6 @@ def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
         )
         values[name] = {"most": most, "share": frames / len(others)}
     return Fact("other lights", lines, values) if lines else None
-
-
-def reached(context: Context, samples: CheckedSamples) -> str:
-    """The directions in reach of the motion, in words."""
-    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
-    return f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
 
 
 def spot(context: Context, samples: CheckedSamples) -> Fact:
@@ -180,7 +172,7 @@ def peak(context: Context, samples: CheckedSamples) -> Fact:
 def smear(context: Context, samples: CheckedSamples) -> Fact:
     """Path of the images during an exposure at the rates of the frames."""
     frames = samples.frames
-    rate_deg_s = np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1))
+    rate_deg_s = np.degrees(frames.attitudes.speed_rad_s)
     length_px = np.array(
         [np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known]
     )
@@ -435,8 +427,6 @@ def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
 
 def expected_error(context: Context, samples: CheckedSamples) -> Fact:
     """Expected cross and roll error, 1 sigma, and their causes, the largest first."""
-    scene = context.lab.scene
-    mount = context.lab.camera.mount
     lines: list[str] = []
     values: dict[str, Any] = {}
     for key, what, sampled in (
@@ -449,13 +439,9 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         worst = ""
         if key == "reach" and failing < len(sampled.seen):
             n = int(np.nanargmax(sampled.error.total("roll")))
-            where = attitudes.describe(sampled.attitudes, n, scene, mount)
+            where = attitudes.describe(sampled.attitudes, n, context.lab)
             worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
-        errors = (
-            f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
-            if cross == cross
-            else "no solution"
-        )
+        errors = errors_text(cross, roll)
         rates = attitudes.rates_text(sampled.attitudes)
         lines.append(f"{what}, {rates}: {errors}{worst}{few}")
         values[key] = {
@@ -481,6 +467,15 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
         )
     return Fact("expected error", lines, values)
+
+
+def errors_text(cross: float, roll: float) -> str:
+    """Expected errors in arcsec as text."""
+    return (
+        f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
+        if cross == cross
+        else "no solution"
+    )
 
 
 # Causes of the expected error that are drawn with the survey.

@@ -39,9 +39,8 @@ from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning
-TARGET_FILL = (
-    0.7  # recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
-)
+# Recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
+TARGET_FILL = 0.7
 # Limits of exposure times and lenses that a warning recommends.
 SHORTEST_S = 10e-6
 LARGEST_F_NUMBER = 22.0
@@ -51,9 +50,8 @@ MIN_DETECTED = 0.5  # fraction of the lights on the detector that the tracker sh
 # Fraction of the directions in reach, or of the whole sky, that may have fewer than MIN_LIGHTS.
 MAX_FEW = 0.02
 MAX_FEW_SKY = 0.5
-HIGH_THRESHOLD = (
-    20.0  # threshold in sigma above which it is the reason for missing detections
-)
+# Threshold in sigma above which it is the reason for missing detections
+HIGH_THRESHOLD = 20.0
 MAX_BACKGROUND = 0.5  # fraction of full scale
 MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up to which frames are identified
 # A path that is longer than both gives a warning; the second is in widths of the image.
@@ -167,7 +165,6 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     4. Recommend more LEDs, or fainter stars.
     """
     scene = context.lab.scene
-    mount = context.lab.camera.mount
     needed = least_lights(scene)
     # 1. More lights where there are some would not help.
     explained = (cap_too_small, dark_corners, bright_background, black_level)
@@ -186,7 +183,7 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     else:
         return ""
     on_chip = np.array([len(view) for view in sampled.seen])
-    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), scene, mount)
+    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), context.lab)
     text = (
         f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
         f" {'frames' if sampled is samples.frames else 'directions in reach'}, least {counts.min()} at {where}"
@@ -208,7 +205,6 @@ def hidden_lights(context: Context, samples: CheckedSamples) -> str:
     """Warn if something hides so many lights at a frame that the tracker has too few."""
     frames = samples.frames
     scene = context.lab.scene
-    mount = context.lab.camera.mount
     counts = frames.counts()
     hidden = frames.hidden_counts()
     few = (counts < least_lights(scene)) & (counts + hidden >= least_lights(scene))
@@ -220,7 +216,7 @@ def hidden_lights(context: Context, samples: CheckedSamples) -> str:
     what = f"all behind {name}" if behind == expected else f"{behind} of them behind {name}"
     what += "".join(f", {count} behind {other}" for other, count in others)
     return (
-        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, scene, mount)},"
+        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, context.lab)},"
         f" {what}; so at {100 * few.mean():.0f} % of the frames; point elsewhere, or change the time"
     )
 
@@ -337,9 +333,7 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
         f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
         f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
     )
-    rate_deg_s = float(
-        np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max()
-    )
+    rate_deg_s = float(np.degrees(frames.attitudes.speed_rad_s).max())
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
     text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
@@ -452,9 +446,7 @@ def long_smear(context: Context, samples: CheckedSamples) -> str:
     longest_px = float(length_px.max())
     if longest_px <= limit_px:
         return ""
-    rate_deg_s = float(
-        np.degrees(np.linalg.norm(frames.attitudes.rate_body_rad_s, axis=1)).max()
-    )
+    rate_deg_s = float(np.degrees(frames.attitudes.speed_rad_s).max())
     shorter_ms = 1e3 * scene.exposure.time_s * limit_px / longest_px
     return (
         f"exposure.time: images move by up to {longest_px:.0f} px during an exposure, at {rate_deg_s:.3g} deg/s; change"
@@ -468,7 +460,7 @@ def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
         return ""
-    rate_rad_s = float(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1).max())
+    rate_rad_s = float(samples.frames.attitudes.speed_rad_s.max())
     turn_arcsec = sigma_s * rate_rad_s / ARCSEC_RAD
     if turn_arcsec <= MAX_TAG_ARCSEC:
         return ""
@@ -526,7 +518,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
     moved = thermal_motion.camera_at(config, mount, optics, t_s)
     drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
-    return np.asarray(np.einsum("nij,nj->i", gain, drifted_px - surveyed_px))
+    return np.einsum("nij,nj->i", gain, drifted_px - surveyed_px)
 
 
 def image_px(

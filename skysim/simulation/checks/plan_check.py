@@ -24,7 +24,7 @@ from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, context_of
-from skysim.simulation.checks.facts import ARCSEC, FACTS, Fact, short
+from skysim.simulation.checks.facts import FACTS, Fact, errors_text
 from skysim.simulation.checks.findings import FINDINGS
 from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.lab import Lab
@@ -226,15 +226,6 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     ]
     together = {"cross_arcsec": combined[0], "roll_arcsec": combined[1]}
     return Fact("heads", lines, {"heads": values, "together": together})
-
-
-def errors_text(cross: float, roll: float) -> str:
-    """Expected errors in arcsec as text."""
-    return (
-        f"cross {short(cross)}{ARCSEC}, roll {short(roll)}{ARCSEC} (1σ)"
-        if cross == cross
-        else "no solution"
-    )
 
 
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:

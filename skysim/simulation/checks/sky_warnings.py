@@ -58,9 +58,7 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
     atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
-    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply(
-        [0.0, 0.0, 1.0]
-    )
+    boresight = attitudes.boresights(at.lab_from_body, lab)
     zenith = np.array(
         [atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures]
     )
@@ -79,7 +77,7 @@ def refraction(context: Context, samples: CheckedSamples) -> str:
         MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec
     ):
         return ""
-    where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
+    where = attitudes.describe(at, n, lab)
     text = (
         f"the air raises stars by {short(middle)}″ at {where}, {math.degrees(altitude_rad[n]):.1f}° above the horizon,"
         f" and shortens the field by {short(low - high, 2)}″, which the tracker does not know"
@@ -114,7 +112,7 @@ def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
     # 2. Warnings.
     for name, (off_rad, n, body) in closest.items():
         seen = body.truth()
-        where = attitudes.describe(at, n, lab.scene, lab.camera.mount)
+        where = attitudes.describe(at, n, lab)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
         if in_field(
@@ -264,7 +262,7 @@ def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
         f" {source}, of {full_e:.0f} at saturation,"
-        f" at {attitudes.describe(at, n, lab.scene, lab.camera.mount)}; the faintest star is {loss_mag:.1f} mag"
+        f" at {attitudes.describe(at, n, lab)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
 
@@ -276,9 +274,7 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
-    boresight = (at.lab_from_body * lab.camera.mount.cam_from_body.inv()).apply(
-        [0.0, 0.0, 1.0]
-    )
+    boresight = attitudes.boresights(at.lab_from_body, lab)
     angles_deg = np.array(
         [
             beside_deg(context, t, axis)
@@ -292,7 +288,7 @@ def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
             what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
             yield (
                 f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
-                f" {attitudes.describe(at, n, lab.scene, lab.camera.mount)}, within {limit_deg:g}°; point farther away"
+                f" {attitudes.describe(at, n, lab)}, within {limit_deg:g}°; point farther away"
             )
 
 
@@ -323,9 +319,7 @@ def faintest_star(context: Context, samples: CheckedSamples) -> Fact | None:
     believed = context.beliefs
     if not isinstance(scene.light, StarsConfig):
         return None
-    rate_deg_s = float(
-        np.degrees(np.linalg.norm(samples.frames.attitudes.rate_body_rad_s, axis=1)).min()
-    )
+    rate_deg_s = float(np.degrees(samples.frames.attitudes.speed_rad_s).min())
     limit_mag = detection_limit_mag(context, samples)
     snr_mag = snr_limit_mag(context, samples)
     sky = context.lab.camera.sources.magnitude
@@ -404,10 +398,7 @@ def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
     peak_e = threshold_e(context, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
     share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
-    return 2.5 * math.log10(
-        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s * share / peak_e
-    )
+    return 2.5 * math.log10(bright_star_e(context) * share / peak_e)
 
 
 def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
@@ -424,10 +415,14 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
     area_px = width_px * math.hypot(width_px, *least_streak_px(samples))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
-    reference_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
-    return 2.5 * math.log10(
-        reference_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s / signal_e
-    )
+    return 2.5 * math.log10(bright_star_e(context) / signal_e)
+
+
+def bright_star_e(context: Context) -> float:
+    """Electrons of a star of V = 0 and the Sun's color in an exposure."""
+    camera = context.camera
+    light_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
+    return light_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
 
 
 def least_streak_px(samples: CheckedSamples) -> Floats:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import Poses, in_view, project, rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lens import STRAY_LIGHT
@@ -64,7 +64,7 @@ class View(NamedTuple):
         (n,) numbers of the occluders that hide the lights; VISIBLE for none
     """
 
-    row: NDArray[np.int64]
+    row: Ints
     xy_px: Floats
     offset_m: Floats
     arm_m: Floats
@@ -76,7 +76,7 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
-    behind: NDArray[np.int64]
+    behind: Ints
 
     def __len__(self) -> int:
         return len(self.row)
@@ -99,7 +99,7 @@ class View(NamedTuple):
         """(n,) variances of the lens's image, without LED, defocus and motion."""
         return self.sigma_px**2 - (self.disk_px**2 + self.defocus_px**2) / 4
 
-    def take(self, which: NDArray[Any]) -> View:
+    def take(self, which: NDArray) -> View:
         """The lights selected by a mask or by indices."""
         return View(*(column[which] for column in self))
 
@@ -236,9 +236,7 @@ def view(
     )
 
 
-def on_detector(
-    points: Sources, optics: Optics, pose: Poses
-) -> tuple[NDArray[np.int64], list[Floats]]:
+def on_detector(points: Sources, optics: Optics, pose: Poses) -> tuple[Ints, list[Floats]]:
     """Rows of the points whose images are on the detector, and what `project` returns for these at the one pose."""
     near = in_view(points, optics, pose, reach=0.0)
     projected = [one[0] for one in project(points.take(near), optics, pose)]
@@ -279,7 +277,7 @@ def lens_blur(
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 
-def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray[np.int64]:
+def hiding(occluders: Sequence[Occluder], place: Floats) -> Ints:
     """(N,) number of the last occluder that hides each of N places; VISIBLE for none."""
     found = np.full(len(place), VISIBLE)
     for number, occluder in enumerate(occluders):
@@ -291,9 +289,7 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
-    return np.asarray(
-        np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
-    )
+    return np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
 
 
 def peak_share(
@@ -317,4 +313,4 @@ def peak_share(
     # With x = L / (2 sqrt 2 S) the factor is sqrt(pi) / 2 erf(x) / x.
     sigma = 1 / np.sqrt(2 * np.pi * still)
     x = np.maximum(streak_px, 1e-9) / (2 * np.sqrt(2) * sigma)
-    return np.asarray(still * np.sqrt(np.pi) / 2 * special.erf(x) / x)
+    return still * np.sqrt(np.pi) / 2 * special.erf(x) / x

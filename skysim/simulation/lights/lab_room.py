@@ -8,10 +8,9 @@ from functools import partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.camera.glow.stray import images_in_wall, wall_glow
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
@@ -120,7 +119,7 @@ class DomeWall(Obstacle):
     wall: Surface
 
     def during(self, exposure: Exposure) -> Lit:
-        def hides(place: Floats) -> NDArray[np.bool_]:
+        def hides(place: Floats) -> Bools:
             """(N,) whether a place (N, 4) is that of an LED behind the wall."""
             hidden = place[:, 3] > 0
             hidden[hidden] = behind_wall(self.wall, exposure.camera_m, place[hidden, :3])
@@ -129,7 +128,7 @@ class DomeWall(Obstacle):
         return Lit("the dome's wall", hides=Occluder("the dome's wall", hides))
 
 
-def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> NDArray[np.bool_]:
+def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> Bools:
     """(N,) whether the line from an LED at (N, 3) to the camera passes through the dome's wall (not beneath its rim).
 
     The wall hides nothing from a camera inside, since a convex surface cannot hide its inside. All surfaces here are

@@ -20,14 +20,13 @@ from functools import cached_property, partial
 from typing import ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import FEW, Exposed, centers_of
 from skysim.camera.optics import Optics
 from skysim.camera.projection import Poses, poses
 from skysim.camera.render import OcclusionTest, Window
-from skysim.core.types import Floats, Mount, SatelliteTruth, Sources, Trajectory
+from skysim.core.types import Bools, Floats, Mount, SatelliteTruth, Sources, Trajectory
 from skysim.dynamics.multibody.model import VehicleModel
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import GlareConfig
@@ -163,7 +162,7 @@ class Occluder(NamedTuple):
 def any_of(occluders: Sequence[Occluder]) -> OcclusionTest | None:
     """The test for places that any of the occluders hides; None without occluders."""
 
-    def hidden(place: Floats) -> NDArray[np.bool_]:
+    def hidden(place: Floats) -> Bools:
         return np.any([occluder.hides(place) for occluder in occluders], axis=0)
 
     return hidden if occluders else None
@@ -293,7 +292,7 @@ class Beam(NamedTuple):
         )
 
 
-def behind_disc(disc: BodyLight, place: Floats) -> NDArray[np.bool_]:
+def behind_disc(disc: BodyLight, place: Floats) -> Bools:
     """(N,) whether each place (N, 4) is at infinity and behind a disc."""
     return (place[:, 3] == 0) & disc.hides(place[:, :3])
 

@@ -6,11 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from skysim.camera.glow.earth_glow import earth_around, earth_light
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.scene.sections.light import BodiesConfig, StarsConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
@@ -48,7 +45,7 @@ class DarkEarth(Obstacle):
     def during(self, exposure: Exposure) -> Lit:
         position_m = exposure.observer.from_earth.position_m
 
-        def hides(place: Floats) -> NDArray[np.bool_]:
+        def hides(place: Floats) -> Bools:
             return hidden_by_earth(position_m, place[:, :3]) & (place[:, 3] == 0)
 
         return Lit(NAME, hides=Occluder(NAME, hides, whole=True))

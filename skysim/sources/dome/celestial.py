@@ -11,11 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints, normalized
 from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
@@ -37,7 +36,7 @@ class ProjectedStars(NamedTuple):
         (N, 3) places in the lab
     """
 
-    hip: NDArray[np.int64]
+    hip: Ints
     v_mag: Floats
     shown_mag: Floats
     place_m: Floats
@@ -93,12 +92,11 @@ def project_stars(
     projected = ProjectedStars(stars.hip, stars.v_mag, mag, place_m)
     selected = select_brightest(projected, config, led.disk_diameter_m)
     # 4.
-    rays = selected.place_m - camera_m
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = normalized(selected.place_m - camera_m)
     return selected._replace(place_m=surface.meet(camera_m, rays))
 
 
-def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
+def merge_targets(place_m: Floats, separation_m: float) -> Ints:
     """(N,) index of the star with which each star is merged: itself, unless a brighter target is within separation_m.
 
     Parameters
@@ -114,7 +112,7 @@ def merge_targets(place_m: Floats, separation_m: float) -> NDArray[np.int64]:
     return target
 
 
-def merge_stars(stars: ProjectedStars, target: NDArray[np.int64]) -> ProjectedStars:
+def merge_stars(stars: ProjectedStars, target: Ints) -> ProjectedStars:
     """Merge stars: the light of each is added to its target's, at their center of light.
 
     The merged stars have the targets' numbers, and the order of combined V. m = -2.5 log10(sum 10^(-0.4 m_i)).
@@ -227,4 +225,4 @@ def led_levels(
     brightest_mag = -np.inf if config.brightest_mag is None else config.brightest_mag
     shown_mag = np.maximum(stars.shown_mag, brightest_mag)
     needed = 10 ** (-0.4 * shown_mag) / gain
-    return np.asarray(needed / needed.max())
+    return needed / needed.max()

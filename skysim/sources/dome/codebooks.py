@@ -34,11 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig
 
 Words = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 
 # Primitive polynomials over GF(2) by degree, as bits: x^5 + x^2 + 1 is 0b100101.
 PRIMITIVE = {3: 0b1011, 4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001}

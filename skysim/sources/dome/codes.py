@@ -133,9 +133,7 @@ def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: flo
 
     lit0_s, voltage0 = lit_s_and_voltage(begin_s)
     lit1_s, voltage1 = lit_s_and_voltage(end_s)
-    return np.asarray(
-        (lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s)
-    )
+    return (lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s)
 
 
 def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:

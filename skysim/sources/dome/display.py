@@ -12,12 +12,11 @@ import datetime
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections import layouts, leds, light
 from skysim.scene.sections.layouts import ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
@@ -34,7 +33,6 @@ from skysim.sources.dome.led import (
 from skysim.sources.dome.surface import Plane, Surface
 from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
 
-Ints = NDArray[np.int64]
 PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 
 
@@ -98,7 +96,7 @@ def gray_transmission(config: layouts.PixelsConfig, level: Floats) -> Floats:
     Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
     """
     top = config.gray_levels - 1
-    return np.asarray((np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma)
+    return (np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma
 
 
 def min_level(config: layouts.PixelsConfig) -> float:
@@ -324,7 +322,7 @@ def beam_sources(
 
     At the distance D a source has the strength F D^2, which gives the flux F at the bearing.
     """
-    direction = beam / np.linalg.norm(beam, axis=1, keepdims=True)
+    direction = normalized(beam)
     zeros = np.zeros(len(beam))
     ones = np.ones(len(beam))
     place = np.column_stack([direction, zeros])
@@ -374,7 +372,7 @@ def own_from_lab(config: ProjectorConfig) -> Rotation:
     return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
 
 
-def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, Bools]:
     """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and (N,) whether they are on its pixels.
 
     A direction beyond the fold of the distortion, where 1 + 3 k t^2 = 0, is not on them.
@@ -399,15 +397,15 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
     own = np.column_stack(
         [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
     )
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
-    return np.asarray(own_from_lab(config).inv().apply(own))
+    own = normalized(own)
+    return own_from_lab(config).inv().apply(own)
 
 
 def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
     """(N,) solid angles w of pixels at these cosines from the axis."""
     tangent2 = 1 / cos_axis**2 - 1
     stretch = (1 + config.distortion * tangent2) * (1 + 3 * config.distortion * tangent2)
-    return np.asarray((config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch)
+    return (config.pitch_m / config.focal_length_m) ** 2 * cos_axis**3 / stretch
 
 
 def spot_radius_m(
@@ -437,7 +435,7 @@ def spot_radius_m(
     for axis in R_own_from_lab[:2]:
         on_wall = axis - (normal @ axis / np.sum(normal * ray, axis=1))[:, None] * ray
         square_m2 += blur_m**2 / 2 * np.sum(on_wall**2, axis=1)
-    return np.asarray(np.sqrt(square_m2))
+    return np.sqrt(square_m2)
 
 
 def projector_sources(

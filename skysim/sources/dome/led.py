@@ -12,12 +12,11 @@ from math import ceil, exp, floor, log, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.tolerance import Tolerance, scaled_errors
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.scene.sections.leds import (
     AgingConfig,
     CosineLobeConfig,
@@ -213,7 +212,7 @@ class DriveInput(NamedTuple):
     """
 
     level: Floats
-    board: NDArray[np.int64]
+    board: Ints
     row: Floats | float = 0.0
 
 
@@ -227,7 +226,7 @@ class PulseTrains(NamedTuple):
     start_s: Floats
     on_s: Floats
     strength: Floats
-    clock: NDArray[np.int64]
+    clock: Ints
 
 
 def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> PulseTrains:

@@ -29,10 +29,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
@@ -70,7 +69,7 @@ class Image(NamedTuple):
         (K, 3) directions from there toward the LEDs
     """
 
-    led: NDArray[np.int64]
+    led: Ints
     toward: Floats
     distance_m: Floats
     cosine: Floats
@@ -109,7 +108,7 @@ def mirrored(
     )
 
 
-def numbered(led: NDArray[np.int64]) -> NDArray[np.int64]:
+def numbered(led: Ints) -> Ints:
     """(K,) number of each image among those of its LED, from 1, for `led` (K,) in ascending order."""
     return np.arange(len(led)) - np.searchsorted(led, led) + 1
 
@@ -140,7 +139,7 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
         with np.errstate(invalid="ignore", divide="ignore"):
             step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
         toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        toward = normalized(toward)
     # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in the field.
     offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
     rays = reflect(wall, camera_m, toward)
@@ -158,9 +157,7 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
     return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
 
 
-def distinct(
-    led: NDArray[np.int64], toward: Floats, solved: NDArray[np.bool_]
-) -> NDArray[np.int64]:
+def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:
     """Rows of the solutions, each image once, sorted by LED and direction."""
     rows = np.flatnonzero(solved)
     rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
@@ -180,7 +177,7 @@ def reflect(wall: Surface, camera_m: Floats, toward: Floats) -> Rays:
 
 def nearest_rays(
     wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """LEDs (K,) and rays (K,), as flat indices of the grid, at which an LED's angle from the reflected ray is least."""
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
     cosine = np.sum(grid[1:] * grid[:-1], axis=2)
@@ -246,7 +243,7 @@ def linearized(
     axes = axes_across(toward)
     first, second = STEP_RAD * np.moveaxis(axes, 1, 0)
     shifted = toward + np.stack([0 * toward, first, -first, second, -second])
-    shifted /= np.linalg.norm(shifted, axis=2, keepdims=True)
+    shifted = normalized(shifted)
     rays = reflect(wall, camera_m, shifted.reshape(-1, 3))
     wall_m = rays.wall_m.reshape(shifted.shape)
     along = rays.along.reshape(shifted.shape)

@@ -78,7 +78,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 
     # 2.
     def residual(parameters: Floats) -> Floats:
-        return np.asarray(np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3])
+        return np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3]
 
     start = np.append(algebraic[:3], radius)
     solution = scipy.optimize.least_squares(
@@ -108,7 +108,7 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         axes = np.exp(parameters[3:]) * sphere.radius_m
         w = (points_m - sphere.center_m - sphere.radius_m * parameters[:3]) / axes
         norm = np.linalg.norm(w, axis=1)
-        return np.asarray((norm - 1) * norm / np.linalg.norm(w / axes, axis=1))
+        return (norm - 1) * norm / np.linalg.norm(w / axes, axis=1)
 
     solution = scipy.optimize.least_squares(
         residual_m,
@@ -257,7 +257,7 @@ class SurfaceFit:
         ring = np.sin(self.radius.cover_rad)
         up = np.full(EDGE_POINTS, np.cos(self.radius.cover_rad))
         unit = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), up])
-        return np.asarray(self.radius.evaluate(unit)[0][:, None] * unit)
+        return self.radius.evaluate(unit)[0][:, None] * unit
 
 
 def read(file: str, unit: str) -> Floats:
@@ -279,7 +279,7 @@ def read(file: str, unit: str) -> Floats:
 
 def covered_rad(unit: Floats) -> tuple[float, float]:
     """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
-    angle = np.arctan2(np.hypot(unit[:, 0], unit[:, 1]), unit[:, 2])
+    angle = np.arctan2(np.hypot(*unit.T[:2]), unit[:, 2])
     azimuth = np.arctan2(unit[:, 1], unit[:, 0])
     sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Of the farthest point in each sector of azimuth, the least.

@@ -10,10 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.scene.sections.light import RoomConfig
 from skysim.sources.dome.surface import Plane, Surface, directions
 
@@ -215,7 +214,7 @@ def find_edges(
     """(N, 3) last points of the shell between tilts on it and tilts off it, by bisection."""
     for _ in range(BISECTIONS):
         middle_rad = (on_rad + off_rad) / 2
-        met: NDArray[np.bool_] = np.isfinite(meet(surface, middle_rad, azimuth_rad)[:, 0])
+        met: Bools = np.isfinite(meet(surface, middle_rad, azimuth_rad)[:, 0])
         on_rad = np.where(met, middle_rad, on_rad)
         off_rad = np.where(met, off_rad, middle_rad)
     return meet(surface, on_rad, azimuth_rad)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -55,14 +55,12 @@ class Rim:
         """Whether the surface has no end."""
         return self.lowest_m == -math.inf and self.half_rad == math.pi
 
-    def contains(self, own_m: Floats) -> NDArray[np.bool_]:
+    def contains(self, own_m: Floats) -> Bools:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
         slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
-        return np.asarray(
-            (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
-        )
+        return (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +96,7 @@ class Surface(ABC):
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """(N,) distance at which a ray from the inside leaves, in lengths of `along` (N, 3); NaN if it never leaves."""
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         """(N,) whether points of the level set belong to the surface."""
         return self.rim.contains(own_m)
 
@@ -110,7 +108,7 @@ class Surface(ABC):
         along = rays @ R_lab_from_own
         distance = self.distance(start, along)
         within = self.within(start + distance[:, None] * along)
-        return np.asarray(origin_m + np.where(within, distance, np.nan)[:, None] * rays)
+        return origin_m + np.where(within, distance, np.nan)[:, None] * rays
 
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
@@ -125,7 +123,7 @@ class Surface(ABC):
         gradient = (
             self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
         )
-        return np.asarray(-gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
+        return -normalized(gradient)
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point (3,) of the lab is inside; the rim is ignored."""
@@ -154,7 +152,7 @@ class Surface(ABC):
         return nearest.center_m, nearest.semi_axes_m
 
 
-def unit_vectors(z: NDArray[Any], azimuth: NDArray[Any]) -> Floats:
+def unit_vectors(z: NDArray, azimuth: NDArray) -> Floats:
     """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
     ring = np.sqrt(1 - z**2)
     return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
@@ -172,7 +170,7 @@ def perpendicular(unit: Floats) -> Floats:
     """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
     # The axis on which the vector has its least component is never parallel to it.
     across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
-    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
+    return normalized(across)
 
 
 def exit_distance(start: Floats, along: Floats) -> Floats:
@@ -198,10 +196,10 @@ class Ellipsoid(Surface):
     semi_axes_m: Floats
 
     def level(self, own_m: Floats) -> Floats:
-        return np.asarray(np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1)
+        return np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1
 
     def gradient(self, own_m: Floats) -> Floats:
-        return np.asarray(own_m / self.semi_axes_m**2)
+        return own_m / self.semi_axes_m**2
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m, along / self.semi_axes_m)
@@ -243,8 +241,8 @@ class Plane(Surface):
         distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
         return np.where(distance > 0, distance, np.nan)
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
-        return np.asarray(np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1))
+    def within(self, own_m: Floats) -> Bools:
+        return np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1)
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
@@ -275,17 +273,17 @@ class Cylinder(Surface):
         return np.where(np.arange(3) == self.axis, along_m, self.radius_m)
 
     def level(self, own_m: Floats) -> Floats:
-        return np.asarray(np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1)
+        return np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1
 
     def gradient(self, own_m: Floats) -> Floats:
-        return np.asarray(own_m / self.semi_axes_m() ** 2)
+        return own_m / self.semi_axes_m() ** 2
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
-        return np.asarray(self.rim.contains(own_m) & inside_ends)
+        return self.rim.contains(own_m) & inside_ends
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
@@ -324,7 +322,7 @@ class Shell:
 
     def evaluate(self, unit: Floats) -> tuple[Floats, Floats]:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient on the unit sphere."""
-        ring = np.hypot(unit[:, 0], unit[:, 1])
+        ring = np.hypot(*unit.T[:2])
         angle = np.arctan2(ring, unit[:, 2])
         # dr / d(angle) between apex and base.
         slope = (
@@ -371,10 +369,10 @@ class Radial(Surface):
         across = slope - np.sum(slope * unit, axis=1, keepdims=True) * unit
         return distance_m[:, 0] - radius, unit - across / distance_m
 
-    def within(self, own_m: Floats) -> NDArray[np.bool_]:
+    def within(self, own_m: Floats) -> Bools:
         """(N,) whether points are within the rim and in directions for which the radius is defined."""
         cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
-        return np.asarray(self.rim.contains(own_m) & (cosine >= -SLACK_M))
+        return self.rim.contains(own_m) & (cosine >= -SLACK_M)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """Newton's method within a bracket, for all rays at once.

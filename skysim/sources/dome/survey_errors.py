@@ -13,7 +13,7 @@ from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.sources.dome.surface import Surface
 
@@ -50,7 +50,7 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
         For an LED at the station.
     """
     sight_m = place_m - np.array(config.position_m)
-    level_m = np.hypot(sight_m[:, 0], sight_m[:, 1])
+    level_m = np.hypot(*sight_m.T[:2])
     distance_m = np.hypot(level_m, sight_m[:, 2])
     if not np.all(distance_m > 0):
         raise InputError(
@@ -109,9 +109,7 @@ def draw_setup(config: TotalStationConfig, normal: Floats) -> Floats:
 def moved_m(config: TotalStationConfig, place_m: Floats, setup: Floats) -> Floats:
     """(..., 3) places moved as a rigid body by the set-up's errors c and r: station's place, leveling, orientation."""
     station_m = np.array(config.position_m)
-    return np.asarray(
-        station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
-    )
+    return station_m + setup[:3] + Rotation.from_rotvec(setup[3:6]).apply(place_m - station_m)
 
 
 def surveyed_m(
@@ -164,7 +162,7 @@ def station_displacements_m(config: TotalStationConfig, place_m: Floats) -> Floa
     unit = np.eye(3)
     fields = [np.broadcast_to(axis, sight_m.shape) for axis in unit]
     fields += [np.cross(axis, sight_m) for axis in unit]
-    fields += [sight_m, sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)]
+    fields += [sight_m, normalized(sight_m)]
     sizes = np.array([float(sigma) for sigma in setup_sigmas(config)]) * SETUP_UNITS
     chosen = [size * field for size, field in zip(sizes, fields, strict=True) if size]
     return np.array(chosen).reshape(len(chosen), *place_m.shape)
@@ -250,9 +248,9 @@ def across_sigma_m(place_m: Floats, covariance_m2: Floats) -> Floats:
 
     sigma^2 = (trace C - u' C u) / 2, with the direction u from the bearing. The error along u hardly moves an image.
     """
-    along = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    along = normalized(place_m)
     along_m2 = np.einsum("ni,nij,nj->n", along, covariance_m2, along)
-    return np.asarray(np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2))
+    return np.sqrt((np.trace(covariance_m2, axis1=1, axis2=2) - along_m2) / 2)
 
 
 def common_displacements_m(

@@ -13,6 +13,7 @@ from estimator.attitude import rotation_fit, systematic
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
+from estimator.core.vectors import normalized
 from estimator.trackers import dome_tracker
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn, units
 
@@ -185,7 +186,7 @@ def test_a_focal_length_s_error_grows_from_the_principal_point(
     assert none is None
 
 
-@law(dome_tracker.led_sigma_rad)
+@law(dome_tracker.led_sigma_rad, LedMap.radius_m, normalized)
 @given(rng=SEEDS)
 def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     rng: np.random.Generator,
@@ -196,6 +197,8 @@ def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     leds = LedMap(
         np.arange(COUNT), 1.2 * along, np.zeros(3), np.full(3, 1.2), sigma_m=sigma_m
     )
+    assert_allclose(leds.radius_m, 1.2, rtol=1e-14)
+    assert_allclose(normalized(leds.position_m), along, rtol=0, atol=1e-15)
     arm = Lever(np.array([0, 0, rng.uniform(0, 0.4)]), turn(rng))
     expected = np.full(COUNT, sigma_m / (1.2 - arm.camera_body_m[2]))
     assert_allclose(dome_tracker.led_sigma_rad(leds, arm), expected, rtol=1e-12, atol=0)

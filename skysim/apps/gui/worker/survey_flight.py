@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.survey_plan import Mask, SurveyAccuracy
+from estimator.calibration.survey_plan import SurveyAccuracy
 from estimator.core.types import Centroids
 from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import (
     adjust,
@@ -225,7 +225,7 @@ def tilt_deg(scene: Scene) -> float:
 
 
 def survey_plan(
-    lab_from_body: Rotation, shown: Mask, steps: tuple[tuple[int, int, float | None], ...]
+    lab_from_body: Rotation, shown: Bools, steps: tuple[tuple[int, int, float | None], ...]
 ) -> SurveyPlan:
     """Return a plan in the form of the page.
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, normalized
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
@@ -177,7 +177,7 @@ def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> 
     # The normal is parallel to lab x.
     edge_on = np.linalg.norm(across, axis=1) < 1e-9
     across[edge_on] = [0.0, 1.0, 0.0]
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = normalized(across)
     along = np.cross(normal, across)
     rotation = rotation_rad[:, None]
     u = across * np.cos(rotation) + along * np.sin(rotation)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError, Where
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, normalized
 from skysim.scene.sections.layouts import ListedConfig, relative_levels
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
@@ -95,7 +95,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
 def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
     """Raise InputError for the first LED that is too far from the surface, along the ray from the bearing."""
     # Written so that NaN is too far.
-    directions = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    directions = normalized(place_m)
     offset_m = np.linalg.norm(project_from_bearing(surface, directions) - place_m, axis=1)
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
     if len(far):

@@ -24,13 +24,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.scene.sections import layouts
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.layouts.fisher import (
@@ -45,8 +44,6 @@ from skysim.sources.dome.layouts.fisher import (
 )
 from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread
 from skysim.sources.dome.surface import Surface
-
-Ints = NDArray[np.int64]
 
 # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed).
 GOLDEN = 1.2207440846057596

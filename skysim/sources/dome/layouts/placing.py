@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.ambiguity import unique_levels
@@ -28,8 +27,6 @@ from skysim.sources.dome.led import (
 )
 from skysim.sources.dome.surface import Surface, directions, unit_vectors
 from skysim.sources.photometry import Band
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,10 +236,10 @@ def contract(place_m: Floats, sites_m: Floats, fraction: float) -> Floats:
     contraction is 1 - z' = fraction (1 - z), which scales every solid angle alike.
     """
     # Contract the directions, then take the nearest sites.
-    direction = place_m / np.linalg.norm(place_m, axis=1, keepdims=True)
+    direction = normalized(place_m)
     z = 1 - fraction * (1 - direction[:, 2])
     # Ratio of sin(zenith angle) after the contraction to that before it.
     narrower = np.sqrt((1 - z**2) / np.maximum(1 - direction[:, 2] ** 2, 1e-12))
     xy = direction[:, :2] * narrower[:, None]
-    site_direction = sites_m / np.linalg.norm(sites_m, axis=1, keepdims=True)
+    site_direction = normalized(sites_m)
     return sites_m[cKDTree(site_direction).query(np.column_stack([xy, z]))[1]]

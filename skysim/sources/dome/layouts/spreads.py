@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -174,7 +174,7 @@ CAP_SLACK = 1e-12  # relative rounding error of a vertex on the rim of the cap
 def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
     vertices = geodesic_vertices(config.frequency, config.class_)
-    tilt_rad = np.arctan2(np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2])
+    tilt_rad = np.arctan2(np.hypot(*vertices.T[:2]), vertices[:, 2])
     azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
     # Rounded, so that vertices of equal tilt are in the order of their azimuths.
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
@@ -198,7 +198,7 @@ def geodesic_vertices(frequency: int, class_: str) -> Floats:
     points = np.array(
         [sum(n * corners[corner] for corner, n in each) for each in sorted(weights)]
     )
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
+    return normalized(points)
 
 
 def lattice_points(frequency: int, class_: str) -> Iterator[tuple[int, int, int]]:

@@ -18,14 +18,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
@@ -93,7 +92,7 @@ class Wound(NamedTuple):
     """The LEDs of all tapes in order: (N, 3) places, (N,) number of the tape, and length from its first LED."""
 
     place_m: Floats
-    tape: NDArray[np.int64]
+    tape: Ints
     tape_m: Floats
 
 
@@ -261,9 +260,8 @@ def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Fl
 # normal.
 
 
-SHELL_STREAM = (
-    2  # spawn key of the shell's own random stream, which leaves the fibers' places unchanged
-)
+# Spawn key of the shell's own random stream, which leaves the fibers' places unchanged
+SHELL_STREAM = 2
 AIMING_STREAM = 5  # spawn key of the laser's errors
 
 
@@ -319,7 +317,7 @@ def marked_m(
         )
     # 1.
     sight_m = place_m - laser_m
-    line = sight_m / np.linalg.norm(sight_m, axis=1, keepdims=True)
+    line = normalized(sight_m)
     common = (
         scaled_errors(config.orientation_sigma_arcsec, rng.standard_normal(3)) * ARCSEC_RAD
     )
@@ -328,7 +326,7 @@ def marked_m(
     )
     line = line + along_two_axes(line, pointing * ARCSEC_RAD)
     line = Rotation.from_rotvec(common).apply(line)
-    line /= np.linalg.norm(line, axis=1, keepdims=True)
+    line = normalized(line)
     # 2.
     mark_m = surface.meet(laser_m, line)
     if np.isnan(mark_m).any():
@@ -341,10 +339,10 @@ def marked_m(
     mark_m += (-outward_m / np.sum(normal * line, axis=1))[:, None] * line
     # 3.
     drill_m = scaled_errors(config.drill_sigma_m, rng.standard_normal((len(line), 2)))
-    return np.asarray(mark_m + along_two_axes(normal, drill_m))
+    return mark_m + along_two_axes(normal, drill_m)
 
 
 def along_two_axes(unit: Floats, size: Floats) -> Floats:
     """(N, 3) vectors perpendicular to unit vectors (N, 3), with components (N, 2) along two axes across them."""
     first = perpendicular(unit)
-    return np.asarray(size[:, :1] * first + size[:, 1:] * np.cross(unit, first))
+    return size[:, :1] * first + size[:, 1:] * np.cross(unit, first)
