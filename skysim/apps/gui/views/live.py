@@ -89,6 +89,7 @@ class LiveInput(LiveField):
 
 LABELS = {  # labels of fields by parameter; the label of a scene's key is the key
     "solve.fov_deg": "the field of view",
+    "solve.near_deg": "the circle of the sky",
     "solve.time_utc": "the date",
     "solve.catalog": "the star catalog",
     "solve.detector": "the detector",
