@@ -161,7 +161,7 @@ def test_every_file_that_skysim_reads_is_valid(tmp_path: Path) -> None:
     ):
         result = check_file(path)
         assert (result.fault, result.what[: len(what)]) == ("", what)
-    assert "allowed: a .yaml file or one of afit_bump" in check_file(Path("nosuch")).fault
+    assert "allowed: a .yaml file or one of afit_board" in check_file(Path("nosuch")).fault
 
 
 def test_an_endless_file_is_refused_without_waiting(tmp_path: Path) -> None:

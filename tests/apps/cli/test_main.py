@@ -36,8 +36,16 @@ ANSWER = {
     "dec_deg",
     "roll_deg",
     "fov_deg",
+    "cam_from_icrs_xyzw",
+    "covariance_rad2",
+    "focal_px",
+    "center_px",
+    "distortion",
+    "log10_chance",
     "matches",
     "rms_arcsec",
+    "stars",
+    "date_utc",
     "time_ms",
 }
 
@@ -446,7 +454,7 @@ def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Pa
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_bump, "),
+        (["nosuch"], "nosuch: no such scene; allowed: a .yaml file or one of afit_board, "),
         (
             ["shefex2", "--set", "camera.focal_lenght=25 mm"],
             "unknown key; did you mean focal_length?; allowed: ",
@@ -507,7 +515,7 @@ def test_exposure_times_are_recorded_frame_by_frame(skysim: Skysim, tmp_path: Pa
         ),
         (
             ["shefex2", "--set", "camera.detector.quantum_efficiency=nosuch.csv"],
-            "unknown curve 'nosuch.csv'; allowed: cmos",
+            "unknown curve 'nosuch.csv'; allowed: bayer_blue",
         ),
         (
             ["shefex2", "--set", "background=[{kind: aurora}]"],
@@ -714,7 +722,7 @@ def test_an_image_of_noise_is_refused(skysim: Skysim, tmp_path: Path) -> None:
         (["--camera", "nosuch.yaml"], "nosuch.yaml: cannot be read: No such file"),
         (
             ["--camera", "nosuch"],
-            "nosuch: no such scene; allowed: a .yaml file or one of afit_bump, ",
+            "nosuch: no such scene; allowed: a .yaml file or one of afit_board, ",
         ),
         (["--camera", SHEFEX, "--time", "yesterday"], "--time yesterday: allowed: ISO 8601"),
         (
