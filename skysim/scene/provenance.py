@@ -185,6 +185,13 @@ def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iter
             raw = tree
         if isinstance(value, ConfigModel):
             yield from entries(value, raw, (*parent, key))
+        elif isinstance(value, dict) and any(
+            isinstance(v, ConfigModel) for v in value.values()
+        ):
+            # Sections by names of the user's, such as types of LEDs.
+            for word, section in value.items():
+                named = raw.get(word) if isinstance(raw, dict) else None
+                yield from entries(section, named, (*parent, key, word))
         else:
             written = raw.value if isinstance(raw, Located) and not sections(value) else None
             shown = plain(value, name) if written is None else written
@@ -216,11 +223,7 @@ def plain(value: Any, name: str) -> Any:
         }
     if isinstance(value, tuple):
         return [plain(item, name) for item in value]
-    if (
-        isinstance(value, dict)
-        or value is None
-        or isinstance(value, bool | datetime.datetime)
-    ):
+    if value is None or isinstance(value, dict | bool | datetime.datetime):
         return value
     if isinstance(value, float) and (unit := si_unit(name)):
         return f"{tidy(value)} {unit}" if math.isfinite(value) else "infinity"

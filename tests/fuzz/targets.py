@@ -17,6 +17,7 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.plate_solver import picture
 from skysim.apps.stream import sinks
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader
@@ -111,6 +112,8 @@ def catalogs(data: bytes) -> None:
 
 
 def maps(data: bytes) -> None:
+    lights = write_file(data, "lights.ecsv")
+    rejects(lambda: picture.read_lights(lights), InputError)
     path = write_file(data, "map.ecsv")
     rejects(lambda: dome_map_file.read_dome_map(path), InputError)
 

@@ -101,6 +101,7 @@ OUT_OF_REACH = {
     "skysim.experiments.study.execution.setups.scene_hash": SOURCES,
     "skysim.experiments.study.execution.dask_engine.decode_chunk": OURS,
     "skysim.experiments.study.execution.runner.prepare_store": "copies the study's text, which `plan.load` has read",
+    "skysim.tracking.computer_time.fastest_mhz": "the system's own file, /proc/cpuinfo",
     "skysim.tracking.tracker_host.receive_picture": OURS,
     "skysim.tracking.tracker_interface.Setup.of_tree": OURS,
     "skysim.dynamics.multibody.scene_picture.film": OURS,

@@ -429,13 +429,13 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
             "shefex2",
             {"camera__preset": "imx174"},
             "tracker.limit_mag",
-            "knows them to V 5.8 only, 9 % of them",
+            "knows them to V 5.8 only, 8 % of them",
         ),
         (
             "shefex2",
             {"camera__detector__prnu": "0.1"},
             "tracker.centroid_sigma_px",
-            "1.3 times too small (NEES 5.4",
+            "1.3 times too small (NEES 5.3",
         ),
         (
             "shefex2",

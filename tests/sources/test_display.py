@@ -369,7 +369,12 @@ def test_a_camera_on_a_lever_sees_only_the_collimation_s_parallax(
     lab = build_lab(
         loader.load(
             "collimated_display",
-            settings | {"vehicle.model": "vehicles/simsat.xml", "motion.start.roll_deg": "6"},
+            settings
+            | {
+                "vehicle.model": "vehicles/simsat.xml",
+                "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
+                "motion.start.roll_deg": "6",
+            },
         )
     )
     central = build_lab(loader.load("collimated_display", {"motion.start.roll_deg": "6"}))

@@ -152,7 +152,8 @@ def detected_radius_px(view: View, context: Context) -> Floats:
         # Linear for a Gaussian.
         square = np.interp(log_ratio[rows], fall - fall[0], v[0, outward] ** 2)
         radius[rows] = blur_px * np.sqrt(square)
-    return radius
+    # A disk's flat top ends at its rim, also where it is below the threshold.
+    return np.where(log_ratio > 0, radius, 0.0)
 
 
 def detected_area_px(view: View, context: Context) -> Floats:
