@@ -162,7 +162,7 @@ def test_halves_cover_the_image_and_are_not_tried_with_few_lights() -> None:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lights_at_random_are_refused_in_every_part() -> None:
     blind = plate_solver.make_solver(None, None)
     for seed in range(10):

@@ -48,6 +48,7 @@ LONG = {
     "howto/dome.md",
     "howto/photo.md",
     "howto/profile.md",
+    "howto/ptase_session.md",
     "howto/thesis_tests.md",
     "howto/tracker.md",
     "explanation/error_budget.md",

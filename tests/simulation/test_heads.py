@@ -200,7 +200,7 @@ def test_two_heads_lower_the_roll_by_the_factor_of_their_covariances() -> None:
     assert abs(found.nees - 3) < 4 * np.sqrt(6 / found.pairs)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_filter_finds_how_far_the_mounts_have_turned() -> None:
     """The shipped scene to its half: the second camera's boresight relative to the first, and the claimed errors."""
     flight = simulate_motion(load_scene("two_heads", {"exposure.frames": 200}))

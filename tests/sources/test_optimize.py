@@ -64,7 +64,7 @@ def best() -> Sources:
     return lit(WANTED)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_optimized_layout_is_computed_once_for_each_dome_and_camera() -> None:
     """Brightness is drawn after the search from the same stream; a cached search changes no dome."""
     few = WANTED | {"count": 12, "rounds": 1, "levels": [1, 0.5], "spacing": "20 mm"}

@@ -237,7 +237,7 @@ def shared_errors(attitudes: Rotation, sigma_rad: float, rng: np.random.Generato
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_common_to_all_attitudes_are_in_the_covariance() -> None:
     """Shared errors five times as large as the noise: of 12 draws the sum of 9 NEES each is as claimed.
 
@@ -265,7 +265,7 @@ def test_errors_common_to_all_attitudes_are_in_the_covariance() -> None:
     assert blind > chi2.ppf(1 - 1e-4, 108)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_errors_of_common_lights_and_of_the_place_are_counted_once() -> None:
     """Each attitude has the mean error of the lights around its z axis and one error that never changes.
 

@@ -105,7 +105,17 @@ def test_an_unknown_id_is_answered_with_the_allowed_ones() -> None:
 
 
 # Hundreds of frames, which `make test-long` and the papers' page have.
-LONG = {"afit-table-2", "afit-table-3-5", "afit-table-6-9", "afit-table-10-15"}
+LONG = {
+    "afit-table-2",
+    "afit-table-3-5",
+    "afit-table-6-9",
+    "afit-table-10-15",
+    "afit-figs-36-40",  # these three are shortened in test_afit_leds.py
+    "afit-fig-38",
+    "afit-fig-40",
+    "oled",
+    "ptase-table-2",
+}
 # NPS matched six stars of nine on average, and its attitudes failed at 6 degrees without exception.
 MOST_OFF = 2
 
@@ -123,7 +133,7 @@ def test_a_quick_experiment_has_a_number_for_every_row(id: str) -> None:
     assert found.commands[0].startswith("skysim ")
     assert experiments()[id].file in found.commands[0]
     assert all(math.isfinite(one.ours.value) for one in found.comparisons)
-    assert id in LONG or found.count("disagrees") <= MOST_OFF
+    assert id.startswith("afit-table") or found.count("disagrees") <= MOST_OFF
 
 
 @pytest.mark.slow

@@ -356,7 +356,7 @@ def test_a_kill_in_any_step_of_a_move_loses_and_duplicates_no_row(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["serial", "pool"])
+@pytest.mark.parametrize("engine", ["serial", pytest.param("pool", marks=pytest.mark.long)])
 def test_killed_at_any_instant_a_study_ends_with_the_same_rows(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
