@@ -86,16 +86,8 @@ class Optics:
         focal = self.camera.focal_px
         center = self.camera.center_px
         if any(self.camera.distortion):
-            x, y = self._distort(x, y)
+            x, y = distort(self.camera.distortion, self.fold_r, x, y)
         return np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
-
-    def _distort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-        """Brown's distortion of (...,) tangents x and y; NaN beyond the fold."""
-        r2 = x**2 + y**2
-        # Beyond the fold a direction would have a second image.
-        scale = np.where(r2 < self.fold_r**2, radial(self.camera.distortion, r2), np.nan)
-        shift_x, shift_y = tangential(self.camera.distortion, x, y)
-        return x * scale + shift_x, y * scale + shift_y
 
     def throughput(self, cos_field: Floats) -> Floats:
         """Relative throughput at field angles theta of any shape: cos(theta) V(theta), zero behind the camera.
@@ -140,6 +132,17 @@ def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Flo
     p1, p2 = distortion[2:4]
     r2 = x**2 + y**2
     return 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
+
+
+def distort(
+    distortion: tuple[float, ...], fold_r: float, x: Floats, y: Floats
+) -> tuple[Floats, Floats]:
+    """Brown's distortion of (...,) tangents x and y; NaN beyond the fold."""
+    r2 = x**2 + y**2
+    # Beyond the fold a direction would have a second image.
+    scale = np.where(r2 < fold_r**2, radial(distortion, r2), np.nan)
+    shift_x, shift_y = tangential(distortion, x, y)
+    return x * scale + shift_x, y * scale + shift_y
 
 
 def field_rad(corner_r: float, distortion: tuple[float, ...], fold_r: float) -> float:

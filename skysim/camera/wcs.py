@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.optics import field_rad, fold_r, radial, tangential
+from skysim.camera.optics import distort, field_rad, fold_r
 from skysim.core.types import Bools, Floats
+from skysim.scene.opencv_calibration import OpencvCalibration
 
 MAX_ORDER = 9  # the highest that SIP allows
 TARGET_ERROR_PX = 1e-4  # the fit stops at the first order with a smaller error
@@ -20,42 +21,6 @@ GRID_SIDE = 41
 MARGIN = 0.02  # the fit extends beyond the chip's edges by this fraction of its sides
 
 Coefficients = dict[tuple[int, int], float]
-
-
-class AnyCamera(Protocol):
-    """A scene's camera, or a tracker's: what its pixels' directions depend on."""
-
-    @property
-    def width_px(self) -> int: ...
-    @property
-    def height_px(self) -> int: ...
-    @property
-    def focal_px(self) -> float: ...
-    @property
-    def center_px(self) -> tuple[float, float]: ...
-    @property
-    def distortion(self) -> tuple[float, ...]: ...
-
-
-class Lens(NamedTuple):
-    """The numbers of a camera that the polynomials are fitted to."""
-
-    width_px: int
-    height_px: int
-    focal_px: float
-    center_px: tuple[float, float]
-    distortion: tuple[float, ...]
-
-    @classmethod
-    def of(cls, camera: AnyCamera) -> Lens:
-        """The lens of a camera."""
-        return cls(*(getattr(camera, name) for name in cls._fields))
-
-    @property
-    def corner_px(self) -> float:
-        """Distance from the principal point to the farthest corner of the detector."""
-        center = np.array(self.center_px) + 0.5
-        return float(np.hypot(*np.maximum(center, [self.width_px, self.height_px] - center)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +44,7 @@ class Sip:
     worst_px: float
 
 
-def header(camera: AnyCamera, cam_from_icrs: Rotation) -> dict[str, Any]:
+def header(camera: OpencvCalibration, cam_from_icrs: Rotation) -> dict[str, Any]:
     """TAN-SIP header (TAN without distortion) of a pointing (Calabretta & Greisen 2002; Shupe et al. 2005).
 
     CD converts pixel offsets to degrees east (xi) and north (eta) of the tangent point. The rows of the attitude
@@ -93,7 +58,7 @@ def header(camera: AnyCamera, cam_from_icrs: Rotation) -> dict[str, Any]:
     east = np.array([-np.sin(ra), np.cos(ra), 0.0])
     north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
     scale = np.degrees(1 / camera.focal_px)
-    distortion = fit_sip(Lens.of(camera))
+    distortion = fit_sip(camera)
     suffix = "-SIP" if distortion else ""
     return {
         "CTYPE1": f"RA---TAN{suffix}",
@@ -122,9 +87,9 @@ def keywords(distortion: Sip) -> dict[str, Any]:
     return cards
 
 
-def accuracy_warning(camera: AnyCamera) -> str:
+def accuracy_warning(camera: OpencvCalibration) -> str:
     """A warning if the WCS of this camera's frames is inaccurate; otherwise an empty string."""
-    distortion = fit_sip(Lens.of(camera))
+    distortion = fit_sip(camera)
     if distortion is None or distortion.worst_px <= MAX_ERROR_PX:
         return ""
     return (
@@ -134,7 +99,7 @@ def accuracy_warning(camera: AnyCamera) -> str:
 
 
 @lru_cache(maxsize=8)
-def fit_sip(camera: Lens) -> Sip | None:
+def fit_sip(camera: OpencvCalibration) -> Sip | None:
     """The camera's distortion as SIP; None without distortion, or if distortion keeps all light off the chip.
 
     1. Make points on the chip and slightly beyond, without and with distortion; more of them for checks.
@@ -181,7 +146,7 @@ def monomials(xy: Floats, powers: list[tuple[int, int]]) -> Floats:
     return np.column_stack([x[:, p] * y[:, q] for p, q in powers])
 
 
-def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, Bools]:
+def fit_grid(camera: OpencvCalibration, side: int) -> tuple[Floats, Floats, Bools]:
     """A grid of image points with their places without distortion.
 
     Returns
@@ -214,21 +179,17 @@ def fit_grid(camera: Lens, side: int) -> tuple[Floats, Floats, Bools]:
     return undistorted_px[on_fit_area], distorted_px[on_fit_area], inside(0)[on_fit_area]
 
 
-def distorted(undistorted_px: Floats, camera: Lens) -> Floats:
+def distorted(undistorted_px: Floats, camera: OpencvCalibration) -> Floats:
     """Apply the lens's distortion to (N, 2) undistorted offsets from the principal point, px.
 
     Points beyond the distortion's fold, which have no image, get a large offset.
     """
     x, y = undistorted_px.T / camera.focal_px
-    r2 = x**2 + y**2
-    scale = radial(camera.distortion, r2)
-    shift_x, shift_y = tangential(camera.distortion, x, y)
-    tangents = np.column_stack([x * scale + shift_x, y * scale + shift_y])
-    has_image = r2 < fold_r(camera.distortion) ** 2
-    return np.where(has_image[:, None], tangents * camera.focal_px, 1e9)
+    tangents = np.column_stack(distort(camera.distortion, fold_r(camera.distortion), x, y))
+    return np.where(np.isfinite(tangents), tangents * camera.focal_px, 1e9)
 
 
-def brown(camera: Lens) -> tuple[Coefficients, Coefficients]:
+def brown(camera: OpencvCalibration) -> tuple[Coefficients, Coefficients]:
     """Brown's distortion as polynomials in the undistorted offsets U, V in pixels.
 
     x (k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (3 x^2 + y^2), y likewise, with x = U / focal. Powers of r^2 = x^2 +

@@ -52,6 +52,14 @@ class OpencvCalibration:
         return width, height, diagonal
 
     @property
+    def corner_px(self) -> float:
+        """Distance from the principal point to the farthest corner of the detector."""
+        x, y = self.center_px
+        far_x = max(x + 0.5, self.width_px - 0.5 - x)
+        far_y = max(y + 0.5, self.height_px - 0.5 - y)
+        return math.hypot(far_x, far_y)
+
+    @property
     def arcsec_px(self) -> float:
         """Angle of a pixel on the axis, in arcsec."""
         return 1 / self.focal_px / ARCSEC_RAD

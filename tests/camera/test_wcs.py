@@ -34,7 +34,7 @@ def test_the_fit_s_points_cover_the_chip_and_little_more(
             },
         }
     )
-    _, distorted_px, on_chip = wcs.fit_grid(wcs.Lens.of(camera), wcs.GRID_SIDE)
+    _, distorted_px, on_chip = wcs.fit_grid(camera.calibration(), wcs.GRID_SIDE)
     pixels = distorted_px + center_px
     size = np.array([640, 480])
     assert (pixels[on_chip] >= -0.5).all()
@@ -45,4 +45,4 @@ def test_the_fit_s_points_cover_the_chip_and_little_more(
     assert (pixels.min(axis=0) < size / wcs.GRID_SIDE).all()
     assert (pixels.max(axis=0) > size - size / wcs.GRID_SIDE).all()
     assert on_chip.sum() > 0.6 * wcs.GRID_SIDE**2
-    assert wcs.fit_sip(wcs.Lens.of(camera)).worst_px < wcs.MAX_ERROR_PX
+    assert wcs.fit_sip(camera.calibration()).worst_px < wcs.MAX_ERROR_PX

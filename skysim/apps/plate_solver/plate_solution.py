@@ -162,11 +162,14 @@ def wcs_header(attitude: Attitude, flipped: bool) -> Any:
     from astropy.io.fits import Header
 
     from skysim.camera import wcs
+    from skysim.scene.opencv_calibration import OpencvCalibration
 
     camera = attitude.camera
     assert camera is not None
     assert attitude.cam_from_ref is not None
-    cards = wcs.header(camera, attitude.cam_from_ref)
+    size_px = camera.width_px, camera.height_px
+    lens = OpencvCalibration(*size_px, camera.focal_px, camera.center_px, camera.distortion)
+    cards = wcs.header(lens, attitude.cam_from_ref)
     if flipped:
         cards["CRPIX2"] = camera.height_px + 1 - cards["CRPIX2"]
         for name in cards:

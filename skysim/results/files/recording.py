@@ -264,7 +264,7 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header.append(TOP_DOWN_CARD)
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
     if scene.stars:
-        header.update(wcs.header(scene.camera, truth.mean_cam_from_lab))
+        header.update(wcs.header(scene.camera.calibration(), truth.mean_cam_from_lab))
         header["COMMENT"] = (
             "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
         )

@@ -556,10 +556,7 @@ class CameraConfig(ConfigModel):
     @property
     def corner_px(self) -> float:
         """Distance from the principal point to the farthest corner of the detector."""
-        x, y = self.center_px
-        far_x = max(x + 0.5, self.width_px - 0.5 - x)
-        far_y = max(y + 0.5, self.height_px - 0.5 - y)
-        return math.hypot(far_x, far_y)
+        return self.calibration().corner_px
 
 
 CURVE_FOLDER = DATA / "qe"

@@ -163,7 +163,7 @@ def broken_assumptions(lab: Lab) -> list[str]:
     """Warnings that the scene breaks an assumption of its tracker, or of the WCS of its frames."""
     scene = lab.scene
     if isinstance(scene.light, StarsConfig):
-        warning = wcs.accuracy_warning(scene.camera)
+        warning = wcs.accuracy_warning(scene.camera.calibration())
         return [warning] if warning else []
     if not isinstance(scene.light, DomeConfig):
         return []
