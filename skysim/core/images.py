@@ -319,6 +319,12 @@ def image_suffix(name: str) -> str:
     )
 
 
+def stem_of(path: Path) -> str:
+    """The file's name without the suffix of its image format; of another file, without its suffix."""
+    suffix = image_suffix(path.name)
+    return path.name[: -len(suffix)] if suffix else path.stem
+
+
 def best_images(
     folder: Path, rank: Callable[[Path], int], recursive: bool = False
 ) -> dict[Path, Path]:
@@ -333,9 +339,8 @@ def best_images(
         raise InputError(folder, "no such folder", "a folder of images")
     best: dict[Path, Path] = {}
     for path in sorted(folder.rglob("*") if recursive else folder.iterdir()):
-        suffix = image_suffix(path.name)
-        if suffix and not path.name.startswith("."):
-            stem = path.with_name(path.name[: -len(suffix)])
+        if image_suffix(path.name) and not path.name.startswith("."):
+            stem = path.with_name(stem_of(path))
             best[stem] = min(best.get(stem, path), path, key=rank)
     return best
 

@@ -124,7 +124,7 @@ def solve(
         )
     else:
         solver = kept_solver(fov_deg, time_utc)
-    result = read_and_solve(Path(path), solver, Outputs())
+    result = read_and_solve(Path(path), solver)
     return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
 
 
@@ -161,7 +161,7 @@ def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
 
     If two pictures differ only in suffix, the suffix stays in the name; if they have the same name, a number is added.
     """
-    stems = [stem_of(path) for path in paths]
+    stems = [images.stem_of(path) for path in paths]
     names = [
         path.name if stems.count(stem) > 1 else stem
         for path, stem in zip(paths, stems, strict=True)
@@ -171,12 +171,6 @@ def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
         folder / f"{name}{f'-{n + 1}' if n else ''}{ANNOTATED}"
         for name, n in zip(names, repeats, strict=True)
     ]
-
-
-def stem_of(path: Path) -> str:
-    """The file's name without the suffix of its image format."""
-    suffix = images.image_suffix(path.name)
-    return path.name[: -len(suffix)] if suffix else path.stem
 
 
 def solve_file(

@@ -119,6 +119,7 @@ def solve(
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
     from skysim.core import files
+    from skysim.core.images import stem_of
 
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
@@ -135,7 +136,8 @@ def solve(
     files.make_folder(out)
     paths = pictures(images or [], live, out)
     if sequence:  # a frame that is there as FITS and as PNG is one
-        paths = list({path.with_suffix(""): path for path in reversed(paths)}.values())[::-1]
+        first = {path.with_name(stem_of(path)): path for path in reversed(paths)}
+        paths = list(first.values())[::-1]
     chosen = plate_solver.Outputs(annotate, table, wcs)
     if any(chosen) and len(paths) != 1:
         raise InputError("", f"{len(paths)} images", "one with --annotate, --table or --wcs")
@@ -195,11 +197,12 @@ def solve_all(
     errors = []
     warnings = []
     annotated = plate_solver.annotated_paths(out, paths)
-    count = sum(video_numbers(path)[1] for path in paths)
+    videos = [video_numbers(path) for path in paths]
+    count = sum(length for _, length in videos)
     frames = (
-        (name, picture, annotated[n])
-        for n, path in enumerate(paths)
-        for name, picture in frames_of(path)
+        (name, picture, marked)
+        for path, (rate_hz, length), marked in zip(paths, videos, annotated, strict=True)
+        for name, picture in (video_frames(path, length) if rate_hz else [(path, None)])
     )
     for name, picture, marked in progress(frames, count, "solving", quiet or count == 1):
         # The frames of a video are not drawn: they are thousands.
@@ -214,14 +217,10 @@ def solve_all(
     return results, warnings, errors
 
 
-def frames_of(path: Path) -> Iterator[tuple[Path, ViewedImage | None]]:
-    """Names and pictures of a video's frames; of another file its name, and None."""
+def video_frames(path: Path, count: int) -> Iterator[tuple[Path, ViewedImage]]:
+    """Names and pictures of a video's frames."""
     from skysim.core.images import LiveCamera, ViewedImage
 
-    rate_hz, count = video_numbers(path)
-    if rate_hz is None:
-        yield path, None
-        return
     with closing(LiveCamera(str(path))) as video:
         for n in range(count):
             yield path.with_name(f"{path.name}#{n}"), ViewedImage(video.frame())
