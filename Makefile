@@ -87,7 +87,7 @@ studies: $(READY)
 papers: $(READY)
 	mkdir -p out
 	$(BIN)/skysim reproduce all --quick --json > out/papers.json
-	$(BIN)/python -m skysim.experiments.papers.afit_fit > out/afit_fit.txt
+	$(BIN)/python docs/site/afit_fit.py > out/afit_fit.txt
 	$(BIN)/python docs/site/papers.py out/papers.json out/afit_fit.txt
 
 # The findings pages whose code has changed since they were made, and the commands that make them again.

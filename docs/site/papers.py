@@ -1,7 +1,7 @@
 """Write docs/findings/papers.md: how the papers' numbers come out, with the predictions that disagree and why.
 
 `python docs/site/papers.py out/papers.json out/afit_fit.txt`: what `make papers` writes by `skysim reproduce all
---quick --json` and `python -m skysim.experiments.papers.afit_fit`.
+--quick --json` and `python docs/site/afit_fit.py`.
 All rows are kept beside the page as papers.csv, which the tests compare with today's code; the full page with
 assumptions and fitted parameters is what `skysim reproduce all --report` writes.
 """

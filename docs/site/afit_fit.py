@@ -1,6 +1,6 @@
 """One laboratory for AFIT's three tests: a joint fit to Tables 2, 3, 4 and 7 (Padro 2012), as section 3.7 says.
 
-`python -m skysim.experiments.papers.afit_fit` prints the parameters with their intervals, chi-square by table, and how
+`python docs/site/afit_fit.py` prints the parameters with their intervals, chi-square by table, and how
 well other exposures do. The scene scenes/papers/afit_laboratory.yaml has the result.
 
 The model of a light in an image: a disk of radius R blurred by a Gaussian, that is proportional to the time for which
@@ -47,13 +47,8 @@ UNITS = ("ms", "gray/ms", "gray", "gray", "px", "px", "us")
 START = np.array([18.1, 80.0, 190.0, 3.8, 11.4, 1.4, 76.0])
 LOW = np.array([9.0, 10.0, 150.0, 0.3, 4.0, 0.3, 20.0])
 HIGH = np.array([110.0, 800.0, 255.0, 8.0, 20.0, 5.0, 200.0])
-OTHERS_MS = (
-    16.7,
-    27.3,
-    36.4,
-    55.0,
-    100.0,
-)  # a frame of 60 Hz, and those that Table 2 alone allows
+# A frame of 60 Hz, and those that Table 2 alone allows.
+OTHERS_MS = (16.7, 27.3, 36.4, 55.0, 100.0)
 CHI2_95 = 3.84
 FARTHEST_MS = 1.0  # of an end of the interval from the best exposure
 
