@@ -15,7 +15,7 @@ from skysim.apps.cli.commands.dataset import dataset
 from skysim.apps.cli.commands.datasheet import datasheet
 from skysim.apps.cli.commands.measure import balance, calibrate, characterize
 from skysim.apps.cli.commands.reproduce import reproduce
-from skysim.apps.cli.commands.resources import export, scenes_app
+from skysim.apps.cli.commands.resources import export, new, scenes_app
 from skysim.apps.cli.commands.run import compare, render, run, trackers
 from skysim.apps.cli.commands.serve import gui, stream
 from skysim.apps.cli.commands.solve import solve
@@ -30,32 +30,20 @@ from skysim.core import __version__, errors
 from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-COMMANDS = (
-    run,
-    check,
-    render,
-    stream,
-    compare,
-    trackers,
-    solve,
-    survey,
-    datasheet,
-    dataset,
-    characterize,
-    calibrate,
-    balance,
-    reproduce,
-    gui,
-    validate,
-    export,
-    availability,
-)
-for command in COMMANDS:
-    app.command()(command)
-app.add_typer(scenes_app, name="scenes")
-app.add_typer(cameras, name="camera")
-app.add_typer(catalogs, name="catalog")
-app.add_typer(studies, name="study")
+# Commands by the job that they do, as `skysim --help` lists them.
+JOBS = {
+    "Simulate": (new, run, render, stream, gui),
+    "Plan": (check, validate, datasheet, availability),
+    "Measure": (solve, survey, characterize, calibrate, balance),
+    "Exchange": (export, dataset, compare, trackers, reproduce),
+}
+for job, commands in JOBS.items():
+    for command in commands:
+        app.command(rich_help_panel=job)(command)
+app.add_typer(scenes_app, name="scenes", rich_help_panel="Simulate")
+app.add_typer(studies, name="study", rich_help_panel="Plan")
+app.add_typer(cameras, name="camera", rich_help_panel="Measure")
+app.add_typer(catalogs, name="catalog", rich_help_panel="Exchange")
 add_examples(app)
 
 

@@ -139,8 +139,8 @@ def within_reach(
 
 
 def rates_text(attitudes: CheckedAttitudes) -> str:
-    """The least and the greatest rate."""
-    rates_deg_s = np.degrees(attitudes.speed_rad_s)
+    """The least and the greatest rate, to 0.001 deg/s."""
+    rates_deg_s = np.degrees(attitudes.speed_rad_s).round(3)
     low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
     return f"at {high} deg/s" if low == high else f"at {low} to {high} deg/s"
 

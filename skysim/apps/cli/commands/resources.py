@@ -1,7 +1,8 @@
-"""Commands `skysim scenes` and `export`."""
+"""Commands `skysim scenes`, `new` and `export`."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -9,8 +10,14 @@ import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, print_titles, progress
+from skysim.core.errors import InputError, unknown_name
+from skysim.core.paths import DATA
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
+
+# A kind is the name of its template, with any endings.
+NEW = DATA / "new"
+KINDS = sorted({path.stem for path in NEW.glob("*.*")})
 
 scenes_app = typer.Typer(
     invoke_without_command=True,
@@ -116,6 +123,49 @@ def scenes_parts(
         for head in parts.COLUMNS
     ]
     print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
+
+
+def new(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            help=f"What to begin: {', '.join(KINDS)}.",
+            autocompletion=lambda: list(KINDS),
+        ),
+    ],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the new file, without its ending.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the new file.")] = Path(),
+) -> None:
+    """Begin a scene, vehicle, camera, study, controller or tracker: write a commented file that runs as it is.
+
+    Its first lines say which commands use it. A vehicle is two files: its model, and a scene that flies it.
+    """
+    from skysim.core import files
+
+    if kind not in KINDS:
+        raise InputError("", *unknown_name("kind", kind, KINDS))
+    if not re.fullmatch(r"[A-Za-z]\w*", name):
+        raise InputError(
+            "NAME", f"{name!r} is no name", "a letter, then letters, digits and _"
+        )
+    templates = {out / f"{name}{path.suffix}": path for path in sorted(NEW.glob(f"{kind}.*"))}
+    for target in templates:
+        if target.exists():
+            raise InputError(
+                target, "exists; choose another name, or another folder with --out"
+            )
+    files.make_folder(out)
+    for target, template in templates.items():
+        text = template.read_text(encoding="utf-8")
+        files.write_text(target, text.replace("NAME", name))
+        print(target)
+        for use in re.findall("^#   (skysim.*)", text, re.MULTILINE):
+            print(
+                f"  {use.replace(template.with_stem('NAME').name, str(target)).replace('NAME', name)}"
+            )
 
 
 def export(
