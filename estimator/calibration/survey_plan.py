@@ -193,7 +193,7 @@ def choose(
        whose rays cross by the rms angle PLANNED_RAD or more, if any attitude has LEAST_CROSSING of them, else any LEDs.
     3. Select the candidate of the largest reduction (`_best`). The reductions hardly grow from choice to choice, so a
        candidate is evaluated again only while its last value is above the best (lazy greedy: Minoux 1978).
-    4. Reduce the covariances by it, and repeat from step 2.
+    4. Reduce the covariances by it, drop it, since a repetition crosses no rays, and repeat from step 2.
 
     Correlations between LEDs are left out, which is thirty times faster and no worse: 40 attitudes under a dome of 390
     LEDs leave 0.66 mm rms, against 0.69 mm with all correlations.
@@ -226,8 +226,9 @@ def choose(
         best = _best(rows, blocks, bound, reach.connected(bound > 0))
         if best is None:
             break
-        # 4. Reduced covariances
+        # 4. Reduced covariances, and one candidate less
         blocks[rows[best].led] -= _reduction(rows[best], blocks)
+        bound[best] = 0.0
         reach.add(candidates[[best]], shown[[best]])
         chosen.append(best)
     return chosen

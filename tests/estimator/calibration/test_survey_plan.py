@@ -250,6 +250,14 @@ def test_planned_attitudes_are_connected_by_rays_that_cross() -> None:
         assert connecting.sum() >= survey_plan.MIN_SHARED
 
 
+def test_an_attitude_is_planned_once() -> None:
+    """A repetition would reduce the noise, but no ray of it crosses another one."""
+    true = narrow_dome()
+    candidates = attitudes(np.random.default_rng(3), 40, 20.0)
+    rows = survey_plan.choose(true, candidates, true.visible(candidates), 60)
+    assert len(rows) == len(set(rows)) > 12
+
+
 @pytest.mark.parametrize(("arm_m", "least"), [(0.1, 20), (0.15, 25), (0.2, 15)])
 def test_a_plan_with_a_short_lever_still_connects_its_attitudes(
     arm_m: float, least: int
