@@ -220,6 +220,24 @@ def test_a_flat_panel_is_a_disk_at_its_height_that_covers_its_leds() -> None:
     assert np.hypot(*shell[:, :2].T).max() > np.hypot(*sources.place[:, :2].T).max()
 
 
+def test_a_dome_for_a_room_ends_at_its_cap_and_stands_in_the_room() -> None:
+    """The floor is as deep as the bearing is high; the bars are the twelve edges of a box of the room's size."""
+    room = "{width: 4 m, length: 5 m, height: 2.9 m, bearing_height: 1.1 m}"
+    sphere = "{kind: sphere, apex: 1.2 m, radius: 1.2 m}"
+    changes = {"light.surface": sphere, "light.layout.cap_deg": "25", "light.room": room}
+    scene, vehicle, sources = dome_lab(changes)
+    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    shell = vertices_m(model, data, "stage_dome_")
+    tilt_rad = np.arctan2(np.hypot(shell[:, 0], shell[:, 1]), shell[:, 2])
+    assert np.degrees(tilt_rad.max()) == pytest.approx(25, abs=1e-3)
+    assert data.geom("stage_floor").xpos[2] == pytest.approx(-1.1)
+    bars = [n for n in range(model.ngeom) if model.geom(n).name.startswith("room_edge")]
+    assert len(bars) == 12
+    length_m = 2 * model.geom_size[bars, 1]
+    assert sorted(length_m.round(9)) == pytest.approx([2.9] * 4 + [4.0] * 4 + [5.0] * 4)
+    assert np.ptp(data.geom_xpos[bars], axis=0) == pytest.approx([4.0, 5.0, 2.9])
+
+
 def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
     """OpenGL draws a triangle whose corners go against the clock's hands as seen by the eye."""
     scene, vehicle, sources = dome_lab()

@@ -11,6 +11,7 @@ import ctypes
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.light import DomeConfig, RoomConfig
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
 
@@ -45,6 +46,7 @@ LED_RADIUS_M = 5e-3  # larger than the true disk, which would be less than a pix
 LEVELS = 12  # steps of brightness
 DIM = 0.15  # brightness of the darkest LED, relative to the brightest
 RIM_M = 0.03
+EDGE_M = 0.012  # radius of the bars along the edges of a room
 # Number of vertices of the dome's mesh around its axis and down from its top.
 SECTORS = 72
 RINGS = 24
@@ -98,7 +100,7 @@ def mjcf(
     # 2. Surroundings.
     add_backdrop(spec, on_earth)
     if on_earth:
-        add_room(spec)
+        add_room(spec, dome.room if dome else None)
     if dome:
         rings_m = shell_m(inside, np.radians(dome.layout.cap_deg))
         add_dome(spec, rings_m)
@@ -183,8 +185,8 @@ def add_backdrop(spec: Any, on_earth: bool) -> None:
     )
 
 
-def add_room(spec: Any) -> None:
-    """Add a tiled floor, and the pedestal whose cup holds the ball of the bearing."""
+def add_room(spec: Any, room: RoomConfig | None) -> None:
+    """Add a tiled floor, the pedestal whose cup holds the ball of the bearing, and the edges of a known room."""
     spec.add_texture(
         name="stage_tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -201,11 +203,18 @@ def add_room(spec: Any) -> None:
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
     bottom = -FLOOR_BELOW_M
+    half_m = [6.0, 6.0]
+    if room and room.bearing_height_m is not None:
+        bottom = -room.bearing_height_m
+    if room and (sides_m := [side for side in (room.width_m, room.length_m) if side]):
+        # A side that is left out is as long as the other one.
+        half_m = [sides_m[0] / 2, sides_m[-1] / 2]
+        add_edges(spec, half_m, bottom, bottom + room.height_m if room.height_m else bottom)
     add_visual_geom(
         spec.worldbody,
         "stage_floor",
         plane,
-        size=[6, 6, 0.1],
+        size=[*half_m, 0.1],
         pos=[0, 0, bottom],
         material="stage_tiles",
     )
@@ -225,6 +234,23 @@ def add_room(spec: Any) -> None:
         )
 
 
+def add_edges(spec: Any, half_m: list[float], bottom_m: float, top_m: float) -> None:
+    """Add the edges of a room as bars; without its height those of the floor."""
+    corners_m = list(
+        product((-half_m[0], half_m[0]), (-half_m[1], half_m[1]), {bottom_m, top_m})
+    )
+    for n, (a, b) in enumerate(combinations(corners_m, 2)):
+        if np.count_nonzero(np.subtract(a, b)) == 1:
+            add_visual_geom(
+                spec.worldbody,
+                f"room_edge_{n}",
+                mujoco.mjtGeom.mjGEOM_CAPSULE,
+                size=[EDGE_M, 0, 0],
+                fromto=[*a, *b],
+                rgba=[0.45, 0.50, 0.58, 1],
+            )
+
+
 def add_visual_geom(body: Any, name: str, kind: Any, **more: Any) -> Any:
     """Add and return a geom for display only: no mass, no contact."""
     return body.add_geom(name=name, type=kind, mass=0.0, contype=0, conaffinity=0, **more)
@@ -242,8 +268,10 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     """(RINGS, SECTORS, 3) points of the dome in the lab: rings from its top down, each counterclockwise from above.
 
     1. A panel ends slightly beyond its LEDs.
-    2. An upright ellipsoid without a rim ends where it is widest, or above the vehicle if that is higher.
-    3. Any other surface ends at its edge as seen from the bearing (`visible_shell_m`).
+    2. Any other surface ends at its rim, or without one at the cap, as the shell does that is built (`RoomConfig`).
+       Rays from the bearing are tested in 400 steps of equal angle to there, or to 80 deg from the zenith. Points
+       lower than about a third of the surface's height are ignored.
+    3. The rings are at equal steps between the first and the last ray in each direction that meets the surface.
     """
     azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
     around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
@@ -255,49 +283,20 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
         half_m = np.append(inside.half_m, np.inf)
         panel_m = np.clip(radius_m * around, -half_m, half_m)
         return inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T
-    # 3. Any other surface.
-    upright = inside.lab_from_own.magnitude() == 0
-    if not (isinstance(inside, Ellipsoid) and upright and inside.rim.unbounded):
-        return visible_shell_m(inside, around)
-    # 2. Upright ellipsoid: rings of equal polar angle.
-    middle = inside.center_m[2]
-    half = inside.semi_axes_m[2]
-    lowest = max(middle, 0.35 * (middle + half))
-    polar = np.linspace(1e-3, np.arccos((lowest - middle) / half), RINGS)[:, None, None]
-    return inside.center_m + inside.semi_axes_m * (
-        np.sin(polar) * around + np.cos(polar) * up
-    )
-
-
-def visible_shell_m(inside: Surface, around: Floats) -> Floats:
-    """(RINGS, SECTORS, 3) points at which rays from the bearing meet a surface, from its upper edge to its rim.
-
-    Rays are tested in steps of a fifth of a degree, from 0 to 80 deg from the zenith. Points lower than about a third
-    of the surface's height are ignored.
-
-    Parameters
-    ----------
-    inside
-        The surface
-    around
-        (SECTORS, 3) horizontal unit vectors
-    """
-    up = np.array([0.0, 0.0, 1.0])
 
     def points_at(polar: Floats) -> Floats:
         """(..., 3) points at these polar angles (..., SECTORS)."""
         rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
-    # The first and the last of 400 polar angles in each direction at which a ray meets the surface.
-    polar = np.broadcast_to(
-        np.linspace(1e-3, np.radians(80), 400)[:, None], (400, len(around))
-    )
+    # 2. The first and the last ray in each direction that meets the surface.
+    lowest_rad = cap_rad if inside.rim.unbounded else np.radians(80)
+    polar = np.broadcast_to(np.linspace(1e-3, lowest_rad, 400)[:, None], (400, len(around)))
     height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
     on_surface = height_m > 0.35 * height_m.max()
     first = on_surface.argmax(axis=0)
     last = 399 - on_surface[::-1].argmax(axis=0)
-    # Rings of equal steps between the two.
+    # 3. Rings of equal steps between the two.
     fraction = np.linspace(0, 1, RINGS)[:, None]
     return points_at(polar[first, 0] * (1 - fraction) + polar[last, 0] * fraction)
 
