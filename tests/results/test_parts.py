@@ -146,6 +146,11 @@ def test_the_parts_table_sums_to_its_total() -> None:
     sums = [float(row[COLUMNS.index("sum")]) for row in rows[1:]]
     assert sum(sums[:-1]) == pytest.approx(sums[-1], abs=1e-9)
     assert sums[-1] == parts.total
+    groups = parts.groups()
+    assert sum(groups.values()) == pytest.approx(parts.total)
+    for group in ("shell", "survey"):
+        of_group = [line.sum for line in parts.lines if line.part.startswith(group)]
+        assert groups[group] == pytest.approx(sum(of_group))
     for row in rows[1:-1]:
         quantity, price, fixed, total = (
             float(row[COLUMNS.index(key)]) for key in ("quantity", "price", "fixed", "sum")

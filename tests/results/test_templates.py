@@ -197,5 +197,7 @@ def test_every_face_looks_inward_or_out_of_its_mark(lab: Lab) -> None:
 
 
 def test_a_sky_scene_has_no_templates() -> None:
-    with pytest.raises(InputError, match=r"light.kind: stars has no .svg; allowed: dome"):
+    with pytest.raises(
+        InputError, match=r"light.kind: stars has no templates; allowed: dome"
+    ):
         templates.template(build_lab(loader.load("shefex2")), ".svg")

@@ -222,6 +222,14 @@ class PartsList(NamedTuple):
         """Sum of all lines."""
         return round(sum(line.sum for line in self.lines), 2)
 
+    def groups(self) -> dict[str, float]:
+        """The sums of shell, survey and all else; they add up to the total."""
+        groups = dict.fromkeys(("shell", "LEDs and electronics", SURVEY), 0.0)
+        for line in self.lines:
+            kind = line.part.partition("_")[0]
+            groups[kind if kind in groups else "LEDs and electronics"] += line.sum
+        return {name: round(value, 2) for name, value in groups.items()}
+
 
 class DomeDesign(NamedTuple):
     """A dome as designed: what the functions of this module count."""

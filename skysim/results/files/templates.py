@@ -180,16 +180,21 @@ class Dome(NamedTuple):
 
 def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
+    return TEMPLATES[ending](dome_of(lab))
+
+
+def dome_of(lab: Lab) -> Dome:
+    """The dome that a scene's builder makes. Raises InputError without a dome."""
     light = lab.scene.dome
     if light is None:
-        raise InputError("light.kind", f"{lab.scene.light.kind} has no {ending}", "dome")
+        raise InputError("light.kind", f"{lab.scene.light.kind} has no templates", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
     # Boards stand out.
     cap_deg = max(
         float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
     )
-    dome = Dome(
+    return Dome(
         lab.scene.name,
         surface,
         cap_deg,
@@ -197,7 +202,6 @@ def template(lab: Lab, ending: str) -> str:
         leds.place[:, :3],
         light.led.disk_diameter_m / 2,
     )
-    return TEMPLATES[ending](dome)
 
 
 def at(surface: Surface, rays: Floats) -> Floats:
@@ -232,49 +236,76 @@ def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     return np.column_stack([x_m, y_m])
 
 
-def gore_count(surface: Surface, cap_deg: float) -> int:
-    """The least number of gores of which none is wider than MAX_WIDTH_M."""
-    tilt_rad = np.radians(np.arange(1, cap_deg + 1))
+def gore_count(dome: Dome, widest_m: float = MAX_WIDTH_M) -> int:
+    """The least number of gores of which none is wider than a sheet, nor than MAX_WIDTH_M."""
+    tilt_rad = np.radians(np.arange(1, dome.cap_deg + 1))
     azimuth_rad = np.radians(np.arange(0, 360, 10.0))
-    around_m = at(surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij")))
+    around_m = at(
+        dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    )
     ring_m = float(np.hypot(around_m[..., 0], around_m[..., 1]).max())
-    return max(LEAST_GORES, math.ceil(2 * math.pi * ring_m / MAX_WIDTH_M))
+    return max(LEAST_GORES, math.ceil(2 * math.pi * ring_m / min(widest_m, MAX_WIDTH_M)))
+
+
+class Gore(NamedTuple):
+    """A gore at full scale, its apex up and at the origin, seen from inside the dome; x to the right and y down, mm."""
+
+    outline_mm: Floats
+    shapes: list[Shape]
+
+
+def gore(dome: Dome, number: int, count: int) -> Gore:
+    """Gore `number`, from 0, of `count`: outline, meridian, title, a circle and a number for each LED."""
+    rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
+    turns = np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)
+    own = np.rint(turns).astype(int) % count == number
+    meridian_rad = 2 * math.pi / count * number
+    edge = outline(meridian_rad, math.pi / count, dome.cap_deg)
+    outline_mm, leds_mm = (
+        1e3 * FROM_INSIDE * on_paper_m(dome.surface, some, meridian_rad)
+        for some in (edge, rays[own])
+    )
+    shapes = [
+        *gore_shapes(outline_mm, f"{number + 1}: {math.degrees(meridian_rad):.4g} deg"),
+        *marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m),
+    ]
+    return Gore(outline_mm, shapes)
+
+
+def moved(shape: Shape, x_mm: float, y_mm: float) -> Shape:
+    """A shape that is moved."""
+    if isinstance(shape, Polyline):
+        return shape._replace(xy_mm=np.add(shape.xy_mm, (x_mm, y_mm)))
+    return shape._replace(x_mm=shape.x_mm + x_mm, y_mm=shape.y_mm + y_mm)
 
 
 def gores(dome: Dome) -> Drawing:
-    """The gores of a dome side by side at full scale, apex up, seen from inside the dome.
-
-    Every LED is a circle of its diameter with its number; a line of RULE_MM tells whether the print is to scale.
-    """
-    count = gore_count(dome.surface, dome.cap_deg)
-    rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
-    nearest = (
-        np.rint(np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)).astype(int) % count
-    )
+    """The gores of a dome side by side at full scale; a line of RULE_MM tells whether the print is to scale."""
+    count = gore_count(dome)
     shapes = list[Shape]()
     left_mm = MARGIN_MM
     bottom_mm = 0.0
-    for gore in range(count):
-        own = nearest == gore
-        meridian_rad = 2 * math.pi / count * gore
-        outline_mm, leds_mm = (
-            1e3 * on_paper_m(dome.surface, some, meridian_rad)
-            for some in (outline(meridian_rad, math.pi / count, dome.cap_deg), rays[own])
-        )
-        shift_mm = np.array([left_mm + outline_mm[:, 0].max(), MARGIN_MM + CAPTION_MM])
-        outline_mm = shift_mm + FROM_INSIDE * outline_mm
-        leds_mm = shift_mm + FROM_INSIDE * leds_mm
-        shapes += gore_shapes(outline_mm, f"{gore + 1}: {math.degrees(meridian_rad):.4g} deg")
-        shapes += marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m)
-        left_mm += float(np.ptp(outline_mm[:, 0])) + GAP_MM
-        bottom_mm = max(bottom_mm, float(outline_mm[:, 1].max()))
+    for number in range(count):
+        one = gore(dome, number, count)
+        half_mm = float(one.outline_mm[:, 0].max())
+        top_mm = MARGIN_MM + CAPTION_MM
+        shapes += [moved(shape, left_mm + half_mm, top_mm) for shape in one.shapes]
+        left_mm += 2 * half_mm + GAP_MM
+        bottom_mm = max(bottom_mm, top_mm + float(one.outline_mm[:, 1].max()))
     rule_mm = bottom_mm + CAPTION_MM
-    caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top. To scale if this line is {RULE_MM:g} mm."
-    shapes += [
-        Polyline(np.array([[MARGIN_MM, rule_mm], [MARGIN_MM + RULE_MM, rule_mm]])),
-        SheetText(MARGIN_MM, rule_mm + 6, 5.0, caption),
-    ]
+    caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top"
+    shapes += scale_line(MARGIN_MM, rule_mm, caption)
     return Drawing(left_mm - GAP_MM + MARGIN_MM, rule_mm + CAPTION_MM + MARGIN_MM, shapes)
+
+
+def scale_line(x_mm: float, y_mm: float, caption: str) -> list[Shape]:
+    """A line of RULE_MM, which is to be measured after printing, and a caption under it."""
+    return [
+        Polyline(np.array([[x_mm, y_mm], [x_mm + RULE_MM, y_mm]])),
+        SheetText(
+            x_mm, y_mm + 6, 5.0, f"{caption}. To scale if this line is {RULE_MM:g} mm."
+        ),
+    ]
 
 
 def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:

@@ -54,25 +54,36 @@ def scenes_export(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Output file, .xml; of a dome .csv (LEDs), .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+            help="Output file, .xml; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj; default: out/SCENE.xml."
         ),
     ] = None,
+    paper: Annotated[
+        str,
+        typer.Option(
+            help="Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page)."
+        ),
+    ] = "a4",
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
     """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
 
-    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale to print (.svg) or to cut (.dxf), or
-    the shell with a mark at each LED as a mesh (.obj).
+    The builder gets a list of the LEDs (.csv), a pattern of gores at full scale on pages (.pdf), in one drawing to
+    print (.svg) or to cut (.dxf), or the shell with a mark at each LED as a mesh (.obj).
     """
     from skysim.core import files
-    from skysim.results.files import templates
+    from skysim.results.files import gore_pages, templates
     from skysim.simulation.lab import build_lab
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
     lab = build_lab(loaded)
     use = f"python -m mujoco.viewer --mjcf={path}"
+    if path.suffix.lower() == ".pdf":
+        files.make_folder(path.parent)
+        count = gore_pages.write_pdf(path, templates.dome_of(lab), paper)
+        print(f"{path}: {count} pages; print them at 100 %")
+        return
     if path.suffix.lower() == ".csv":
         text, cap_deg = lab.export_leds()
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
@@ -112,7 +123,8 @@ def scenes_parts(
         files.make_folder(out.parent)
         files.write_text(out, parts.to_csv(found, loaded.name))
     if json:
-        print_json({"parts": [line._asdict() for line in found.lines], "total": found.total})
+        lines = [line._asdict() for line in found.lines]
+        print_json({"parts": lines, "groups": found.groups(), "total": found.total})
         return
     rows = [
         *map(parts.cells, found.lines),
@@ -123,6 +135,11 @@ def scenes_parts(
         for head in parts.COLUMNS
     ]
     print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
+    shares = [
+        f"{name} {cost:.2f} ({cost / max(found.total, 0.01):.0%})"
+        for name, cost in found.groups().items()
+    ]
+    print(f"Of the total: {', '.join(shares)}")
 
 
 def new(
