@@ -13,7 +13,7 @@ import bisect
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -202,27 +202,15 @@ def without_resampling(values: Floats, value: float) -> Summary:
     )
 
 
-def mean_of(values: Floats) -> Summary:
-    """The mean with its bootstrap interval: that of `resampled`, or beyond MANY_VALUES of `bootstrap_of_many`."""
-    return (
-        bootstrap_of_few(values) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
-    )
-
-
-def rms_of(values: Floats) -> Summary:
-    """The RMS likewise: the root of the mean of the squares, and of the ends of its interval."""
+def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
+    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`."""
     if len(values) <= MANY_VALUES:
-        return bootstrap_of_few(np.square(values), np.sqrt)
-    squares = bootstrap_of_many(np.square(values))
-    return Summary(
-        math.sqrt(squares.value),
-        math.sqrt(squares.low),
-        math.sqrt(squares.high),
-        squares.trials,
-    )
+        return bootstrap_of_few(values, function)
+    mean, low, high, count, _ = bootstrap_of_many(values)
+    return Summary(*map(float, function([mean, low, high])), count)
 
 
-def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
+def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
     """A function of the mean, with the interval of `resampled` from the same draws.
 
     A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
@@ -340,6 +328,24 @@ def values_for_quantile(probability: float) -> int:
     return count
 
 
+def tolerance_limit(values: Floats, probability: float) -> Summary:
+    """The upper tolerance limit: with CONFIDENCE at least this share of all values is below it, whatever their law.
+
+    It is the least order statistic X_(s) that exceeds the quantile q with CONFIDENCE (Wilks 1941; David & Nagaraja
+    2003, section 7.2),
+
+        P(X_(s) >= q) = B(s - 1),    B the distribution function of Bin(n, p),
+
+    of 59 values the largest at 95 % ("95/95"), of 93 the second largest. Fewer have none: NaN, and `needs`.
+    """
+    count = len(values)
+    rank = int(scipy.stats.binom.ppf(CONFIDENCE, count, probability))  # s - 1
+    if rank == count:
+        needs = trials_needed(1 - probability) - count
+        return Summary(math.nan, math.nan, math.nan, count, needs)
+    return Summary(float(np.partition(values, rank)[rank]), math.nan, math.nan, count)
+
+
 def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:
     """The largest or smallest value of these trials, without an interval."""
     return Summary(float(reduce(values)), math.nan, math.nan, len(values))
@@ -362,15 +368,18 @@ DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
 QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
+# Others by their digits: p997 is the quantile at 0.997, tol99 the tolerance limit of 99 %.
+QUANTILE = re.compile(r"(?:p|tol)(?!0+$)(\d{2,5})$")
 # The ending of a response name such as `cross_arcsec_p95`.
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
-    "rms": rms_of,
+    "rms": lambda values: mean_of(np.square(values), np.sqrt),
     "sd": lambda values: resampled(values, sample_std),
     **{
         name: lambda values, share=share: quantile(values, share)  # type: ignore[misc]
         for name, share in QUANTILES.items()
     },
+    "tol95": lambda values: tolerance_limit(values, 0.95),
     "worst": lambda values: extremum(values, np.max),
     "least": lambda values: extremum(values, np.min),
 }
@@ -496,6 +505,16 @@ PROPORTIONS: dict[str, Response] = {
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
+WITHIN = re.compile(r"right_within(?:_(?:cross|roll|angle)_arcsec_\d+(?:\.\d+)?)+$")
+LIMIT = re.compile(r"((?:cross|roll|angle)_arcsec)_([\d.]+)")
+OVER = re.compile(r"(\w+)_over_(\d[\d.e+-]*)$")
+
+
+def right_within(name: str, c: Columns) -> NDArray[Any]:
+    """(N,) whether each trial is solved in all frames, none of them wrong, with errors up to the limits in a name."""
+    right = (c["frames"] > 0) & (c["solved"] == c["frames"]) & (c["wrong"] == 0)
+    within = [QUANTITIES[error](c) <= float(limit) for error, limit in LIMIT.findall(name)]
+    return np.all([right, *within], axis=0)
 
 
 def response(name: str, where: str = "response") -> Response:
@@ -524,6 +543,10 @@ def response(name: str, where: str = "response") -> Response:
         Proportion of the solutions with an error far outside their covariance
     failed
         Proportion of the trials that raised an exception
+    right_within_ERROR_LIMIT, QUANTITY_over_LIMIT
+        Proportion of the trials that are right, with errors up to limits: right_within_cross_arcsec_10_roll_arcsec_60
+        (of a flight: all frames solved, none wrong, and the RMS within), and of the values above a limit:
+        cross_arcsec_over_60
     coverage_N
         Proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     nees, centroid_px, streak_px
@@ -536,29 +559,53 @@ def response(name: str, where: str = "response") -> Response:
         return lambda c: proportion(
             np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0)
         )
+    if WITHIN.match(name):
+        return lambda c: proportion(np.sum(right_within(name, c)), np.sum(c["frames"] > 0))
     quantity, statistic = split_name(name)
     if (quantity, statistic) == ("nees", "mean"):
         return mean_nees
-    if quantity not in QUANTITIES or statistic not in STATISTICS:
+    summary_of = statistic_of(statistic)
+    if quantity not in QUANTITIES or summary_of is None:
         raise InputError(
             where,
             f"unknown response {name!r}",
             f"{', '.join(PROPORTIONS)}, coverage, coverage_N, {', '.join(DEFAULT_STATISTICS)}, or one of"
-            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}",
+            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}, or right_within_cross_arcsec_10 or"
+            " cross_arcsec_over_60 with limits",
         )
 
     def summarize(columns: Columns) -> Summary:
         values = QUANTITIES[quantity](columns)
         values = values[np.isfinite(values)].astype(float)
-        return STATISTICS[statistic](values) if len(values) else NO_VALUE
+        return summary_of(values) if len(values) else NO_VALUE
 
     return summarize
+
+
+def statistic_of(name: str) -> Callable[[Floats], Summary] | None:
+    """The statistic with a name such as mean, p95, tol99 or over_60; None if there is none."""
+    probability = probability_of(name)
+    if probability is not None:
+        function = tolerance_limit if name.startswith("tol") else quantile
+        return partial(function, probability=probability)
+    if name.startswith("over_"):
+        limit = float(name.removeprefix("over_"))
+        return lambda values: proportion(np.sum(values > limit), len(values))
+    return STATISTICS.get(name)
+
+
+def probability_of(statistic: str) -> float | None:
+    """The probability of a quantile or a tolerance limit: 0.95 of p95 and tol95; None of other statistics."""
+    match = QUANTILE.match(statistic)
+    return float(f"0.{match[1]}") if match else QUANTILES.get(statistic)
 
 
 def split_name(name: str) -> tuple[str, str]:
     """Quantity and statistic of a response such as `cross_arcsec_p95`; empty quantity for a proportion."""
     if name in DEFAULT_STATISTICS:
         return name, DEFAULT_STATISTICS[name]
+    if match := OVER.match(name):
+        return match[1], f"over_{match[2]}"
     quantity, _, statistic = name.rpartition("_")
     return quantity, statistic
 
@@ -567,6 +614,6 @@ def is_proportion(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
     return (
         name in PROPORTIONS
-        or bool(COVERAGE.match(name))
+        or any(kind.match(name) for kind in (COVERAGE, WITHIN, OVER))
         or split_name(name)[0] == "availability"
     )

@@ -13,13 +13,14 @@ import numpy as np
 from skysim.core.files import make_folder, write_image, write_table
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
-from skysim.results import run_report, scoring, telemetry_report
+from skysim.results import requirements, run_report, scoring, telemetry_report
 from skysim.results.files.recording import remove_results, write_frame
 from skysim.results.plots import annotate_truth
 from skysim.results.report import Report
 from skysim.results.scoring import Score, image_tag
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
+from skysim.simulation.checks.facts import drawn_once
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.tracking.computer_time import computer_text, on_computer
@@ -123,6 +124,7 @@ class Recorder:
         ]
         motion = telemetry_report.summary(log)
         flown = telemetry_report.findings(log)
+        judged = requirements.of_run(scene.require, self.rows, drawn_once(plan.facts))
         report = run_report.run_report(
             scene.title,
             command,
@@ -137,6 +139,7 @@ class Recorder:
             views=pictures,
             facts=facts,
             findings=plan.findings,
+            judged=judged,
         )
         report.save(page)
         statistics = run_report.summary(self.rows) | {
@@ -148,6 +151,7 @@ class Recorder:
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
             "findings": plan.findings,
             "flight_findings": flown,
+            **({"requirements": [one._asdict() for one in judged]} if judged else {}),
         }
         return statistics, report
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import html
 import math
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -123,6 +124,26 @@ class HeadConfig(ConfigModel):
     exposure: ExposureConfig | None = None
 
 
+ANGLES = "(cross|roll|angle)_arcsec"
+SHARES = rf"identified|refused|wrong|right_within(_{ANGLES}_\d+(\.\d+)?)+"
+REQUIREMENTS = rf"{SHARES}|{ANGLES}_(median|(p|tol)(?!0+$)\d{{2,5}})"
+
+
+def check_requirements(require: dict[str, float]) -> dict[str, float]:
+    """Check the names of requirements, and that the limit of a proportion is below 1. Raises InputError."""
+    for name, limit in require.items():
+        if not re.fullmatch(REQUIREMENTS, name):
+            raise InputError(
+                name,
+                "not a requirement",
+                "a quantile of an error (cross_arcsec_p95, roll_arcsec_median, angle_arcsec_p99), identified, wrong,"
+                " refused, right_within_cross_arcsec_10",
+            )
+        if limit >= 1 and re.fullmatch(SHARES, name):
+            raise InputError(name, f"{limit:g}", "a share between 0 and 1")
+    return require
+
+
 MAX_HEADS = 8
 # Sections of a head, whose keys override those of the main camera.
 HEAD_SECTIONS = ("camera", "tracker", "exposure")
@@ -147,7 +168,15 @@ class SceneKind(ModelMetaclass):
 
 
 class Scene(ConfigModel, metaclass=SceneKind):
-    """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker."""
+    """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker.
+
+    Attributes
+    ----------
+    require
+        Requirements on the frames: greatest median or quantile of an error (`cross_arcsec_p95: 60`), greatest share
+        of `wrong` or `refused`, least share of `identified` or of frames that are right with errors within limits
+        (`right_within_cross_arcsec_10: 0.99`)
+    """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
@@ -166,6 +195,9 @@ class Scene(ConfigModel, metaclass=SceneKind):
     tracker: TrackerConfig = TrackerConfig()
     filter: FilterConfig | None = None
     heads: Annotated[tuple[HeadConfig, ...], Field(max_length=MAX_HEADS)] = ()
+    require: Annotated[dict[str, Positive], AfterValidator(check_requirements)] = Field(
+        default_factory=dict
+    )
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
     # Keys of the vehicle that the loader took from a base with another vehicle.model.
     _inherited: tuple[str, ...] = ()

@@ -33,6 +33,7 @@ from skysim.core.units import (
     InnerFraction,
     NotNegative,
     Number,
+    Positive,
     PositiveInt,
     Seed,
     Triple,
@@ -418,6 +419,10 @@ class Study(ConfigModel):
         kind, not for one of them
     responses
         Names that `metrics.response` accepts
+    require
+        Requirements at every point, by default those of the scene: greatest quantile of an error
+        (`cross_arcsec_p95: 60`), greatest share of an event (`wrong: 0.001`), least share of `identified`, `coverage_N`
+        or `right_within_cross_arcsec_10`
     """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
@@ -437,6 +442,7 @@ class Study(ConfigModel):
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
+    require: dict[str, Positive] = Field(default_factory=dict)
     optimize: Search | None = None
 
     @model_validator(mode="before")

@@ -45,7 +45,7 @@ from skysim.experiments.study.plan import (
     make_plan,
     resolve_point,
 )
-from skysim.results import metrics
+from skysim.results import metrics, requirements
 from skysim.scene import unused
 from skysim.scene.scene import Scene, ephemeris_problem
 from skysim.scene.sections.light import CollimatedDisplayConfig
@@ -148,7 +148,11 @@ def check(plan: Plan, to_run: bool) -> None:
     for n, name in enumerate(study.responses):
         metrics.response(name, f"responses.{n}")
     check_figures(plan)
+    for item in study.require.items():
+        requirements.requirement(*item)
     if study.optimize:
+        if study.require:
+            raise InputError("require", "has no effect in a search", "optimize.constraints")
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise InputError(
@@ -321,6 +325,7 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
     """Raise InputError for a response that no trial of the study measures."""
     where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
     where |= {one.response: key for key, one in named_sections(study)}
+    where |= {name: f"require.{name}" for name in study.require}
     for name, key in where.items():
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):

@@ -157,7 +157,7 @@ def format_level(value: Any) -> str:
 def format_summary(summary: Summary) -> str:
     """Text of a statistic with its interval, or with the number of further values that it needs to have one."""
     if np.isnan(summary.value):
-        return "-"
+        return f"needs {summary.needs} more values" if summary.needs else "-"
     value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
     if summary.needs:
         return f"{value:.3g} (needs {summary.needs} more values)"
@@ -217,6 +217,7 @@ def with_levels(rows: Rows, levels: dict[str, Array]) -> Rows:
 # Error budget: Sobol indices of the attitude error for each factor (Sobol 1993).
 
 
+OFF = ("off", "none", "no", "exact", "false", "0")
 AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}
 RESAMPLES = 200
 
@@ -234,9 +235,59 @@ class Index(NamedTuple):
     rms_arcsec: float
 
 
+def is_off(level: Value) -> bool:
+    """Whether a level switches a cause of errors off: zero, false, or a name in OFF."""
+    return same(level, 0) or format_level(level).partition(" ")[0].lower() in OFF
+
+
+def switches_causes(study: Study) -> bool:
+    """Whether the factors are causes of errors, each off or on, in a design with levels."""
+    levels = [
+        [is_off(one) for one, _ in factor.options()] for factor in study.factors.values()
+    ]
+    return not is_sampled(study) and all(sorted(one) == [False, True] for one in levels)
+
+
+def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
+    """The share of each cause in the mean square of one error with all causes on, and of the rest.
+
+    Mean squares of independent causes add up,
+
+        E[e^2] = v_0 + sum of v_i over the causes i that are on,
+
+    so v is fitted by least squares to the mean squares at the points; a share is v_i / sum v. Its interval is the
+    percentile bootstrap over the replicates, which are the same draws at all points of a paired study; none of fewer
+    than MIN_VALUES.
+    """
+    squares = complete_outputs(plan, store, AXES[response]) ** 2
+    names = [*plan.study.factors, "the rest"]
+    if not len(squares):
+        return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
+    on = [
+        [*(not is_off(one) for one in point.levels.values()), True] for point in plan.points
+    ]
+    drawn = random_stream(1).integers(len(squares), size=(RESAMPLES, len(squares)))
+    means = np.concatenate([[squares.mean(axis=0)], squares[drawn].mean(axis=1)])
+    parts = np.linalg.lstsq(np.array(on, float), means.T)[0]
+    shares = parts / parts.sum(axis=0)
+    ends = np.quantile(shares[:, 1:], metrics.TAILS, axis=1).T
+    ends[:] = ends if len(squares) >= MIN_VALUES else np.nan
+    sizes = np.sqrt(np.maximum(parts[:, 0], 0) * len(AXES[response]))
+    return [
+        Index(name, response, NO_VALUE, Summary(share, *interval, len(squares)), size)
+        for name, share, interval, size in zip(
+            names, shares[:, 0].tolist(), ends.tolist(), sizes.tolist(), strict=True
+        )
+    ]
+
+
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
+    if switches_causes(plan.study):
+        return [
+            index for response in AXES for index in switched_causes(plan, store, response)
+        ]
     if kind != "saltelli" or plan.study.optimize:
         raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
     return [index for response in AXES for index in response_indices(plan, store, response)]
@@ -274,10 +325,21 @@ def sample_outputs(
 ) -> tuple[Floats, Floats, Floats]:
     """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
 
-    There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
-    trials has no solution or is not done yet.
+    There are N sample rows, D factors and S outputs, see `complete_outputs`.
     """
     width = len(plan.study.factors)
+    complete = complete_outputs(plan, store, axes)
+    # Points are in the order A, B, AB_1 .. AB_D.
+    rows = len(plan.points) // (width + 2)
+    blocks = complete.reshape(len(complete), width + 2, rows)
+    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+
+
+def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:
+    """(S, P) errors at the points: S outputs, one per axis and replicate.
+
+    A replicate is left out if any of its trials has no solution or is not done yet.
+    """
     each = plan.study.replicates
     columns = store.columns()
     values = np.full((len(axes), plan.trials), np.nan)
@@ -285,11 +347,7 @@ def sample_outputs(
     # Trial number = point * replicates + replicate.
     by_point = values.reshape(len(axes), len(plan.points), each)
     outputs = by_point.transpose(0, 2, 1).reshape(len(axes) * each, -1)
-    complete = outputs[np.isfinite(outputs).all(axis=1)]
-    # Points are in the order A, B, AB_1 .. AB_D.
-    rows = len(plan.points) // (width + 2)
-    blocks = complete.reshape(len(complete), width + 2, rows)
-    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+    return outputs[np.isfinite(outputs).all(axis=1)]
 
 
 def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
@@ -377,7 +435,7 @@ def label(name: str, unit: str = "") -> str:
     """Readable name with its unit in brackets: `cross_arcsec_p95` becomes "cross p95 [arcsec]"."""
     stem, _, statistic = name.rpartition("_")
     tail = f" {statistic}"
-    if statistic not in metrics.STATISTICS:
+    if not stem or metrics.statistic_of(statistic) is None:
         stem, tail = name, ""
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
     unit = unit or UNITS.get(ending, "")

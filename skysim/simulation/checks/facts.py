@@ -6,12 +6,14 @@ Each function in `FACTS` returns one fact from the context and the samples, or N
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
@@ -32,6 +34,7 @@ SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the fi
 MIN_SHARE = 0.005  # least share of the variance of a cause that is printed
 ARCSEC = "″"
 TRACKER_KNOWS = "tracker knows"
+EXPECTED = "expected error"
 UNTESTED = (
     "matches accepted by the thesis's rule, not tested against chance (tracker.acceptance)"
 )
@@ -466,7 +469,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         lines.append(
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
         )
-    return Fact("expected error", lines, values)
+    return Fact(EXPECTED, lines, values)
 
 
 def errors_text(cross: float, roll: float) -> str:
@@ -478,8 +481,67 @@ def errors_text(cross: float, roll: float) -> str:
     )
 
 
+EQUALLY_LIKELY = (np.arange(1000) + 0.5) / 1000
+# Errors about the boresight's axes of 1 sigma each in 1000 equally likely draws: Rayleigh's law of the length of two
+# equal normal ones, of which cross is the root sum square, and the magnitude of a normal one.
+UNIT_ERRORS = {
+    "cross": np.sqrt(-np.log(EQUALLY_LIKELY)),
+    "roll": special.ndtri(
+        (1 + np.mod(EQUALLY_LIKELY * len(EQUALLY_LIKELY) * attitudes.GOLDEN_RATIO, 1)) / 2
+    ),
+}
+
+
+def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
+    """The expected value of each required error or share at the frames; None without requirements.
+
+    The errors are normal with the expected variances, those about both axes across the boresight equal.
+    """
+    error = samples.frames.error
+    cross, roll = (
+        np.outer(np.sqrt(error.total(angle)), unit) / ARCSEC_RAD
+        for angle, unit in UNIT_ERRORS.items()
+    )
+    sizes = {"cross": cross, "roll": roll, "angle": np.hypot(cross, roll)}
+    lines = []
+    values: dict[str, Any] = {}
+    for name, limit in context.lab.scene.require.items():
+        limits = re.findall(r"(cross|roll|angle)_arcsec_([\d.]+)", name)
+        match = re.fullmatch(r"(cross|roll|angle)_arcsec_(?:median|[a-z]+(\d+))", name)
+        expected = math.nan
+        text = "not forecast; `skysim run` and `skysim study` show it"
+        if match and not np.isnan(cross).all():
+            share = float(f"0.{match[2] or 5}")
+            expected = float(np.nanquantile(sizes[match[1]], share))
+            met = "" if expected <= limit else "not "
+            text = f"expected {met}to be met: {short(expected)}{ARCSEC} of {limit:g}{ARCSEC}"
+        elif limits:
+            within = [sizes[angle] <= float(most) for angle, most in limits]
+            expected = float(np.all(within, axis=0).mean())
+            met = "" if expected >= limit else "not "
+            text = f"expected {met}to be met: {100 * expected:.3g} % of at least {100 * limit:g} %"
+        lines.append(f"{name}: {text}")
+        values[name] = {"limit": limit, "expected": expected}
+    return Fact("requirements", lines, values) if lines else None
+
+
 # Causes of the expected error that are drawn with the survey.
 SURVEYED = ("LED survey", "survey set-up", "common survey", "lever survey", "surface survey")
+
+
+def drawn_once(facts: Sequence[Fact]) -> float:
+    """Share of the expected variance at the frames by errors that a run draws once, of cross or roll; 1 if unknown."""
+    values = {fact.name: fact.values for fact in facts}
+    if EXPECTED not in values:
+        return 1.0
+    once = {*SURVEYED, *(["focal length"] if values[TRACKER_KNOWS]["focal_sigma"] else [])}
+    shares = []
+    for angle in ("cross", "roll"):
+        sizes = values[EXPECTED]["frames"][f"{angle}_causes_arcsec"]
+        total = math.fsum(size**2 for size in sizes.values())
+        drawn = math.fsum(size**2 for name, size in sizes.items() if name in once)
+        shares.append(drawn / total if total else 1.0)
+    return max(shares)
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
@@ -520,4 +582,5 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     depth_of_focus,
     tracker_beliefs,
     expected_error,
+    requirements,
 )

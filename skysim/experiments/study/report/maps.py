@@ -129,7 +129,7 @@ def least_values(response: str) -> int:
     Of 1 / (1 - p) values one exceeds the quantile p, of 1 / p one is below it. With fewer values the quantile is about
     the largest or the smallest one.
     """
-    share = metrics.QUANTILES.get(metrics.split_name(response)[1], 0.5)
+    share = metrics.probability_of(metrics.split_name(response)[1]) or 0.5
     return max(MIN_VALUES, math.ceil(round(1 / min(share, 1 - share), 9)))
 
 
