@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
     Distribution,
@@ -249,35 +249,60 @@ def switches_causes(study: Study) -> bool:
 
 
 def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
-    """The share of each cause in the mean square of one error with all causes on, and of the rest.
+    """The part of each cause, and of the rest, in the mean square m of one error with all causes on.
 
-    Mean squares of independent causes add up,
+    Its first index is what it adds alone, its total one what goes without it,
 
-        E[e^2] = v_0 + sum of v_i over the causes i that are on,
+        (m({i}) - m({})) / m(all),    (m(all) - m(all but i)) / m(all),
 
-    so v is fitted by least squares to the mean squares at the points; a share is v_i / sum v. Its interval is the
-    percentile bootstrap over the replicates, which are the same draws at all points of a paired study; none of fewer
-    than MIN_VALUES.
+    which are equal if the errors are independent and the tracker weights lights alike. NaN without these points; without
+    that of all causes m(all) is the sum m({}) + sum of m({i}) - m({}). The intervals are of the percentile bootstrap
+    over replicates, none of fewer than MIN_VALUES.
     """
     squares = complete_outputs(plan, store, AXES[response]) ** 2
     names = [*plan.study.factors, "the rest"]
-    if not len(squares):
-        return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
-    on = [
-        [*(not is_off(one) for one in point.levels.values()), True] for point in plan.points
-    ]
-    drawn = random_stream(1).integers(len(squares), size=(RESAMPLES, len(squares)))
+    count = len(squares)
+    drawn = random_stream(1).integers(max(count, 1), size=(RESAMPLES, count))
     means = np.concatenate([[squares.mean(axis=0)], squares[drawn].mean(axis=1)])
-    parts = np.linalg.lstsq(np.array(on, float), means.T)[0]
-    shares = parts / parts.sum(axis=0)
-    ends = np.quantile(shares[:, 1:], metrics.TAILS, axis=1).T
-    ends[:] = ends if len(squares) >= MIN_VALUES else np.nan
-    sizes = np.sqrt(np.maximum(parts[:, 0], 0) * len(AXES[response]))
+    points = np.array(
+        [[not is_off(one) for one in each.levels.values()] for each in plan.points]
+    )
+
+    def weight(on: Bools) -> Floats:
+        """(P,) weights of the points in the mean square with some causes on."""
+        there = np.all(points == on, axis=1)
+        return there / (there.sum() or np.nan)
+
+    one = np.eye(len(points[0]), dtype=bool)
+    none = weight(~one.any(axis=0))
+    alone = [weight(on) - none for on in one]
+    every = weight(one.any(axis=0))
+    if np.isnan(every).any():
+        every = none + sum(alone)
+    without = [every - weight(~on) for on in one]
+    weights = np.array([[*alone, none], [*without, np.nan * none]])
+    shares = weights @ means.T / (every @ means.T)
+    ends = np.quantile(shares[..., 1:], metrics.TAILS, axis=-1)
+    ends[...] = ends if count >= MIN_VALUES else np.nan
+    sigma_arcsec = math.sqrt(every @ means[0] * len(AXES[response]))
+    return to_indices(names, response, [shares[..., 0], *ends], count, sigma_arcsec)
+
+
+def to_indices(
+    names: Sequence[str],
+    response: str,
+    estimates: Sequence[Floats],
+    count: int,
+    sigma_arcsec: float,
+) -> list[Index]:
+    """The indices of factors from (2, D) first and total values and their ends."""
+    first, total = (
+        [Summary(*one, count) for one in index]
+        for index in np.stack(estimates, axis=-1).tolist()
+    )
     return [
-        Index(name, response, NO_VALUE, Summary(share, *interval, len(squares)), size)
-        for name, share, interval, size in zip(
-            names, shares[:, 0].tolist(), ends.tolist(), sizes.tolist(), strict=True
-        )
+        Index(name, response, one, other, sigma_arcsec * math.sqrt(max(one.value, 0.0)))
+        for name, one, other in zip(names, first, total, strict=True)
     ]
 
 
@@ -306,18 +331,10 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     selections = rng.integers(count, size=(RESAMPLES, count))
     resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
     low, high = np.quantile(resampled, metrics.TAILS, axis=0)
-    first, total = (
-        [Summary(value, least, most, count) for value, least, most in index]
-        for index in np.stack([estimate, low, high], axis=-1).tolist()
-    )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
     variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
     sigma_arcsec = math.sqrt(variance)
-    found = []
-    for name, one, other in zip(names, first, total, strict=True):
-        alone_arcsec = sigma_arcsec * math.sqrt(max(one.value, 0.0))
-        found.append(Index(name, response, one, other, alone_arcsec))
-    return found
+    return to_indices(names, response, [estimate, low, high], count, sigma_arcsec)
 
 
 def sample_outputs(

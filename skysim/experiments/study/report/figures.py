@@ -424,7 +424,7 @@ def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None
 
 
 def indices_png(indices: Sequence[Index], response: str) -> bytes:
-    """Bar chart of the indices of one response, largest total first, as PNG; of causes with total shares alone."""
+    """Bar chart of the first-order and total indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
     return png(
@@ -433,18 +433,15 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
 
 
 def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
-    """Draw the bars of each factor, with their intervals."""
+    """Draw two bars per factor, with their intervals."""
     axes = fig.subplots()
     rows = np.arange(len(selected))
-    kinds = {"first order": INK[0], "total": GRAY}
-    if all(np.isnan(one.first.value) for one in selected):
-        kinds = {"total": INK[0]}
-    width = 0.76 / len(kinds)
-    for n, (name, ink) in enumerate(kinds.items()):
-        parts = [getattr(one, name.partition(" ")[0])[:3] for one in selected]
+    for shift, name, ink, parts in (
+        (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
+        (0.19, "total", GRAY, [one.total[:3] for one in selected]),
+    ):
         value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
-        shift = width * (n + 0.5) - 0.38
-        axes.barh(rows + shift, np.nan_to_num(value), 0.95 * width, color=ink, label=name)
+        axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
         ends = np.clip([low, high], -9, 9)
         axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
     bounds = np.array(
@@ -458,8 +455,7 @@ def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
     axes.set_ylim(len(selected) - 0.4, -0.6)
     axes.grid(False, axis="y")
     axes.set_xlabel(f"share of the variance, {label(response).partition(' [')[0]}")
-    if len(kinds) > 1:
-        fig.legend(loc="outside right upper")
+    fig.legend(loc="outside right upper")
 
 
 # Optimizations.

@@ -75,8 +75,8 @@ SOBOL = (
 )
 ERROR_CAUSES = (
     "Error causes",
-    "Causes of {}: the share of each in its mean square with all causes on, by least squares over the points, whose"
-    " mean squares add up if causes are independent; intervals of 95 %.",
+    "Causes of {}: of its mean square with all causes on, the share that each adds alone (first order), and that goes"
+    " without it (total); intervals of 95 %.",
 )
 
 
