@@ -206,8 +206,9 @@ def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Sum
     """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`."""
     if len(values) <= MANY_VALUES:
         return bootstrap_of_few(values, function)
-    mean, low, high, count, _ = bootstrap_of_many(values)
-    return Summary(*map(float, function([mean, low, high])), count)
+    found = bootstrap_of_many(values)
+    value, low, high = map(float, function(found[:3]))
+    return found._replace(value=value, low=low, high=high)
 
 
 def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
@@ -340,10 +341,9 @@ def tolerance_limit(values: Floats, probability: float) -> Summary:
     """
     count = len(values)
     rank = int(scipy.stats.binom.ppf(CONFIDENCE, count, probability))  # s - 1
-    if rank == count:
-        needs = trials_needed(1 - probability) - count
-        return Summary(math.nan, math.nan, math.nan, count, needs)
-    return Summary(float(np.partition(values, rank)[rank]), math.nan, math.nan, count)
+    limit = float(np.sort(np.append(values, np.nan))[rank])  # NaN is the last
+    needs = max(trials_needed(1 - probability) - count, 0)
+    return Summary(limit, math.nan, math.nan, count, needs)
 
 
 def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:

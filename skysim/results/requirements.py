@@ -15,7 +15,6 @@ or all points of a study, are met holds at 95 % if each does (Berger 1982).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import FrameRow
 from skysim.results import metrics
 from skysim.results.metrics import Summary
+from skysim.simulation.checks.facts import REQUIREMENTS, Fact
 
 MORE = ("identified", "coverage", "right_within")  # proportions of which more is better
 MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown yet"
@@ -96,8 +96,8 @@ class Judgment(NamedTuple):
             bound = f"more than {percent(self.low)}"
         needs = f", needs {self.needs:,} draws" if self.needs else ""
         return (
-            f"{self.claim}: {self.answer}{where}{needs}: {percent(self.misses)} of {self.draws:.4g} miss it, {bound} at"
-            f" {100 * metrics.CONFIDENCE:g} % confidence, {percent(self.allowed)} allowed"
+            f"{self.claim}: {self.answer}{where}{needs}: {percent(self.misses)} of {self.draws:.4g} draws miss it,"
+            f" {bound} at {100 * metrics.CONFIDENCE:g} % confidence, {percent(self.allowed)} allowed"
         )
 
 
@@ -115,47 +115,43 @@ def judge(
     ----------
     draws
         Number of independent draws, if it is not that of the values: the effective sample size in the exact bounds
-        (Korn & Graubard 1998)
+        (Korn & Graubard 1998); their number need not be whole
     points
         Number of points of which a "not met" holds at 95 % together (Bonferroni 1936)
     """
     count = found.trials if draws is None else draws
-    share = 0.0 if math.isnan(found.value) else found.value
-    misses = 1 - share if count and one.name.startswith(MORE) else share
+    misses = float(np.nan_to_num(found.value))
+    if one.name.startswith(MORE):
+        misses = 1 - misses
     error = (1 - metrics.CONFIDENCE) / points
-    low = metrics.exact_bounds(misses * count, count, 1 - error)[0] if count else 0.0
-    high = metrics.exact_bounds(misses * count, count)[1] if count else 1.0
+    low = metrics.exact_bounds(misses * count, count, 1 - error)[0]
+    high = metrics.exact_bounds(misses * count, count)[1]
     answer = MET if high <= one.allowed else NOT_MET if low > one.allowed else NOT_SHOWN
-    needs = 0
-    if answer == NOT_SHOWN and misses <= one.allowed:
-        needs = metrics.trials_needed(one.allowed, share=misses)
-    elif answer == NOT_SHOWN:
-        needs = metrics.trials_needed(1 - one.allowed, share=1 - misses)
-    return Judgment(one.name, one.limit, answer, misses, low, high, one.allowed, count, needs)
+    # The claim that more draws would show.
+    share, limit = misses, one.allowed
+    if misses > one.allowed:
+        share, limit = 1 - misses, 1 - one.allowed
+    needs = metrics.trials_needed(limit, share=share) if answer == NOT_SHOWN else 0
+    return Judgment(*one[:2], answer, misses, low, high, one.allowed, count, needs)
 
 
 def of_run(
-    require: Mapping[str, float], rows: Sequence[FrameRow], drawn_once: float
+    require: Mapping[str, float], rows: Sequence[FrameRow], facts: Sequence[Fact]
 ) -> list[Judgment]:
     """Judge the requirements of a scene by the frames of one run.
 
     Frames have independent noise and share the errors that a run draws once, such as those of its survey. With their
-    share r of the variance, n frames count as n / (1 + (n - 1) r) independent draws (Kish 1965, section 5.4).
-
-    Parameters
-    ----------
-    drawn_once
-        r
+    share r of the variance by the facts of the check, n frames count as n / (1 + (n - 1) r) independent draws (Kish
+    1965, section 5.4); as one without this fact.
     """
-    solved = np.array([row.status == "solved" for row in rows])
-    columns = {
-        "frames": np.ones(len(rows)),
-        "solved": solved,
-        "wrong": np.array([row.wrong for row in rows]),
-        "x_arcsec": np.array([row.cross_arcsec for row in rows]),
-        "y_arcsec": np.zeros(len(rows)),
-        "roll_arcsec": np.array([row.roll_arcsec for row in rows]),
-    }
+    forecast = [fact.values["drawn_once"] for fact in facts if fact.name == REQUIREMENTS]
+    drawn_once = forecast[0] if forecast else 1.0
+    values = [
+        (1, row.status == "solved", row.wrong, row.cross_arcsec, 0, row.roll_arcsec)
+        for row in rows
+    ]
+    names = ("frames", "solved", "wrong", "x_arcsec", "y_arcsec", "roll_arcsec")
+    columns = dict(zip(names, np.array(values, float).T, strict=True))
     judged = []
     for one in (requirement(*item) for item in require.items()):
         found = metrics.response(one.response)(columns)

@@ -20,7 +20,6 @@ from skysim.results.report import Report
 from skysim.results.scoring import Score, image_tag
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
-from skysim.simulation.checks.facts import drawn_once
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.tracking.computer_time import computer_text, on_computer
@@ -124,7 +123,7 @@ class Recorder:
         ]
         motion = telemetry_report.summary(log)
         flown = telemetry_report.findings(log)
-        judged = requirements.of_run(scene.require, self.rows, drawn_once(plan.facts))
+        judged = requirements.of_run(scene.require, self.rows, plan.facts)
         report = run_report.run_report(
             scene.title,
             command,

@@ -28,7 +28,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
-from skysim.results.requirements import NOT_MET, Judgment
+from skysim.results.requirements import Judgment
 
 # Settings that help where the tracker's own refusal names none.
 HELP = {
@@ -221,8 +221,7 @@ def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
             f"{len(rows)} frames count as {draws:.3g} independent draws, for a run draws the errors of its survey"
             " once; a study draws them anew by `hardware: [tracker.survey.seed]`"
         )
-    tone: Tone = "bad" if any(one.answer == NOT_MET for one in judged) else ""
-    return Items(lines, "Requirements" if lines else "", tone)
+    return Items(lines, "Requirements" if lines else "")
 
 
 def refusals(rows: Sequence[FrameRow]) -> list[str]:

@@ -222,7 +222,10 @@ def verdict(study: Study, lines: PointRows, judged: Sequence[Sequence[Judgment]]
         return ""
     place = placer(study, done)
     frame = "attitude" if study.trial.kind == "centroids" else "frame"
-    sentences = [thresholds.requirement_brief(one) for one in judged]
+    sentences = []
+    for one in judged:
+        worst, where = thresholds.decisive(one)
+        sentences.append(f"`{one[worst].claim}` is {one[worst].answer}{where}.")
     sentences += [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
     sentences += [
         worst_share(

@@ -255,8 +255,8 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
 
         (m({i}) - m({})) / m(all),    (m(all) - m(all but i)) / m(all),
 
-    which are equal if the errors are independent and the tracker weights lights alike. NaN without these points; without
-    that of all causes m(all) is the sum m({}) + sum of m({i}) - m({}). The intervals are of the percentile bootstrap
+    which are equal if the errors are independent and the tracker weights lights alike. NaN without these points;
+    without that of all causes m(all) is m({}) + sum of m({i}) - m({}). The intervals are of the percentile bootstrap
     over replicates, none of fewer than MIN_VALUES.
     """
     squares = complete_outputs(plan, store, AXES[response]) ** 2
@@ -274,9 +274,9 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
         return there / (there.sum() or np.nan)
 
     one = np.eye(len(points[0]), dtype=bool)
-    none = weight(~one.any(axis=0))
+    none = weight(np.zeros(len(one), bool))
     alone = [weight(on) - none for on in one]
-    every = weight(one.any(axis=0))
+    every = weight(np.ones(len(one), bool))
     if np.isnan(every).any():
         every = none + sum(alone)
     without = [every - weight(~on) for on in one]
@@ -297,7 +297,7 @@ def to_indices(
 ) -> list[Index]:
     """The indices of factors from (2, D) first and total values and their ends."""
     first, total = (
-        [Summary(*one, count) for one in index]
+        [Summary(value, least, most, count) for value, least, most in index]
         for index in np.stack(estimates, axis=-1).tolist()
     )
     return [

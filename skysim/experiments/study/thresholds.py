@@ -169,19 +169,13 @@ def judged(require: Mapping[str, float], lines: PointRows) -> list[list[Judgment
 
 def decisive(found: Sequence[Judgment]) -> tuple[int, str]:
     """The point that decides on a requirement at all points, and at how many of them it has the same answer."""
-    answers = [one.answer for one in found]
-    answer = next(answer for answer in (NOT_MET, NOT_SHOWN, MET) if answer in answers)
-    same = [n for n, one in enumerate(found) if one.answer == answer]
-    worst = max(same, key=lambda n: (found[n].needs, found[n].misses))
-    if len(same) == len(found):
-        return worst, f" at all {len(found)} points" if len(found) > 1 else ""
-    return worst, f" at {len(same)} of {len(found)} points"
-
-
-def requirement_brief(found: Sequence[Judgment]) -> str:
-    """Whether a requirement is met at all points, in short."""
-    worst, where = decisive(found)
-    return f"{found[worst].claim} is {found[worst].answer}{where}."
+    order = (MET, NOT_SHOWN, NOT_MET)
+    keys = [(order.index(one.answer), one.needs, one.misses) for one in found]
+    worst = keys.index(max(keys))
+    same = sum(key[0] == keys[worst][0] for key in keys)
+    if len(found) == 1:
+        return worst, ""
+    return worst, f" at {'all' if same == len(found) else f'{same} of'} {len(found)} points"
 
 
 def requirement_text(found: Sequence[Judgment], lines: PointRows, place: Place) -> str:

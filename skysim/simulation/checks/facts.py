@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +34,7 @@ SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the fi
 MIN_SHARE = 0.005  # least share of the variance of a cause that is printed
 ARCSEC = "″"
 TRACKER_KNOWS = "tracker knows"
-EXPECTED = "expected error"
+REQUIREMENTS = "requirements"
 UNTESTED = (
     "matches accepted by the thesis's rule, not tested against chance (tracker.acceptance)"
 )
@@ -469,7 +469,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         lines.append(
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
         )
-    return Fact(EXPECTED, lines, values)
+    return Fact("expected error", lines, values)
 
 
 def errors_text(cross: float, roll: float) -> str:
@@ -493,11 +493,13 @@ UNIT_ERRORS = {
 
 
 def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
-    """The expected value of each required error or share at the frames; None without requirements.
+    """The expected value of each required error or share at the frames, None without requirements.
 
-    The errors are normal with the expected variances, those about both axes across the boresight equal.
+    The errors are normal with the expected variances, those about both axes across the boresight equal. `drawn_once` is
+    the share of the variance by errors that a run draws once, of cross or roll, whichever is more.
     """
     error = samples.frames.error
+    known = np.isfinite(error.total("cross"))
     cross, roll = (
         np.outer(np.sqrt(error.total(angle)), unit) / ARCSEC_RAD
         for angle, unit in UNIT_ERRORS.items()
@@ -506,42 +508,36 @@ def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
     lines = []
     values: dict[str, Any] = {}
     for name, limit in context.lab.scene.require.items():
-        limits = re.findall(r"(cross|roll|angle)_arcsec_([\d.]+)", name)
-        match = re.fullmatch(r"(cross|roll|angle)_arcsec_(?:median|[a-z]+(\d+))", name)
+        limits = re.findall(r"([a-z]+)_arcsec_([\d.]+)", name)
+        quantile = re.fullmatch(r"([a-z]+)_arcsec_(?:median|[a-z]+(\d+))", name)
         expected = math.nan
         text = "not forecast; `skysim run` and `skysim study` show it"
-        if match and not np.isnan(cross).all():
-            share = float(f"0.{match[2] or 5}")
-            expected = float(np.nanquantile(sizes[match[1]], share))
-            met = "" if expected <= limit else "not "
-            text = f"expected {met}to be met: {short(expected)}{ARCSEC} of {limit:g}{ARCSEC}"
-        elif limits:
+        if limits:
             within = [sizes[angle] <= float(most) for angle, most in limits]
             expected = float(np.all(within, axis=0).mean())
-            met = "" if expected >= limit else "not "
-            text = f"expected {met}to be met: {100 * expected:.3g} % of at least {100 * limit:g} %"
+            text = f"{100 * expected:.3g} % of at least {100 * limit:g} %"
+        elif quantile and known.any():
+            share = float(f"0.{quantile[2] or 5}")
+            expected = float(np.quantile(sizes[quantile[1]][known], share))
+            text = f"{short(expected)}{ARCSEC} of {limit:g}{ARCSEC}"
+        if not math.isnan(expected):
+            met = expected >= limit if limits else expected <= limit
+            text = f"expected {'' if met else 'not '}to be met: {text}"
         lines.append(f"{name}: {text}")
         values[name] = {"limit": limit, "expected": expected}
-    return Fact("requirements", lines, values) if lines else None
+    shares = [
+        sum(error.by_cause(angle)[name] for name in DRAWN_ONCE) / error.total(angle)
+        for angle in UNIT_ERRORS
+    ]
+    values["drawn_once"] = (
+        float(np.mean(np.max(shares, axis=0)[known])) if known.any() else 1.0
+    )
+    return Fact(REQUIREMENTS, lines, values) if lines else None
 
 
 # Causes of the expected error that are drawn with the survey.
 SURVEYED = ("LED survey", "survey set-up", "common survey", "lever survey", "surface survey")
-
-
-def drawn_once(facts: Sequence[Fact]) -> float:
-    """Share of the expected variance at the frames by errors that a run draws once, of cross or roll; 1 if unknown."""
-    values = {fact.name: fact.values for fact in facts}
-    if EXPECTED not in values:
-        return 1.0
-    once = {*SURVEYED, *(["focal length"] if values[TRACKER_KNOWS]["focal_sigma"] else [])}
-    shares = []
-    for angle in ("cross", "roll"):
-        sizes = values[EXPECTED]["frames"][f"{angle}_causes_arcsec"]
-        total = math.fsum(size**2 for size in sizes.values())
-        drawn = math.fsum(size**2 for name, size in sizes.items() if name in once)
-        shares.append(drawn / total if total else 1.0)
-    return max(shares)
+DRAWN_ONCE = (*SURVEYED, "focal length")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:

@@ -96,7 +96,7 @@ def test_correct_covariances_are_not_called_overconfident():
 
 
 @pytest.mark.parametrize(
-    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
+    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p9", "coverage_", "_p95", ""]
 )
 def test_an_unknown_response_is_refused_with_the_known_ones(name):
     with pytest.raises(

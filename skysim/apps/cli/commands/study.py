@@ -373,7 +373,7 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
         "findings": found.about.findings,
     }
     if judged:
-        told["requirements"] = [
+        progress["requirements"] = [
             row[thresholds.decisive(row)[0]]._asdict()
             | {"points": [one._asdict() for one in row]}
             for row in found.judged

@@ -59,7 +59,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
-from skysim.results.requirements import MET, NOT_MET, Judgment, requirement
+from skysim.results.requirements import Judgment, percent, requirement
 
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
@@ -394,23 +394,15 @@ def range_table(study: Study, lines: PointRows) -> Table:
 
 def requirement_table(study: Study, found: Analysis) -> list[Block]:
     """The judgment of each requirement at each point, and the share of its trials that miss it."""
-    if not found.judged or found.pooled:
+    if not any(found.judged) or found.pooled:
         return []
     lines = answer.answered(found.lines)
-    place = answer.placer(study, lines)
-    tones: dict[str, Tone] = {NOT_MET: "bad", MET: "good"}
-    rows = [
-        [
-            place(line),
-            *(
-                Cell(f"{one.answer}: {answer.percent(one.misses)}", tones.get(one.answer, ""))
-                for one in row
-            ),
-        ]
-        for line, *row in zip(lines, *found.judged, strict=True)
+    places = map(answer.placer(study, lines), lines)
+    answers = [
+        [f"{one.answer} ({percent(one.misses)} miss)" for one in row] for row in found.judged
     ]
     heads = ["at", *(row[0].claim for row in found.judged)]
-    return [Table(list(map(text_column, heads)), rows), Text("With the share of misses.")]
+    return [Table(list(map(text_column, heads)), list(zip(places, *answers, strict=True)))]
 
 
 def index_table(indices: Sequence[Index]) -> Table:
