@@ -1,4 +1,4 @@
-"""Requirements: tolerance limits against tables, coverage by simulation, and each judgment from the counts that give it."""
+"""Requirements: tolerance limits against tables and by simulation, and each judgment from the counts that give it."""
 
 from __future__ import annotations
 

@@ -260,9 +260,11 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
     over replicates, none of fewer than MIN_VALUES.
     """
     squares = complete_outputs(plan, store, AXES[response]) ** 2
+    if not len(squares):
+        squares = np.full((1, len(plan.points)), np.nan)
     names = [*plan.study.factors, "the rest"]
     count = len(squares)
-    drawn = random_stream(1).integers(max(count, 1), size=(RESAMPLES, count))
+    drawn = random_stream(1).integers(count, size=(RESAMPLES, count))
     means = np.concatenate([[squares.mean(axis=0)], squares[drawn].mean(axis=1)])
     points = np.array(
         [[not is_off(one) for one in each.levels.values()] for each in plan.points]
