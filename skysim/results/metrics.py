@@ -543,10 +543,11 @@ def response(name: str, where: str = "response") -> Response:
         Proportion of the solutions with an error far outside their covariance
     failed
         Proportion of the trials that raised an exception
-    right_within_ERROR_LIMIT, QUANTITY_over_LIMIT
-        Proportion of the trials that are right, with errors up to limits: right_within_cross_arcsec_10_roll_arcsec_60
-        (of a flight: all frames solved, none wrong, and the RMS within), and of the values above a limit:
-        cross_arcsec_over_60
+    right_within_cross_arcsec_10, right_within_cross_arcsec_10_roll_arcsec_60
+        Proportion of the trials that are solved, not wrong, and have errors up to the limits (of a flight: all frames,
+        and the RMS errors)
+    cross_arcsec_over_60
+        Proportion of the values of a quantity that are above a limit
     coverage_N
         Proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     nees, centroid_px, streak_px

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -139,6 +142,24 @@ def test_points_that_are_judged_together_are_seldom_not_met() -> None:
 def test_what_trials_cannot_show_is_refused(name: str, limit: float, match: str) -> None:
     with pytest.raises(InputError, match=match):
         requirement(name, limit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "code"), [(1e-6, 1), (1e6, 0)])
+def test_a_run_ends_with_code_1_if_a_requirement_is_not_met(
+    tmp_path: Path, limit: float, code: int
+) -> None:
+    """One frame of one beyond a quantile of 99 %: that has a probability of 1 %, below 5 %."""
+    require = f"require={{cross_arcsec_p99: {limit}, wrong: 0.001}}"
+    words = ["run", "shefex2", "--frames", "1", "--out", tmp_path, "--set", require]
+    done = subprocess.run(
+        [sys.executable, "-m", "skysim", *map(str, words)], capture_output=True, text=True
+    )
+    assert done.returncode == code, done.stderr
+    assert "not shown yet, needs 2,995 draws" in done.stdout
+    answer = "not met" if code else "not shown yet, needs 299 draws"
+    assert f"cross_arcsec_p99 ≤ {limit:g}: {answer}" in done.stdout
+    assert f"cross_arcsec_p99 ≤ {limit:g}: {answer}" in (tmp_path / "report.html").read_text()
 
 
 class Row:

@@ -588,7 +588,7 @@ def test_the_expected_error_is_nan_with_two_lights(stars: Lab) -> None:
 
 
 def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
-    """Cross by Rayleigh's law, roll by the normal one, their hypotenuse by drawing; half of the frames have no lights."""
+    """Cross by Rayleigh's law, roll by the normal one, their hypotenuse by drawing; one of two frames is dark."""
     none = dict.fromkeys(facts.DRAWN_ONCE, np.zeros(2))
     noise = np.array([ARCSEC_RAD**2 * 15, np.nan])
     error = Expected(
