@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError
 from skysim.core.types import FrameRow
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -40,22 +39,12 @@ class Requirement(NamedTuple):
 
 
 def requirement(name: str, limit: float) -> Requirement:
-    """The requirement of a key and its limit. Raises InputError for one that no number of trials can show."""
-    key = f"require.{name}"
-    metrics.response(name, key)
+    """The requirement of a key of a scene or study and its limit."""
     quantity, statistic = metrics.split_name(name)
-    if metrics.is_proportion(name) and quantity != "availability" and name != "mismatched":
-        if not 0 < limit < 1:
-            raise InputError(key, f"{limit:g}", "a share between 0 and 1")
-        return Requirement(name, limit, name, 1 - limit if name.startswith(MORE) else limit)
     probability = metrics.probability_of(statistic)
-    if probability is None or quantity in metrics.MORE_IS_BETTER:
-        raise InputError(
-            key,
-            "no number of trials shows it without assumptions",
-            "a quantile of an error (cross_arcsec_p95), or a share (wrong, coverage_4, right_within_cross_arcsec_10)",
-        )
-    return Requirement(name, limit, f"{quantity}_over_{limit}", 1 - probability)
+    if probability is not None:
+        return Requirement(name, limit, f"{quantity}_over_{limit}", 1 - probability)
+    return Requirement(name, limit, name, 1 - limit if name.startswith(MORE) else limit)
 
 
 class Judgment(NamedTuple):
@@ -91,6 +80,8 @@ class Judgment(NamedTuple):
 
     def text(self, where: str = "") -> str:
         """The judgment in words, for some points of a study."""
+        if not self.draws:
+            return f"{self.claim}: {self.answer}{where}: it is measured by a study, in trials that have it"
         bound = f"less than {percent(self.high)}"
         if self.answer == NOT_MET:
             bound = f"more than {percent(self.low)}"
@@ -154,7 +145,10 @@ def of_run(
     columns = dict(zip(names, np.array(values, float).T, strict=True))
     judged = []
     for one in (requirement(*item) for item in require.items()):
-        found = metrics.response(one.response)(columns)
+        try:
+            found = metrics.response(one.response)(columns)
+        except KeyError:  # frames of a run do not have it
+            found = metrics.NO_VALUE
         draws = found.trials / (1 + max(found.trials - 1, 0) * drawn_once)
         judged.append(judge(one, found, draws))
     return judged

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from skysim import load_scene
 from skysim.core.errors import InputError
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -130,18 +131,18 @@ def test_points_that_are_judged_together_are_seldom_not_met() -> None:
 @pytest.mark.parametrize(
     ("name", "limit", "match"),
     [
-        ("cross_arcsec_worst", 60, "no number of trials"),
-        ("cross_arcsec_rms", 60, "no number of trials"),
-        ("availability_median", 0.9, "no number of trials"),
-        ("stars_p95", 5, "no number of trials"),
-        ("mismatched", 0.1, "no number of trials"),
+        ("cross_arcsec_worst", 60, "nothing that a number of trials shows"),
+        ("cross_arcsec_rms", 60, "nothing that a number of trials shows"),
+        ("cross_arcsec_p00", 60, "nothing that a number of trials shows"),
+        ("stars_p95", 5, "nothing that a number of trials shows"),
+        ("mismatched", 0.1, "nothing that a number of trials shows"),
         ("identified", 1.0, "share between 0 and 1"),
-        ("cross", 60, "unknown response"),
     ],
 )
 def test_what_trials_cannot_show_is_refused(name: str, limit: float, match: str) -> None:
-    with pytest.raises(InputError, match=match):
-        requirement(name, limit)
+    with pytest.raises(InputError, match=match) as refused:
+        load_scene("shefex2", {f"require.{name}": limit})
+    assert str(refused.value).startswith(f"require.{name}: ")
 
 
 @pytest.mark.slow
@@ -183,5 +184,8 @@ def test_frames_of_a_run_count_by_the_share_of_the_errors_that_it_draws_once(
     (found,) = of_run({"cross_arcsec_p95": 60.0}, [Row()] * n, [fact])
     assert found.draws == pytest.approx(draws)
     assert found.answer == (MET if drawn_once == 0 else NOT_SHOWN)
+    (other,) = of_run({"coverage_4": 0.9}, [Row()] * n, [fact])
+    assert (other.draws, other.answer) == (0, NOT_SHOWN)
+    assert "measured by a study" in other.text()
     (unknown,) = of_run({"roll_arcsec_p95": 40.0}, [Row()] * n, [])
     assert (unknown.draws, unknown.misses) == (1.0, 1.0)

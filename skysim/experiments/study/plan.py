@@ -33,7 +33,6 @@ from skysim.core.units import (
     InnerFraction,
     NotNegative,
     Number,
-    Positive,
     PositiveInt,
     Seed,
     Triple,
@@ -42,7 +41,7 @@ from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
-from skysim.scene.scene import Scene
+from skysim.scene.scene import Requirements, Scene
 
 TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
@@ -442,7 +441,7 @@ class Study(ConfigModel):
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
-    require: dict[str, Positive] = Field(default_factory=dict)
+    require: Requirements = Field(default_factory=dict)
     optimize: Search | None = None
 
     @model_validator(mode="before")

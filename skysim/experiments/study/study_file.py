@@ -45,7 +45,7 @@ from skysim.experiments.study.plan import (
     make_plan,
     resolve_point,
 )
-from skysim.results import metrics, requirements
+from skysim.results import metrics
 from skysim.scene import unused
 from skysim.scene.scene import Scene, ephemeris_problem
 from skysim.scene.sections.light import CollimatedDisplayConfig
@@ -148,8 +148,6 @@ def check(plan: Plan, to_run: bool) -> None:
     for n, name in enumerate(study.responses):
         metrics.response(name, f"responses.{n}")
     check_figures(plan)
-    for item in study.require.items():
-        requirements.requirement(*item)
     if study.optimize:
         if study.require:
             raise InputError("require", "has no effect in a search", "optimize.constraints")

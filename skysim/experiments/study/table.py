@@ -270,23 +270,22 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
         [[not is_off(one) for one in each.levels.values()] for each in plan.points]
     )
 
-    def weight(on: Bools) -> Floats:
-        """(P,) weights of the points in the mean square with some causes on."""
+    def mean(on: Bools) -> Floats:
+        """(1 + RESAMPLES,) mean square with some causes on; NaN without this point."""
         there = np.all(points == on, axis=1)
-        return there / (there.sum() or np.nan)
+        return means @ there / (there.sum() or np.nan)
 
     one = np.eye(len(points[0]), dtype=bool)
-    none = weight(np.zeros(len(one), bool))
-    alone = [weight(on) - none for on in one]
-    every = weight(np.ones(len(one), bool))
+    none = mean(np.zeros(len(one), bool))
+    alone = [mean(on) - none for on in one]
+    every = mean(np.ones(len(one), bool))
     if np.isnan(every).any():
         every = none + sum(alone)
-    without = [every - weight(~on) for on in one]
-    weights = np.array([[*alone, none], [*without, np.nan * none]])
-    shares = weights @ means.T / (every @ means.T)
+    without = [every - mean(~on) for on in one]
+    shares = np.array([[*alone, none], [*without, np.nan * none]]) / every
     ends = np.quantile(shares[..., 1:], metrics.TAILS, axis=-1)
     ends[...] = ends if count >= MIN_VALUES else np.nan
-    sigma_arcsec = math.sqrt(every @ means[0] * len(AXES[response]))
+    sigma_arcsec = math.sqrt(every[0] * len(AXES[response]))
     return to_indices(names, response, [shares[..., 0], *ends], count, sigma_arcsec)
 
 
