@@ -27,12 +27,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
-WRONG_AS_CLAIMED_RAD = np.radians(
-    1
-)  # limit for an error that the tracker's covariance allows
-OVERCONFIDENCE_PROBABILITY = (
-    1e-8  # with which a correct covariance allows an error counted as overconfident
-)
+WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the covariance allows
+# Probability with which a correct covariance allows an error that is counted as overconfident.
+OVERCONFIDENCE_PROBABILITY = 1e-8
 OVERCONFIDENT_NEES = float(chdtri(3, OVERCONFIDENCE_PROBABILITY))
 
 
@@ -80,10 +77,8 @@ def normalized_error_squared(
 # Statistics of a sample.
 
 CONFIDENCE = 0.95
-TAILS = (
-    (1 - CONFIDENCE) / 2,
-    (1 + CONFIDENCE) / 2,
-)  # probabilities below the ends of an interval
+# Probabilities below the ends of an interval.
+TAILS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 # Half of the interval of a normal variable, in sigmas.
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
 MOST_TRIALS = 10**9  # greatest number of trials that `trials_needed` considers
@@ -176,9 +171,8 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
-    batch = max(
-        1, 2_000_000 // len(values)
-    )  # limits the memory of a batch to two million values
+    # The memory of a batch is that of two million values.
+    batch = max(1, 2_000_000 // len(values))
     result = scipy.stats.bootstrap(
         (values,),
         statistic,
@@ -221,17 +215,16 @@ def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
     value = float(function(np.mean(values)))
     if count < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
-    low, high = np.quantile(function(values @ resampling_counts(count) / count), TAILS)
-    return Summary(value, float(low), float(high), count)
+    means = function(values @ resampling_counts(count) / count)
+    low, high = np.quantile(means, TAILS).tolist()
+    return Summary(value, low, high, count)
 
 
 @lru_cache(maxsize=64)
 def resampling_counts(count: int) -> NDArray[np.uint8]:
     """(count, RESAMPLES) how often each resample has drawn each value."""
-    drawn = (
-        random_stream(1).integers(0, count, (RESAMPLES, count))
-        + count * np.arange(RESAMPLES)[:, None]
-    )
+    drawn = random_stream(1).integers(0, count, (RESAMPLES, count))
+    drawn += count * np.arange(RESAMPLES)[:, None]
     counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
     return np.ascontiguousarray(counts.reshape(RESAMPLES, count).T, dtype=np.uint8)
 
@@ -255,23 +248,22 @@ def bootstrap_of_many(values: Floats) -> Summary:
     inner = distance <= np.partition(distance, count - EXTREMES)[count - EXTREMES]
     others = values[inner]
     extremes = values[~inner]
-    middle = float(np.mean(others))
-    spread = float(np.std(others))
     weights, normal = resampling_draws()
     weights = weights[:, : len(extremes)]
     left = np.maximum(count - weights.sum(axis=1), 0)
-    means = middle + (weights @ (extremes - middle) + spread * np.sqrt(left) * normal) / count
-    low, high = np.quantile(means, TAILS)
-    return Summary(mean, float(low), float(high), count)
+    middle = float(np.mean(others))
+    scatter = float(np.std(others)) * np.sqrt(left) * normal
+    means = middle + (weights @ (extremes - middle) + scatter) / count
+    low, high = np.quantile(means, TAILS).tolist()
+    return Summary(mean, low, high, count)
 
 
 @lru_cache(maxsize=1)
 def resampling_draws() -> tuple[Floats, Floats]:
     """(RESAMPLES, EXTREMES) counts and (RESAMPLES,) normal variables of `bootstrap_of_many`; the seed is fixed."""
     rng = random_stream(2)
-    return rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float), rng.standard_normal(
-        RESAMPLES
-    )
+    counts = rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float)
+    return counts, rng.standard_normal(RESAMPLES)
 
 
 def quantile(values: Floats, probability: float) -> Summary:
@@ -283,11 +275,10 @@ def quantile(values: Floats, probability: float) -> Summary:
     value = float(np.quantile(values, probability)) if count else math.nan
     ranks = quantile_ranks(count, probability)
     if ranks is None:
-        return Summary(
-            value, math.nan, math.nan, count, values_for_quantile(probability) - count
-        )
-    low, high = np.partition(values, ranks)[list(ranks)]
-    return Summary(value, float(low), float(high), count)
+        needs = values_for_quantile(probability) - count
+        return Summary(value, math.nan, math.nan, count, needs)
+    low, high = np.partition(values, ranks)[list(ranks)].tolist()
+    return Summary(value, low, high, count)
 
 
 @lru_cache(maxsize=4096)
@@ -346,11 +337,6 @@ def tolerance_limit(values: Floats, probability: float) -> Summary:
     return Summary(limit, math.nan, math.nan, count, needs)
 
 
-def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:
-    """The largest or smallest value of these trials, without an interval."""
-    return Summary(float(reduce(values)), math.nan, math.nan, len(values))
-
-
 def rms(values: Floats, axis: int = -1) -> Any:
     """sqrt(mean(x^2)) along the last axis."""
     return np.sqrt(np.mean(np.square(values), axis=axis))
@@ -380,8 +366,8 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
         for name, share in QUANTILES.items()
     },
     "tol95": lambda values: tolerance_limit(values, 0.95),
-    "worst": lambda values: extremum(values, np.max),
-    "least": lambda values: extremum(values, np.min),
+    "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
+    "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }
 # The beginning of a response name. Errors are taken as magnitudes.
 QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
@@ -487,9 +473,8 @@ def mismatched(c: Columns) -> Summary:
     matches = np.sum(c["matched"][known] * c["frames"][known])
     if not matches:
         return NO_VALUE
-    return Summary(
-        float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches)
-    )
+    share = float(np.sum(c["wrong_matches"][known]) / matches)
+    return Summary(share, math.nan, math.nan, round(matches))
 
 
 PROPORTIONS: dict[str, Response] = {
@@ -527,18 +512,16 @@ def response(name: str, where: str = "response") -> Response:
     identified, wrong, refused
         Proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
     ambiguous
-        Proportion of the frames refused because another attitude fits the lights as well (LEDs
-        only)
+        Proportion of the frames refused because another attitude fits the lights as well (LEDs only)
     misidentified
         Proportion of the frames solved with a light that is matched with a wrong star or LED
     misled
-        Proportion of the frames that are misidentified and have an error that the covariance
-        does not allow
+        Proportion of the frames that are misidentified and have an error that the covariance does not allow
     mismatched
         Proportion of the matches that are wrong, of all frames; without an interval
     roll_noise
-        Proportion of the frames solved with the right lights and a roll error beyond ten
-        arcminutes that the tracker's covariance allows
+        Proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that the tracker's
+        covariance allows
     overconfident
         Proportion of the solutions with an error far outside their covariance
     failed
@@ -590,8 +573,7 @@ def statistic_of(name: str) -> Callable[[Floats], Summary] | None:
         function = tolerance_limit if name.startswith("tol") else quantile
         return partial(function, probability=probability)
     if name.startswith("over_"):
-        limit = float(name.removeprefix("over_"))
-        return lambda values: proportion(np.sum(values > limit), len(values))
+        return lambda values: proportion(np.sum(values > float(name[5:])), len(values))
     return STATISTICS.get(name)
 
 
@@ -613,8 +595,5 @@ def split_name(name: str) -> tuple[str, str]:
 
 def is_proportion(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
-    return (
-        name in PROPORTIONS
-        or any(kind.match(name) for kind in (COVERAGE, WITHIN, OVER))
-        or split_name(name)[0] == "availability"
-    )
+    limited = any(kind.match(name) for kind in (COVERAGE, WITHIN, OVER))
+    return limited or name in PROPORTIONS or split_name(name)[0] == "availability"
