@@ -28,7 +28,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
-from skysim.results.requirements import Judgment
+from skysim.results.requirements import NOT_MET, Judgment
 
 # Settings that help where the tracker's own refusal names none.
 HELP = {
@@ -221,7 +221,8 @@ def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
             f"{len(rows)} frames count as {draws:.3g} independent draws, for a run draws the errors of its survey"
             " once; a study draws them anew by `hardware: [tracker.survey.seed]`"
         )
-    return Items(lines, "Requirements" if lines else "")
+    unmet = any(one.answer == NOT_MET for one in judged)
+    return Items(lines, "Requirements" if lines else "", "bad" if unmet else "")
 
 
 def refusals(rows: Sequence[FrameRow]) -> list[str]:

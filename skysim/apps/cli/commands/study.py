@@ -346,7 +346,7 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study import search, table, thresholds
+    from skysim.experiments.study import answer, search, table, thresholds
     from skysim.experiments.study.report import study_report
 
     path = place.folder / "report.html"
@@ -373,9 +373,15 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
         "findings": found.about.findings,
     }
     if judged:
+        lines = answer.answered(found.lines)
         progress["requirements"] = [
             row[thresholds.decisive(row)[0]]._asdict()
-            | {"points": [one._asdict() for one in row]}
+            | {
+                "points": [
+                    one._asdict() | {"point": line.point}
+                    for one, line in zip(row, lines, strict=False)
+                ]
+            }
             for row in found.judged
         ]
     print_json(progress | told | (search.front_columns(found.result) if found.result else {}))

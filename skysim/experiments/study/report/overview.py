@@ -90,7 +90,8 @@ def overview(plan: Plan) -> Overview:
             leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
-        require = require or scene.require
+        if not plan.study.optimize:  # candidates need not meet them
+            require = require or scene.require
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))

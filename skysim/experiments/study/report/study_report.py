@@ -59,7 +59,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
-from skysim.results.requirements import Judgment, percent, requirement
+from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
@@ -228,11 +228,13 @@ def compose(
     shown = {one.response for one in layout.figures(study, lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
     done = progress(study, store)
+    unmet = any(one.answer == NOT_MET for row in found.judged for one in row)
+    tone: Tone = "bad" if unmet else done.tone
     further = [*drawn[1:], Text(left and f"In the table alone: {left}.")]
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
         *(
-            [Verdict(found.verdict, done.tone), done]
+            [Verdict(found.verdict, tone), done]
             if found.verdict
             else [Verdict(done.text, done.tone)]
         ),
