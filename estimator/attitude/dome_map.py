@@ -8,14 +8,19 @@ surface gives points whose directions from the bearing center have angles that d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
+
+UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,101 @@ class LedMap:
     def radius_m(self) -> Floats:
         """(N,) distance of each LED from the bearing center."""
         return np.linalg.norm(self.position_m, axis=1)
+
+    @classmethod
+    def from_csv(
+        cls, path: str | Path, unit: str | None = None, sigma_m: float = 0.0
+    ) -> LedMap:
+        """Return the map of a list of LEDs: a text file whose first line names its columns.
+
+        Columns are separated by commas, or by blanks in a line without commas; lines that begin with # are comments.
+        x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, are places from the bearing center in the dome's axes. `id`
+        numbers the LEDs; without it they are numbered from 0. Other columns are not used.
+
+        The surface is the sphere |x - c| = R through the LEDs: |x|^2 = 2 c.x + k with k = R^2 - |c|^2 is linear in c
+        and k, which least squares gives (Coope 1993, J. Optim. Theory Appl. 76, 381). LEDs in a plane do not determine
+        it: it is then about the bearing center.
+
+        Parameters
+        ----------
+        path
+            The file
+        unit
+            Unit of columns x, y, z, which have none in their names: m, mm, cm or in
+        sigma_m
+            Standard deviation of a place along each axis
+
+        Raises
+        ------
+        ImageError
+            With the number of the line, for a file that cannot be read in this way, or that has an LED twice.
+        """
+        places, rows = _read_columns(Path(path), unit)
+        position_m = rows[:, :3]
+        if pairs := cKDTree(position_m).query_pairs(SAME_PLACE_M):
+            first, second = (places[n] for n in min(pairs))
+            raise ImageError(
+                f"{path}: line {second} is the LED of line {first}; allowed: each once"
+            )
+        number = rows[:, 3]
+        _, first_row = np.unique(number, return_index=True)
+        again = np.setdiff1d(np.arange(len(number)), first_row)
+        for n in (*again, *np.flatnonzero((number % 1 != 0) | (number < 0))):
+            raise ImageError(
+                f"{path}: line {places[n]}: id {number[n]:g}; allowed: whole numbers from 0, each once"
+            )
+        radius_m = np.linalg.norm(position_m, axis=1)
+        design = np.column_stack([2 * position_m, np.ones(len(position_m))])
+        solution, _, rank, _ = np.linalg.lstsq(design, radius_m**2, rcond=None)
+        center_m = solution[:3] if rank == 4 else np.zeros(3)
+        semi_axes_m = np.full(3, np.linalg.norm(position_m - center_m, axis=1).mean())
+        return cls(
+            number.astype(np.int64), position_m, center_m, semi_axes_m, sigma_m=sigma_m
+        )
+
+
+def _read_columns(path: Path, unit: str | None) -> tuple[list[int], Floats]:
+    """Return the line numbers and rows x_m, y_m, z_m, id of a list of LEDs, see `LedMap.from_csv`."""
+    if unit is not None:
+        checks.known("unit", unit, UNIT_M)
+    try:
+        text = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ImageError(
+            f"{path}: cannot be read: {reason}; allowed: a list of LEDs"
+        ) from None
+    lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and line[0] != "#"]
+    cells = [
+        [cell.strip() for cell in line.split("," if "," in line else None)]
+        for _, line in lines
+    ]
+    header = cells[0] if cells else []
+    units = {f"_{name}": scale for name, scale in UNIT_M.items()}
+    if unit is not None:
+        units |= {"": UNIT_M[unit]}
+    found = [end for end in units if {f"{axis}{end}" for axis in "xyz"} <= {*header}]
+    if len(found) != 1 or len({*header}) < len(header) or len(cells) < 2:
+        raise ImageError(
+            f"{path}: no list of LEDs; allowed: one of columns x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, or x, y, z"
+            " with a unit; one LED a line"
+        )
+    used = [header.index(f"{axis}{found[0]}") for axis in "xyz"]
+    used += [header.index("id")] if "id" in header else []
+    rows = np.zeros((len(cells) - 1, 4))
+    rows[:, 3] = np.arange(len(rows))
+    for row, words, (n, line) in zip(rows, cells[1:], lines[1:], strict=True):
+        try:
+            row[: len(used)] = [float(words[k]) for k in used]
+        except (ValueError, IndexError):
+            row[0] = np.nan
+        if len(words) != len(header) or not np.isfinite(row).all():
+            raise ImageError(
+                f"{path}: line {n}: {line.strip()[:40]!r} is no LED; allowed: {len(header)} finite numbers, as the"
+                " first line has names"
+            )
+    rows[:, :3] *= units[found[0]]
+    return [n for n, _ in lines[1:]], rows
 
 
 @dataclass(frozen=True, slots=True)

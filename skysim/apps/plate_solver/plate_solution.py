@@ -220,11 +220,12 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
                 "the order of time",
             )
         one["rate_deg_s"] = None
-        if one["ra_deg"] is None:
+        if one["roll_deg"] is None:
             continue
+        attitude = "cam_from_lab_xyzw" if "leds" in one else "cam_from_icrs_xyzw"
         if last is not None:
-            first = Rotation.from_quat(last["cam_from_icrs_xyzw"])
-            second = Rotation.from_quat(one["cam_from_icrs_xyzw"])
+            first = Rotation.from_quat(last[attitude])
+            second = Rotation.from_quat(one[attitude])
             turn_rad = (first * second.inv()).as_rotvec()
             one["rate_deg_s"] = np.degrees(turn_rad / (one["t_s"] - last["t_s"])).tolist()
         last = one
@@ -232,7 +233,7 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
 
 def sequence_summary(results: list[dict[str, Any]]) -> str:
     """A sentence on a sequence: solved images, gaps, rate."""
-    solved = [one["ra_deg"] is not None for one in results]
+    solved = [one["roll_deg"] is not None for one in results]
     edges = np.flatnonzero(np.diff([True, *solved, True]))
     gaps = [
         results[min(end, len(results) - 1)]["t_s"] - results[max(begin - 1, 0)]["t_s"]

@@ -162,6 +162,13 @@ def lost_in_space(
     lever = Lever(
         model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m
     )
+    return dome_tracker(camera, leds, lever, settings)
+
+
+def dome_tracker(
+    camera: Camera, leds: LedMap, lever: Lever, settings: Settings
+) -> DomeTracker:
+    """A `DomeTracker`. Raises InputError for LEDs that it cannot use."""
     try:
         return DomeTracker(camera, leds, lever, settings)
     except ImageError as error:
