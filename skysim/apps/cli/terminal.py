@@ -5,11 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from math import sqrt
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import printable
 from skysim.results.report import print_blocks, print_table, print_wrapped
 from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 ANIMATION_FRAMES = 60
-SIGMAS = ("cross_sigma_arcsec", "roll_sigma_arcsec")
 
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
@@ -150,40 +147,25 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
     """Print the attitudes of pictures of the sky, or of a dome's LEDs, with remarks."""
     columns = [Column("file", kind="text"), Column("status", kind="text")]
-    keys = ("roll_deg", "pitch_deg", "yaw_deg", *SIGMAS, "matches", "rms_px", "time_ms")
     if "leds" in solutions[0]:
+        keys = (
+            "roll_deg pitch_deg yaw_deg cross_sigma_arcsec roll_sigma_arcsec matches rms_px"
+        )
         columns += [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
         columns += [Column(name, "″", ".3g") for name in ("cross 1σ", "roll 1σ")]
-        columns += [Column("LEDs"), Column("rms", " px", ".2f")]
-        solutions = [one | sigmas_arcsec(one["covariance_rad2"]) for one in solutions]
+        columns += [Column("LEDs"), Column("rms px", "", ".2f")]
     else:
-        keys = (
-            "ra_deg",
-            "dec_deg",
-            "roll_deg",
-            "fov_deg",
-            "matches",
-            "rms_arcsec",
-            "time_ms",
-        )
+        keys = "ra_deg dec_deg roll_deg fov_deg matches rms_arcsec"
         columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
         columns += [Column("stars"), Column("rms", "″", ".1f")]
     rows = []
     for one in solutions:
         status = one["status"] if one["time_ms"] is not None else "bad input"
-        rows.append([one["file"], status, *(one[key] for key in keys)])
+        rows.append([one["file"], status, *(one[key] for key in (*keys.split(), "time_ms"))])
     print_table(Table([*columns, Column("ms", format=".0f")], rows))
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")
-
-
-def sigmas_arcsec(covariance_rad2: Sequence[Sequence[float]] | None) -> dict[str, Any]:
-    """Standard deviations of an attitude across and about the boresight; None of a refusal."""
-    if covariance_rad2 is None:
-        return dict.fromkeys(SIGMAS)
-    x, y, z = (covariance_rad2[n][n] for n in range(3))
-    return dict(zip(SIGMAS, (sqrt(one) / ARCSEC_RAD for one in (x + y, z)), strict=True))
 
 
 def print_remarks(solution: dict[str, Any]) -> None:

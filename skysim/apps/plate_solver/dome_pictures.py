@@ -23,6 +23,7 @@ from estimator.identification.led_search import NO_MATCH
 from estimator.trackers.pipeline import Report
 from skysim.apps.plate_solver import diagnosis
 from skysim.apps.plate_solver.solver import KnownCamera, read_camera
+from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
 
@@ -48,6 +49,8 @@ class DomeSolution:
         z along the principal point's ray. Its inverse turns camera axes to the dome's
     covariance_rad2
         3 rows of the covariance of the small rotation about the camera axes
+    cross_sigma_arcsec, roll_sigma_arcsec
+        Standard deviations across and about the boresight, from the covariance
     systematic_rad2
         The part of it that pictures with this map and camera share: errors of LEDs, lever and focal length; None if
         there is none
@@ -73,6 +76,8 @@ class DomeSolution:
     yaw_deg: float | None = None
     cam_from_lab_xyzw: tuple[float, ...] | None = None
     covariance_rad2: tuple[tuple[float, ...], ...] | None = None
+    cross_sigma_arcsec: float | None = None
+    roll_sigma_arcsec: float | None = None
     systematic_rad2: tuple[tuple[float, ...], ...] | None = None
     log10_chance: float | None = None
     matches: int = 0
@@ -93,12 +98,15 @@ class DomeSolver(NamedTuple):
         Lost-in-space tracker with the dome's map
     camera
         The camera of the pictures
+    listed
+        Number of LEDs that the scene has; a map may have fewer
     time_utc
         Not known
     """
 
     tracker: DomeTracker
     camera: KnownCamera
+    listed: int
     time_utc: None = None
 
 
@@ -107,6 +115,8 @@ class DomeReading(NamedTuple):
 
     Attributes
     ----------
+    solver
+        The solver of the report
     pixels
         The picture, the highest row first; blank for a list of lights
     assumption
@@ -115,9 +125,9 @@ class DomeReading(NamedTuple):
         Whether the order of its rows is known; if not, both were tried
     """
 
+    solver: DomeSolver
     pixels: NDArray
     report: Report
-    tracker: DomeTracker
     assumption: str = ""
     rows_known: bool = True
 
@@ -179,7 +189,7 @@ def make_dome_solver(
         camera, leds, lever = onboard_model.surveyed_dome(lab.scene, str(path), leds, lever)
     settings = factory.assumed_settings(lab.scene)
     tracker = survey_images.dome_tracker(camera, leds, lever, settings)
-    return DomeSolver(tracker, known)
+    return DomeSolver(tracker, known, len(prior.leds.id))
 
 
 def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReading:
@@ -190,7 +200,7 @@ def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReadi
     tracker = solver.tracker
     if isinstance(source, Centroids):
         blank = np.zeros((tracker.camera.height_px, tracker.camera.width_px), np.uint8)
-        return DomeReading(blank, Report(tracker.solve_centroids(source), source), tracker)
+        return DomeReading(solver, blank, Report(tracker.solve_centroids(source), source))
     views = {"": source.pixels}
     if not source.row_order_known:
         views[ASSUMED_TOP_DOWN] = np.ascontiguousarray(source.pixels[::-1])
@@ -200,7 +210,7 @@ def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReadi
         match = report.attitude.match
         if match and match.log10_chance > ACCEPT_LOG10_CHANCE - math.log10(len(views)):
             report.attitude = Attitude(NO_MATCH)
-        readings.append(DomeReading(pixels, report, tracker, text, len(views) == 1))
+        readings.append(DomeReading(solver, pixels, report, text, len(views) == 1))
     return next((one for one in readings if one.report.attitude.solved), readings[0])
 
 
@@ -209,7 +219,7 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
     from skysim.results.telemetry_report import euler_deg
 
     report = reading.report
-    tracker = reading.tracker
+    tracker = reading.solver.tracker
     attitude = report.attitude
     pixels = reading.pixels
     seen = {
@@ -220,9 +230,12 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
     }
     match = attitude.match
     camera = attitude.camera
-    covariances = attitude.covariance_rad2, attitude.systematic_rad2
+    covariance_rad2 = attitude.covariance_rad2
     if attitude.cam_from_ref is None or match is None or camera is None:
         return seen | {"hint": likely_cause(reading)}
+    assert covariance_rad2 is not None
+    x_rad2, y_rad2, z_rad2 = np.diag(covariance_rad2).tolist()
+    shared = attitude.systematic_rad2
     body_from_lab = tracker.lever.cam_from_body.inv() * attitude.cam_from_ref
     roll_deg, pitch_deg, yaw_deg = euler_deg(body_from_lab.inv()).tolist()
     place_m = tracker.leds.position_m[match.star]
@@ -230,16 +243,15 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
     # Measured minus expected.
     residual_px = xy_px - project(body_from_lab, place_m, tracker.lever, camera)
     rows = np.hstack([place_m, xy_px, residual_px]).tolist()
-    covariance_rad2, systematic_rad2 = (
-        None if one is None else tuple(map(tuple, one.tolist())) for one in covariances
-    )
     return seen | {
         "roll_deg": roll_deg,
         "pitch_deg": pitch_deg,
         "yaw_deg": yaw_deg,
         "cam_from_lab_xyzw": tuple(attitude.cam_from_ref.as_quat(canonical=True).tolist()),
-        "covariance_rad2": covariance_rad2,
-        "systematic_rad2": systematic_rad2,
+        "covariance_rad2": tuple(map(tuple, covariance_rad2.tolist())),
+        "cross_sigma_arcsec": math.sqrt(x_rad2 + y_rad2) / ARCSEC_RAD,
+        "roll_sigma_arcsec": math.sqrt(z_rad2) / ARCSEC_RAD,
+        "systematic_rad2": None if shared is None else tuple(map(tuple, shared.tolist())),
         "log10_chance": match.log10_chance,
         "matches": len(match.star),
         "rms_px": attitude.rms_px,
@@ -253,7 +265,7 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
 
 def likely_cause(reading: DomeReading) -> str:
     """The likeliest cause of a refusal in one line, with a remedy."""
-    tracker = reading.tracker
+    tracker = reading.solver.tracker
     lights = reading.report.centroids
     if len(lights) < MIN_EVIDENCE_MATCHES:
         return f"too few lights ({len(lights)}): a longer exposure, or an attitude that shows more LEDs"
@@ -262,7 +274,8 @@ def likely_cause(reading: DomeReading) -> str:
     flipped = diagnosis.reversed_columns(lights, tracker.camera.width_px)
     if reading.rows_known and tracker.solve_centroids(flipped).solved:
         return diagnosis.MIRRORED
-    return (
-        f"the {len(lights)} lights fit the {len(tracker.leds.id)} LEDs at no attitude: is it this dome, this camera,"
-        " and a map that is true?"
-    )
+    mapped = len(tracker.leds.id)
+    text = f"the {len(lights)} lights fit the {mapped} LEDs at no attitude: is it this dome and this camera?"
+    if mapped < reading.solver.listed:
+        text += f" the map lacks {reading.solver.listed - mapped} LEDs of the scene: survey more of them"
+    return text

@@ -387,6 +387,34 @@ def fault_lines(faults: Record) -> Iterator[str]:
 # --- as numbers ---------------------------------------------------------------------------------------------
 
 
+def attitude_rows(run: SurveyRun, names: Sequence[str]) -> list[Record]:
+    """The attitude of each image by the survey, in the order of their names; the numbers are None without one.
+
+    Roll, pitch and yaw are the vehicle's. The quaternion, scalar last, turns the dome's axes (lab) to the camera's, in
+    which the covariance of its small rotation is; it includes the errors of LEDs, lever and lens.
+    """
+    survey = run.survey
+    cam_from_body = survey.lever.cam_from_body
+    R_cam_from_body = cam_from_body.as_matrix()
+    keys = ("roll_deg", "pitch_deg", "yaw_deg", "cam_from_lab_xyzw", "covariance_rad2")
+    blank = {"status": "not identified"} | dict.fromkeys(keys) | {"matches": 0}
+    rows: list[Record] = [{"file": name} | blank for name in names]
+    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+        row = rows[frame.index]
+        row["matches"] = len(match.led)
+        row["status"] = "solved" if survey.tied[k] else "too few surveyed LEDs"
+        if survey.tied[k]:
+            covariance = survey.attitude_covariance_rad2[k]
+            quaternion = (cam_from_body * frame.body_from_lab).as_quat(canonical=True)
+            values = (
+                *euler_deg(frame.body_from_lab.inv()).tolist(),
+                quaternion.tolist(),
+                (R_cam_from_body @ covariance @ R_cam_from_body.T).tolist(),
+            )
+            row |= dict(zip(keys, values, strict=True))
+    return rows
+
+
 def coverage_statistics(so_far: Coverage) -> Record:
     """Counts and errors of a coverage, one row for each LED."""
     frames = so_far.seen.sum(axis=0)

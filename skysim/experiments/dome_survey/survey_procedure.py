@@ -113,7 +113,8 @@ def plan_survey(
 def write_plan(path: Path, plan: HeldAttitudes) -> None:
     """Write the attitudes as CSV with the names of the images to take, as `attitudes.csv` has them."""
     names = [FRAME.format(n) for n in range(len(plan.shown))]
-    write_attitudes(path, names, plan.lab_from_body, plan.shown.sum(axis=1))
+    leds = plan.shown.sum(axis=1).tolist()
+    write_attitudes(path, names, plan.lab_from_body, {"leds": leds})
 
 
 def simulated_frames(
