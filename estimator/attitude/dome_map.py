@@ -83,9 +83,8 @@ class LedMap:
         x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, are places from the bearing center in the dome's axes. `id`
         numbers the LEDs; without it they are numbered from 0. Other columns are not used.
 
-        The surface is the sphere |x - c| = R through the LEDs: |x|^2 = 2 c.x + k with k = R^2 - |c|^2 is linear in c
-        and k, which least squares gives (Coope 1993, J. Optim. Theory Appl. 76, 381). LEDs in a plane do not determine
-        it: it is then about the bearing center.
+        The surface is the sphere about the bearing center with their mean distance. The default identifier and solver
+        do not use it; for the others replace it by the dome's.
 
         Parameters
         ----------
@@ -101,72 +100,64 @@ class LedMap:
         ImageError
             With the number of the line, for a file that cannot be read in this way, or that has an LED twice.
         """
-        places, rows = _read_columns(Path(path), unit)
-        position_m = rows[:, :3]
+        lines, table = _read_leds(path, unit)
+        position_m = table[:, :3]
+        number = table[:, 3] if table.shape[1] == 4 else np.arange(len(table))
+        first = dict(zip(number[::-1], lines[::-1], strict=True))
+        for n, line in zip(number, lines, strict=True):
+            if n % 1 or n < 0 or first[n] != line:
+                raise ImageError(
+                    f"{path}: line {line}: id {n:g}; allowed: whole numbers from 0, each once"
+                )
         if pairs := cKDTree(position_m).query_pairs(SAME_PLACE_M):
-            first, second = (places[n] for n in min(pairs))
+            one, other = (lines[n] for n in min(pairs))
             raise ImageError(
-                f"{path}: line {second} is the LED of line {first}; allowed: each once"
+                f"{path}: line {other}: the LED of line {one}; allowed: each once"
             )
-        number = rows[:, 3]
-        _, first_row = np.unique(number, return_index=True)
-        again = np.setdiff1d(np.arange(len(number)), first_row)
-        for n in (*again, *np.flatnonzero((number % 1 != 0) | (number < 0))):
-            raise ImageError(
-                f"{path}: line {places[n]}: id {number[n]:g}; allowed: whole numbers from 0, each once"
-            )
-        radius_m = np.linalg.norm(position_m, axis=1)
-        design = np.column_stack([2 * position_m, np.ones(len(position_m))])
-        solution, _, rank, _ = np.linalg.lstsq(design, radius_m**2, rcond=None)
-        center_m = solution[:3] if rank == 4 else np.zeros(3)
-        semi_axes_m = np.full(3, np.linalg.norm(position_m - center_m, axis=1).mean())
-        return cls(
-            number.astype(np.int64), position_m, center_m, semi_axes_m, sigma_m=sigma_m
-        )
+        radius_m = np.full(3, np.linalg.norm(position_m, axis=1).mean())
+        numbers = number.astype(np.int64)
+        return cls(numbers, position_m, np.zeros(3), radius_m, sigma_m=sigma_m)
 
 
-def _read_columns(path: Path, unit: str | None) -> tuple[list[int], Floats]:
-    """Return the line numbers and rows x_m, y_m, z_m, id of a list of LEDs, see `LedMap.from_csv`."""
-    if unit is not None:
-        checks.known("unit", unit, UNIT_M)
-    try:
-        text = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ImageError(
-            f"{path}: cannot be read: {reason}; allowed: a list of LEDs"
-        ) from None
-    lines = [(n, line) for n, line in enumerate(text, 1) if line.strip() and line[0] != "#"]
-    cells = [
-        [cell.strip() for cell in line.split("," if "," in line else None)]
-        for _, line in lines
-    ]
-    header = cells[0] if cells else []
+def _read_leds(path: str | Path, unit: str | None) -> tuple[list[int], Floats]:
+    """Return the numbers of the lines of a list of LEDs, and its columns x_m, y_m, z_m and id, if it has that."""
     units = {f"_{name}": scale for name, scale in UNIT_M.items()}
     if unit is not None:
-        units |= {"": UNIT_M[unit]}
-    found = [end for end in units if {f"{axis}{end}" for axis in "xyz"} <= {*header}]
-    if len(found) != 1 or len({*header}) < len(header) or len(cells) < 2:
+        checks.known("unit", unit, UNIT_M)
+        units[""] = UNIT_M[unit]
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
         raise ImageError(
-            f"{path}: no list of LEDs; allowed: one of columns x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, or x, y, z"
-            " with a unit; one LED a line"
+            f"{path}: cannot be read: {error}; allowed: a list of LEDs"
+        ) from None
+    rows = [
+        (n, [cell.strip() for cell in line.split("," if "," in line else None)])
+        for n, line in enumerate(text, 1)
+        if line.strip() and line[0] != "#"
+    ]
+    names = rows[0][1] if rows else []
+    found = [end for end in units if {f"{axis}{end}" for axis in "xyz"} <= {*names}]
+    if len(found) != 1 or len({*names}) < len(names) or len(rows) < 2:
+        raise ImageError(
+            f"{path}: no list of LEDs; allowed: columns x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, or x, y, z with a"
+            " unit; one LED a line"
         )
-    used = [header.index(f"{axis}{found[0]}") for axis in "xyz"]
-    used += [header.index("id")] if "id" in header else []
-    rows = np.zeros((len(cells) - 1, 4))
-    rows[:, 3] = np.arange(len(rows))
-    for row, words, (n, line) in zip(rows, cells[1:], lines[1:], strict=True):
+    used = [f"{axis}{found[0]}" for axis in "xyz"] + ["id"] * ("id" in names)
+    table = []
+    for n, cells in rows[1:]:
         try:
-            row[: len(used)] = [float(words[k]) for k in used]
-        except (ValueError, IndexError):
-            row[0] = np.nan
-        if len(words) != len(header) or not np.isfinite(row).all():
+            row = dict(zip(names, cells, strict=True))
+            table.append([float(row[name]) for name in used])
+        except ValueError:
+            table.append([np.nan])
+        if not np.isfinite(table[-1]).all():
             raise ImageError(
-                f"{path}: line {n}: {line.strip()[:40]!r} is no LED; allowed: {len(header)} finite numbers, as the"
-                " first line has names"
+                f"{path}: line {n}: {','.join(cells)[:40]!r}; allowed: {len(names)} columns, finite numbers in"
+                f" {', '.join(used)}"
             )
-    rows[:, :3] *= units[found[0]]
-    return [n for n, _ in lines[1:]], rows
+    scales = [units[found[0]]] * 3 + [1.0]
+    return [n for n, _ in rows[1:]], np.array(table) * scales[: len(used)]
 
 
 @dataclass(frozen=True, slots=True)
