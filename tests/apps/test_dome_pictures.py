@@ -17,6 +17,7 @@ from scipy.stats import chi2
 import skysim
 from skysim.apps import plate_solver
 from skysim.apps.cli import main
+from skysim.apps.plate_solver.dome_pictures import dome_fields, solve_dome
 from skysim.core.errors import InputError
 from skysim.core.images import ViewedImage
 from skysim.experiments.dome_survey import survey_frames
@@ -84,8 +85,8 @@ def test_attitudes_err_as_their_covariance_says_where_the_dome_differs_from_its_
     held = survey_frames.stop_attitudes(lab.scene, "checks", 30, 20.0)
     nees = []
     for frame, truth in survey_frames.render_stops(true, held):
-        reading = plate_solver.solve_dome(ViewedImage(frame.image_dn), solver)
-        found = plate_solver.DomeSolution(**plate_solver.dome_fields(reading))
+        reading = solve_dome(ViewedImage(frame.image_dn), solver)
+        found = plate_solver.DomeSolution(**dome_fields(reading))
         if found.status == "solved":
             turn = Rotation.from_quat(found.cam_from_lab_xyzw) * truth.cam_from_lab.inv()
             error_rad = turn.as_rotvec()
@@ -166,7 +167,7 @@ def test_pictures_that_are_not_of_the_dome_are_refused(
     }
     for hint, pixels in cases.items():
         image = ViewedImage(np.ascontiguousarray(pixels).astype(np.uint16))
-        found = plate_solver.dome_fields(plate_solver.solve_dome(image, solver))
+        found = dome_fields(solve_dome(image, solver))
         assert found["status"] != "solved"
         assert "cam_from_lab_xyzw" not in found
         assert hint in found["hint"]
@@ -214,7 +215,7 @@ def test_a_camera_of_a_dome_s_scene_points_to_dome(
     assert f"solve them with --dome {scene}" in found["hint"]
 
 
-@pytest.mark.parametrize("name", ["fov", "time", "catalog", "near", "size", "wcs"])
+@pytest.mark.parametrize("name", ["fov", "camera", "time", "catalog", "near", "size", "wcs"])
 def test_options_of_the_sky_have_no_effect_under_a_dome(
     name: str, scene: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:

@@ -8,9 +8,7 @@ Pictures of a dome's LEDs are solved by the tracker of a scene (`dome_pictures.p
 from skysim.apps.plate_solver.dome_pictures import (
     DomeSolution,
     DomeSolver,
-    dome_fields,
     make_dome_solver,
-    solve_dome,
 )
 from skysim.apps.plate_solver.picture import (
     Outputs,
@@ -50,7 +48,6 @@ __all__ = [
     "add_rates",
     "annotated_paths",
     "best_attitude",
-    "dome_fields",
     "kept_solver",
     "load_picture",
     "make_dome_solver",
@@ -62,7 +59,6 @@ __all__ = [
     "solution_fields",
     "solve",
     "solve_array",
-    "solve_dome",
     "solve_file",
     "solve_picture",
     "validated_date",

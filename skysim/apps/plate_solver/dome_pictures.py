@@ -8,7 +8,7 @@ the scene or those of the map, are in the covariance.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -22,7 +22,7 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_EVIDENCE_MA
 from estimator.identification.led_search import NO_MATCH
 from estimator.trackers.pipeline import Report
 from skysim.apps.plate_solver import diagnosis
-from skysim.apps.plate_solver.solver import KnownCamera, read_camera
+from skysim.apps.plate_solver.solver import KnownCamera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
@@ -74,15 +74,15 @@ class DomeSolution:
     roll_deg: float | None = None
     pitch_deg: float | None = None
     yaw_deg: float | None = None
-    cam_from_lab_xyzw: tuple[float, ...] | None = None
-    covariance_rad2: tuple[tuple[float, ...], ...] | None = None
+    cam_from_lab_xyzw: list[float] | None = None
+    covariance_rad2: list[list[float]] | None = None
     cross_sigma_arcsec: float | None = None
     roll_sigma_arcsec: float | None = None
-    systematic_rad2: tuple[tuple[float, ...], ...] | None = None
+    systematic_rad2: list[list[float]] | None = None
     log10_chance: float | None = None
     matches: int = 0
     rms_px: float | None = None
-    leds: tuple[dict[str, Any], ...] = ()
+    leds: Sequence[dict[str, Any]] = ()
     lights: int = 0
     brightest_dn: float | None = None
     background_dn: float | None = None
@@ -135,7 +135,6 @@ class DomeReading(NamedTuple):
 def make_dome_solver(
     dome: str | Path,
     map_file: str | Path | None = None,
-    camera_file: Path | None = None,
     stages: Mapping[str, str] | None = None,
 ) -> DomeSolver:
     """Build a DomeSolver from user input. Raises InputError with one line.
@@ -146,8 +145,6 @@ def make_dome_solver(
         Scene of the dome: its name or file
     map_file
         Map that a survey wrote, with its LEDs, lever and lens; `tracker.map` of the scene if left out
-    camera_file
-        Camera of the pictures, see `read_camera`; the scene's if left out
     stages
         Names of algorithms by stage; the scene's for the others
     """
@@ -163,32 +160,24 @@ def make_dome_solver(
     light = scene.light
     if not isinstance(light, DomeConfig):
         raise InputError("solve.dome", f"the light of {dome} is {light.kind}", "a dome")
-    path = map_file or scene.tracker.map
-    if path and camera_file:
-        raise InputError("solve.camera", "the lens is that of the map", "a map or a camera")
     # 1. The lists without simulated errors. One picture is too few for codes.
     own = with_config(scene, "tracker", name=OWN, decoder=None, **(stages or {}))
     lab = build_lab(survey_prior.as_listed(own))
-    camera = onboard_model.assumed_camera(lab.scene)
-    known = KnownCamera(camera, 0.0, scene.camera.detector)
-    if camera_file:
-        known = read_camera(camera_file)[0]
-        camera = replace(known.model, row_time_s=camera.row_time_s)
+    sigma = onboard_model.assumed_camera(scene).focal_sigma
+    camera = replace(onboard_model.assumed_camera(lab.scene), focal_sigma=sigma)
     prior = survey_prior.listed_prior(lab, camera)
     # 2. The sizes of their errors.
     doubt = onboard_model.assumed_dome(scene, light, survey_prior.design_of(lab))
     names = ("sigma_m", "covariance_m2", "common_m")
     leds = replace(prior.leds, **{name: getattr(doubt, name) for name in names})
     lever = replace(prior.lever, sigma_m=float(scene.tracker.survey.lever_sigma_m))
-    focal_sigma = onboard_model.assumed_camera(scene).focal_sigma
-    if camera_file:
-        focal_sigma = known.uncertainty / CALIBRATION_SIGMAS
-    camera = replace(camera, focal_sigma=focal_sigma)
     # 3. A map in their place.
+    path = map_file or scene.tracker.map
     if path:
         camera, leds, lever = onboard_model.surveyed_dome(lab.scene, str(path), leds, lever)
     settings = factory.assumed_settings(lab.scene)
     tracker = survey_images.dome_tracker(camera, leds, lever, settings)
+    known = KnownCamera(camera, 0.0, scene.camera.detector)
     return DomeSolver(tracker, known, len(prior.leds.id))
 
 
@@ -216,51 +205,49 @@ def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReadi
 
 def dome_fields(reading: DomeReading) -> dict[str, Any]:
     """The fields of DomeSolution: image statistics, and solution or likely cause of the refusal."""
-    from skysim.results.telemetry_report import euler_deg
+    from skysim.experiments.dome_survey.survey_findings import attitude_record
 
     report = reading.report
-    tracker = reading.solver.tracker
     attitude = report.attitude
-    pixels = reading.pixels
     seen = {
         "status": attitude.status,
         "lights": len(report.centroids),
-        "brightest_dn": float(pixels.max()),
-        "background_dn": float(np.median(pixels)),
+        "brightest_dn": float(reading.pixels.max()),
+        "background_dn": float(np.median(reading.pixels)),
     }
     match = attitude.match
-    camera = attitude.camera
-    covariance_rad2 = attitude.covariance_rad2
-    if attitude.cam_from_ref is None or match is None or camera is None:
+    if match is None:
         return seen | {"hint": likely_cause(reading)}
-    assert covariance_rad2 is not None
-    x_rad2, y_rad2, z_rad2 = np.diag(covariance_rad2).tolist()
-    shared = attitude.systematic_rad2
-    body_from_lab = tracker.lever.cam_from_body.inv() * attitude.cam_from_ref
-    roll_deg, pitch_deg, yaw_deg = euler_deg(body_from_lab.inv()).tolist()
-    place_m = tracker.leds.position_m[match.star]
+    assert attitude.camera is not None
+    assert attitude.covariance_rad2 is not None
+    leds = reading.solver.tracker.leds
+    lever = reading.solver.tracker.lever
+    body_from_lab = lever.cam_from_body.inv() * attitude.cam_from_ref
+    x_rad2, y_rad2, z_rad2 = np.diag(attitude.covariance_rad2).tolist()
+    place_m = leds.position_m[match.star]
     xy_px = report.centroids.xy_px[match.observed]
     # Measured minus expected.
-    residual_px = xy_px - project(body_from_lab, place_m, tracker.lever, camera)
-    rows = np.hstack([place_m, xy_px, residual_px]).tolist()
-    return seen | {
-        "roll_deg": roll_deg,
-        "pitch_deg": pitch_deg,
-        "yaw_deg": yaw_deg,
-        "cam_from_lab_xyzw": tuple(attitude.cam_from_ref.as_quat(canonical=True).tolist()),
-        "covariance_rad2": tuple(map(tuple, covariance_rad2.tolist())),
-        "cross_sigma_arcsec": math.sqrt(x_rad2 + y_rad2) / ARCSEC_RAD,
-        "roll_sigma_arcsec": math.sqrt(z_rad2) / ARCSEC_RAD,
-        "systematic_rad2": None if shared is None else tuple(map(tuple, shared.tolist())),
-        "log10_chance": match.log10_chance,
-        "matches": len(match.star),
-        "rms_px": attitude.rms_px,
-        "leds": tuple(
-            {"name": f"LED {led}"} | dict(zip(LED_KEYS, row, strict=True))
-            for led, row in zip(tracker.leds.id[match.star].tolist(), rows, strict=True)
-        ),
-        "hint": reading.assumption,
-    }
+    residual_px = xy_px - project(body_from_lab, place_m, lever, attitude.camera)
+    numbers = np.hstack([place_m, xy_px, residual_px]).tolist()
+    shared = attitude.systematic_rad2
+    solved = attitude_record(body_from_lab, attitude.covariance_rad2, lever)
+    return (
+        seen
+        | solved
+        | {
+            "cross_sigma_arcsec": math.sqrt(x_rad2 + y_rad2) / ARCSEC_RAD,
+            "roll_sigma_arcsec": math.sqrt(z_rad2) / ARCSEC_RAD,
+            "systematic_rad2": None if shared is None else shared.tolist(),
+            "log10_chance": match.log10_chance,
+            "matches": len(match.star),
+            "rms_px": attitude.rms_px,
+            "leds": [
+                {"name": f"LED {led}"} | dict(zip(LED_KEYS, row, strict=True))
+                for led, row in zip(leds.id[match.star], numbers, strict=True)
+            ],
+            "hint": reading.assumption,
+        }
+    )
 
 
 def likely_cause(reading: DomeReading) -> str:

@@ -124,7 +124,7 @@ def solve(
         Right ascension, declination and radius: only answers within this circle are searched
     dome, map
         Scene of the dome whose LEDs the image shows, and the map of a survey in place of the scene's LEDs, lever and
-        lens. The result is then a `DomeSolution`, and only `camera` has an effect
+        lens. The result is then a `DomeSolution`; no other keyword is allowed
 
     Raises
     ------
@@ -132,8 +132,11 @@ def solve(
         With one line for an image that cannot be read.
     """
     solver: Solver | DomeSolver
+    given = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
     if dome:
-        solver = make_dome_solver(dome, map, Path(camera) if camera else None)
+        if any(one is not None for one in given):
+            raise InputError("solve.dome", "with a keyword of the sky", "dome and map alone")
+        solver = make_dome_solver(dome, map)
         result = read_and_solve(Path(path), solver)
         return DomeSolution(**{one.name: result[one.name] for one in fields(DomeSolution)})
     if camera or catalog or near_deg or size_px:

@@ -151,10 +151,10 @@ def solve(
         )
     else:
         sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
-        for name, value in (sky | {"wcs": wcs}).items():
+        for name, value in (sky | {"camera": camera, "wcs": wcs}).items():
             if value is not None:
                 raise InputError(f"--{name}", "has no effect with --dome", "without it")
-        settings = plate_solver.make_dome_solver(dome, map_, camera, stages)
+        settings = plate_solver.make_dome_solver(dome, map_, stages)
     files.make_folder(out)
     paths = pictures(images or [], live, out)
     if sequence:  # a frame that is there as FITS and as PNG is one
