@@ -77,7 +77,10 @@ def command(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
 def test_attitudes_err_as_their_covariance_says_where_the_dome_differs_from_its_list(
     lab: Lab, solver: plate_solver.DomeSolver
 ) -> None:
-    """The LEDs stand 1 mm from their places in the list about each axis, as the scene says that they may."""
+    """The LEDs stand 1 mm from their places in the list about each axis, as the scene says that they may.
+
+    The tracker takes the least distance of an LED for all of them, so that NEES may be somewhat below three.
+    """
     sources = lab.camera.sources
     place = sources.place.copy()
     place[:, :3] += np.random.default_rng(2).normal(0, LED_SIGMA_M, (len(place), 3))
@@ -92,8 +95,7 @@ def test_attitudes_err_as_their_covariance_says_where_the_dome_differs_from_its_
             error_rad = turn.as_rotvec()
             nees.append(error_rad @ np.linalg.solve(found.covariance_rad2, error_rad))
     assert len(nees) > 20
-    low, high = chi2.ppf([RARE, 1 - RARE], 3 * len(nees)) / len(nees)
-    assert low < np.mean(nees) < high
+    assert 1 < np.mean(nees) < chi2.ppf(1 - RARE, 3 * len(nees)) / len(nees)
 
 
 def test_the_list_has_no_simulated_errors_but_their_sizes(
