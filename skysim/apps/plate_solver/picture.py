@@ -104,7 +104,7 @@ def solve(
     near_deg: tuple[float, float, float] | None = None,
     dome: str | Path | None = None,
     map: str | Path | None = None,
-) -> Any:
+) -> PlateSolution | DomeSolution:
     """Solve the attitude of an image file of the sky or a dome's LEDs, lost in space. Public as `skysim.solve`.
 
     Parameters
@@ -132,14 +132,16 @@ def solve(
         With one line for an image that cannot be read.
     """
     solver: Solver | DomeSolver
-    given = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
+    kind: type[PlateSolution | DomeSolution] = PlateSolution
+    sky = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
     if dome:
-        if any(one is not None for one in given):
+        if any(one is not None for one in sky):
             raise InputError("solve.dome", "with a keyword of the sky", "dome and map alone")
+        kind = DomeSolution
         solver = make_dome_solver(dome, map)
-        result = read_and_solve(Path(path), solver)
-        return DomeSolution(**{one.name: result[one.name] for one in fields(DomeSolution)})
-    if camera or catalog or near_deg or size_px:
+    elif map:
+        raise InputError("solve.map", "has no effect without a dome", "with the dome's scene")
+    elif camera or catalog or near_deg or size_px:
         solver = make_solver(
             fov_deg,
             Path(camera) if camera else None,
@@ -151,7 +153,7 @@ def solve(
     else:
         solver = kept_solver(fov_deg, time_utc)
     result = read_and_solve(Path(path), solver)
-    return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
+    return kind(**{one.name: result[one.name] for one in fields(kind)})
 
 
 def pictures_in(paths: Iterable[Path]) -> list[Path]:
@@ -236,21 +238,20 @@ def read_and_solve(
     date_utc = None
     reading: SolvedReading | DomeReading
     try:
+        source: images.ViewedImage | Centroids
         if path.suffix.lower() in LIST_SUFFIXES:
-            lights = read_lights(path)
-            if isinstance(solver, DomeSolver):
-                reading = solve_dome(lights, solver)
-            else:
-                reading = solve_list(path, lights, solver)
+            source = read_lights(path)
         else:
-            picture = load_picture(path, solver.camera, picture)
-            date_utc, warning = validated_date(picture.date_utc)
+            source = load_picture(path, solver.camera, picture)
+            date_utc, warning = validated_date(source.date_utc)
             if warning and not solver.time_utc:
                 result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
-            if isinstance(solver, DomeSolver):
-                reading = solve_dome(picture, solver)
-            else:
-                reading = solve_picture(picture, solver, date_utc)
+        if isinstance(solver, DomeSolver):
+            reading = solve_dome(source, solver)
+        elif isinstance(source, Centroids):
+            reading = solve_list(path, source, solver)
+        else:
+            reading = solve_picture(source, solver, date_utc)
     except InputError as error:
         raise error if error.key == printable(path) else error.within(path) from None
     except ImageError as error:
