@@ -61,6 +61,11 @@ def image_files(folder: Path) -> list[Path]:
     return paths
 
 
+def frame_names(count: int) -> list[str]:
+    """The names of the images of a plan or a simulation."""
+    return [FRAME.format(n) for n in range(count)]
+
+
 def best_images(folder: Path) -> list[Path]:
     """The images of a folder by name; of one stem, that of the first of FORMATS. Raises InputError for no folder."""
 

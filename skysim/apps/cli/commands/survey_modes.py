@@ -118,7 +118,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         coverage_shown(request, observations, before, plan.model.sigma_px),
     ):
         run = adjust.run_survey(observations, before, uncertainty, update)
-    names = [survey_images.FRAME.format(n) for n in range(len(observations))]
+    names = survey_images.frame_names(len(observations))
     statistics = write_results(request, run, before, lab, names)
     tracker = factory.build_tracker(
         survey_prior.with_map(lab.scene, statistics["map"]),
