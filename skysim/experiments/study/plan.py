@@ -24,6 +24,7 @@ from pydantic import (
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES
+from skysim.core.plugins import Programs
 from skysim.core.units import (
     ConfigModel,
     Declination,
@@ -39,6 +40,7 @@ from skysim.core.units import (
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
+from skysim.experiments.study.own_code import digests_of
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
 from skysim.scene.scene import Scene
@@ -407,8 +409,8 @@ class Study(ConfigModel):
     Attributes
     ----------
     scene
-        Name, or path relative to the study file's folder; `set` overrides keys of it at all
-        points
+        Name, or path relative to the study file's folder, or the keys of a scene; `set`
+        overrides keys of it at all points
     paired
         Use the same random attitudes and noise at every point for each replicate (common random
         numbers); by default in all designs but lhs and sobol, whose trials are evaluated together
@@ -422,7 +424,7 @@ class Study(ConfigModel):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    scene: str
+    scene: str | dict[str, Any]
     seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
@@ -474,18 +476,21 @@ class TrialSpec:
     hardware
         Keys of the seeds that every replicate draws anew
     programs
-        Commands of external trackers by name, from the command line; not part of the study's
-        digest
+        External trackers and controllers by name: commands from the command line, functions and
+        objects from Python; not part of the study's digest
+    digests
+        Digests of these functions and objects
     """
 
-    scene: str
+    scene: str | Tree
     folder: str
     seed: int
     base: Settings
     trial: Tree
     paired: bool
     hardware: tuple[str, ...] = ()
-    programs: Mapping[str, str] = field(default_factory=dict)
+    programs: Programs = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
 
     def trial_settings(self, settings: Settings, replicate: int) -> Settings:
         """The settings of a point's trial: those of the point, and the replicate's draws of the hardware.
@@ -508,6 +513,8 @@ class Plan:
     ----------
     prices
         Prices of `optimize.cost.parts`
+    text
+        Text of the study's file
     """
 
     path: Path
@@ -515,6 +522,7 @@ class Plan:
     spec: TrialSpec
     points: list[Point]
     prices: Prices | None = None
+    text: str = ""
 
     @property
     def name(self) -> str:
@@ -558,7 +566,9 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
-def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]) -> Plan:
+def make_plan(
+    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
+) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -570,11 +580,13 @@ def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]
         study.paired,
         study.hardware,
         dict(programs),
+        digests_of(programs),
     )
     if study.optimize is None:
-        return Plan(path, study, spec, points(study.design, study.factors, study.seed))
+        chosen = points(study.design, study.factors, study.seed)
+        return Plan(path, study, spec, chosen, text=text)
     parts = study.optimize.cost.parts
-    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None)
+    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None, text)
 
 
 def prices_of(parts: str, folder: Path) -> Prices:
@@ -589,16 +601,16 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
     trial = resolve_trial(spec, settings)
     values = spec.base | settings
-    name = str(values.pop("scene", spec.scene))
-    local = Path(spec.folder) / name
-    path = (
-        local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
-    )
+    name = values.pop("scene", spec.scene)
+    folder = Path(spec.folder)
+    local = folder / str(name)
+    if local.suffix in {".yaml", ".yml"} and is_file(local):
+        name = local
     overrides = {
         key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
     }
     # `unused_options` refuses unused keys, for the whole study.
-    return loader.load(path, overrides, refuses_unused=False), trial
+    return loader.load(name, overrides, refuses_unused=False, folder=folder), trial
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
