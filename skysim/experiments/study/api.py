@@ -140,13 +140,15 @@ def run_study(
         tree, _ = as_tree(tree)
         for key, text in texts.items():
             set_key(tree, key, text)
-        tree = with_absolute_paths(tree, path.resolve().parent)
+        beside = path.resolve().parent / str(tree.get("scene", ""))
+        if is_file(beside):
+            tree["scene"] = str(beside)
         folder = Path(out) if out is not None else Path("out") / slug(tree)
         # 3. Parts.
         for name, part in given.items():
             with_part(tree, name, part, folder, made)
         tree, text = as_tree(own_code.with_names(tree, made))
-        plan = study_file.plan_of(tree, text, Path(MAPPING), programs=made)
+        plan = study_file.plan_of(tree, text, path.with_name(MAPPING), programs=made)
         plan = replace(plan, path=folder / f"{folder.resolve().name}.yaml")
     # 4. Trials.
     engine = engine_for(made, workers)
@@ -191,16 +193,6 @@ def study_texts(changes: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str
     if isinstance(changes.get("set"), Mapping):
         changes = {**changes, "set": {**tree.get("set", {}), **changes["set"]}}
     return override_texts(changes, dict(tree), WHOLE)
-
-
-def with_absolute_paths(value: Any, folder: Path) -> Any:
-    """A value of a study with absolute names of the scenes, cameras and prices that are files in a folder."""
-    if isinstance(value, dict):
-        return {key: with_absolute_paths(inner, folder) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [with_absolute_paths(inner, folder) for inner in value]
-    is_name = isinstance(value, str) and Path(value).suffix in (".yaml", ".yml", ".csv")
-    return str(folder / value) if is_name and is_file(folder / value) else value
 
 
 def slug(tree: Tree) -> str:

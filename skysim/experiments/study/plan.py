@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import yaml
@@ -256,76 +256,76 @@ class Budget(ConfigModel):
     failures: PositiveInt | None = None
 
 
-class Curve(ConfigModel):
-    """A figure: one response against a factor, with a line for each level of another factor."""
+class Selection(ConfigModel):
+    """Base of what a study shows: at some levels of the factors.
 
-    kind: Literal["curve"]
-    x: str
-    y: str
-    by: str | None = None
+    Attributes
+    ----------
+    AXES
+        Keys that name a factor
+    """
+
+    AXES: ClassVar[tuple[str, ...]]
     where: dict[str, Value] = Field(default_factory=dict)
+
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it shows, by key."""
+        return {key: getattr(self, key) for key in self.AXES}
+
+
+class FigureKeys(Selection):
+    """Base of the figures; RESPONSE is the key of the response."""
+
+    RESPONSE: ClassVar[str]
     log: bool = False
 
     @property
     def response(self) -> str:
         """The response that the figure shows."""
-        return self.y
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"x": self.x, "by": self.by}
+        return str(getattr(self, self.RESPONSE))
 
 
-class Map(ConfigModel):
+class Curve(FigureKeys):
+    """A figure: one response against a factor, with a line for each level of another factor."""
+
+    AXES = ("x", "by")
+    RESPONSE = "y"
+    kind: Literal["curve"]
+    x: str
+    y: str
+    by: str | None = None
+
+
+class Map(FigureKeys):
     """A figure: one response over the directions of the random attitudes, a panel for each level of another factor.
 
     Under a dome the direction is that of the body's z axis, tilt as radius and azimuth as angle; under the stars it is
     the boresight's, in a projection of the whole sky.
     """
 
+    AXES = ("by",)
+    RESPONSE = "value"
     kind: Literal["map"]
     value: str
     by: str | None = None
-    where: dict[str, Value] = Field(default_factory=dict)
-    log: bool = False
-
-    @property
-    def response(self) -> str:
-        """The response that the figure shows."""
-        return self.value
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"by": self.by}
 
 
-class Heat(ConfigModel):
+class Heat(FigureKeys):
     """A figure: one response over two factors."""
 
+    AXES = ("x", "y")
+    RESPONSE = "value"
     kind: Literal["heat"]
     x: str
     y: str
     value: str
-    where: dict[str, Value] = Field(default_factory=dict)
-    log: bool = False
-
-    @property
-    def response(self) -> str:
-        """The response that the figure shows."""
-        return self.value
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"x": self.x, "y": self.y}
 
 
 Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
 
 
-class Threshold(ConfigModel):
+class Threshold(Selection):
     """Where along a factor a proportion crosses a limit, such as the rate at which 95 % of the frames are identified.
 
     Attributes
@@ -338,16 +338,11 @@ class Threshold(ConfigModel):
         One threshold for each level of this factor
     """
 
+    AXES = ("along", "by")
     response: str
     limit: InnerFraction
     along: str
     by: str | None = None
-    where: dict[str, Value] = Field(default_factory=dict)
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors of the threshold, by key."""
-        return {"along": self.along, "by": self.by}
 
 
 class Cost(ConfigModel):
