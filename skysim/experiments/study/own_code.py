@@ -21,14 +21,19 @@ from typing import Any
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
+from skysim.core.paths import ROOT
 from skysim.core.plugins import Programs, describe_error
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.simulation.lab import name_of
 from skysim.tracking.tracker_interface import OWN
 
-INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib"))
-# Packages whose code is in the version that a store keeps (`setups.code_version`).
-COVERED = ("skysim", "estimator")
+# Beginnings of the paths of code that is not the user's. That of skysim and estimator is in the version that a store
+# keeps (`setups.code_version`).
+INSTALLED = (
+    *(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib")),
+    *(str(ROOT / package) for package in ("skysim", "estimator")),
+    "<frozen",
+)
 # What a tracker of the estimator is made from; the rest follows from it.
 TRACKER = (
     "camera",
@@ -72,11 +77,11 @@ class SourcePickler(pickle.Pickler):
 
 def is_own(code: Any) -> bool:
     """Whether a module, function or class is the user's: neither installed nor of skysim."""
-    name = code.__name__ if isinstance(code, ModuleType) else code.__module__ or ""
-    file = getattr(sys.modules.get(name), "__file__", None)
-    if name.partition(".")[0] in (*COVERED, *sys.builtin_module_names):
-        return False
-    return not (file or "").startswith(INSTALLED)
+    if isinstance(code, FunctionType):
+        return not code.__code__.co_filename.startswith(INSTALLED)
+    name = code.__name__ if isinstance(code, ModuleType) else code.__module__
+    file = getattr(sys.modules.get(name), "__file__", None) or ""
+    return name not in sys.builtin_module_names and not file.startswith(INSTALLED)
 
 
 def version_of(code: Any) -> str:
