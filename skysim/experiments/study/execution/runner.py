@@ -386,7 +386,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     rendered before it are also written.
     """
     segment = segment_of(plan, store, trial)
-    row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
+    (row,) = trials.run_block(plan.spec, segment)
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
