@@ -15,6 +15,7 @@ import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
@@ -23,6 +24,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.plugins import Programs, describe_error
+from skysim.core.yaml_reader import is_file
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.simulation.lab import name_of
 from skysim.tracking.tracker_interface import OWN
@@ -168,6 +170,7 @@ def unsendable(programs: Programs) -> str:
         except Exception as error:
             return f"{name}: {describe_error(error)}"
         main = sys.modules["__main__"]
-        if b"__main__" in data and not (main.__spec__ or hasattr(main, "__file__")):
+        file = Path(getattr(main, "__file__", None) or "")
+        if b"__main__" in data and not (main.__spec__ or is_file(file)):
             return f"{name} is defined in a session without a file"
     return ""

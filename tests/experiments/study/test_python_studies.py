@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -302,3 +303,13 @@ def test_wrong_parts_of_a_study_are_refused_in_one_line(
     with pytest.raises(InputError) as refusal:
         skysim.run_study(study, out=tmp_path, **parts)
     assert message in str(refusal.value)
+
+
+def test_a_function_of_a_session_cannot_be_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes import the file of a script; a notebook or standard input has none."""
+    session = types.ModuleType("__main__")
+    exec("def mine(image):\n    return None\n", vars(session))
+    monkeypatch.setitem(sys.modules, "__main__", session)
+    assert "without a file" in own_code.unsendable({"mine": vars(session)["mine"]})
+    vars(session)["__file__"] = __file__
+    assert own_code.unsendable({"mine": vars(session)["mine"], "other": "python x.py"}) == ""
