@@ -45,6 +45,10 @@ CHUNK_BYTES = 1 << 20
 QUOTED_LINES = 3  # lines of standard error that an error message quotes
 FOLDER = re.compile(r"\{folder(?::(\w+))?\}")
 
+# External trackers and controllers by name: a command, or an object given in Python.
+Programs = Mapping[str, Any]
+NO_PROGRAMS: Programs = {}
+
 # Function from the header of a message, and the stream of the bytes that follow it, to an answer.
 Respond = Callable[[dict[str, Any], IO[bytes]], dict[str, Any]]
 

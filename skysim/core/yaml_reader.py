@@ -34,6 +34,8 @@ OverrideTexts = Mapping[str, str]  # YAML texts by dotted key
 # Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
 VERSION = 1
 
+# Stands for the file's name of a mapping that is given in Python, or in a study; its files are in the folder.
+MAPPING = "mapping"
 MAX_BYTES = 1 << 20  # of a file: a minute of reading
 MAX_KEPT = 1 << 15  # number of characters of a text whose values are cached
 MAX_NODES = 100_000  # of a document, counting the content of an alias each time
@@ -160,27 +162,71 @@ def parse_overrides(
     return overrides
 
 
-def override_texts(overrides: Mapping[str, Any] | None) -> dict[str, str]:
+def override_texts(
+    overrides: Mapping[str, Any] | None, base: Tree, whole: Sequence[str] = ()
+) -> dict[str, str]:
     """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON.
 
-    Numbers and arrays of numpy are those of Python. Raises InputError for values of other types.
+    A mapping gives the dotted keys in it, so that it changes only these: `{"exposure": {"frames": 3}}` is
+    `{"exposure.frames": 3}`. Some replace what the base has: an empty one, one with another `kind`, one over a value
+    that is no mapping, and those of the keys `whole`. Raises InputError for a key that is given twice, and for values
+    without a text.
     """
     if not isinstance(overrides, Mapping | None):
         raise InputError("overrides", excerpt(repr(overrides)), "values by dotted key")
-    texts = {}
-    for key, value in (overrides or {}).items():
+    texts: dict[str, str] = {}
 
-        def as_plain(value: Any, key: object = key) -> Any:
-            if isinstance(value, Path | datetime.date):
-                return str(value)
-            if hasattr(value, "tolist"):
-                return value.tolist()
-            raise InputError(key, excerpt(repr(value)), "text, numbers, lists and mappings")
-
+    def add(key: object, value: Any) -> None:
         if not isinstance(key, str):
             raise InputError("overrides", excerpt(repr(key)), "dotted keys")
-        texts[key] = value if isinstance(value, str) else json.dumps(value, default=as_plain)
+        below = value_at(base, key)
+        nested = isinstance(value, Mapping) and value and isinstance(below, dict)
+        if nested and key not in whole and value.get("kind") in (None, below.get("kind")):
+            for name, inner in value.items():
+                add(f"{key}.{name}", inner)
+            return
+        text = value if isinstance(value, str) else as_json(key, value)
+        if texts.setdefault(key, text) != text:
+            problem = f"given twice, as {excerpt(texts[key])} and as {excerpt(text)}"
+            raise InputError(key, problem, "one of the two", OVERRIDES)
+
+    for key, value in (overrides or {}).items():
+        add(key, value)
     return texts
+
+
+def value_at(tree: Any, key: str) -> Any:
+    """The value of a dotted key of a raw tree; an empty mapping without one."""
+    for part in key.split("."):
+        tree = tree.get(part, {}) if isinstance(tree, dict) else None
+    return tree
+
+
+def as_json(key: object, value: Any) -> str:
+    """A value given in Python as JSON; numbers and arrays of numpy, dates and paths are those of YAML.
+
+    Raises InputError for values of other types, with the key.
+    """
+
+    def as_plain(value: Any) -> Any:
+        if isinstance(value, Path | datetime.date):
+            return str(value)
+        if isinstance(value, Mapping):
+            return dict(value)
+        if hasattr(value, "tolist"):
+            return value.tolist()
+        raise TypeError(excerpt(repr(value)))
+
+    try:
+        return json.dumps(value, default=as_plain)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(key, error, "text, numbers, lists and mappings") from None
+
+
+def as_tree(keys: Mapping[str, Any]) -> tuple[Tree, str]:
+    """A file's keys given in Python as a tree of YAML values, and its YAML text. Raises InputError as `as_json`."""
+    tree = {"schema": VERSION, **{key: json.loads(as_json(key, keys[key])) for key in keys}}
+    return tree, yaml.safe_dump(tree, sort_keys=False)
 
 
 def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
@@ -412,6 +458,8 @@ def where_of(keys: list[str], files: Files, overrides: OverrideTexts) -> Where |
     matches = [(*line_of(text, keys), path) for path, text in files]
     # `max` takes the first file of those with equal depth; in Python there may be no file.
     _, line, path = max(matches, key=lambda match: match[0], default=(0, None, None))
+    if path and path.name == MAPPING:
+        return Where(f"{MAPPING}, files in {path.resolve().parent}")
     return Where(path, line) if path else None
 
 

@@ -15,7 +15,7 @@ import json
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from skysim.core.plugins import (
     PluginKind,
     Program,
     ProgramError,
+    Programs,
     describe_error,
     finite_array,
     host_command,
@@ -200,29 +201,6 @@ def _rotation(a_from_b_xyzw: Floats) -> Rotation:
 # The control law that calls an external controller.
 
 
-class ControllerSource(NamedTuple):
-    """External controllers other than entry points.
-
-    Attributes
-    ----------
-    programs
-        Commands of programs by name, from the user's command line
-    factory
-        Factory given to `skysim.simulate`, which replaces the law that the scene names
-    """
-
-    programs: Mapping[str, str] = {}
-    factory: Factory | None = None
-
-    def check_name(self, law: str) -> None:
-        """Raise InputError if no controller has this name."""
-        if self.factory is None:
-            CONTROLLERS.check_name(law, self.programs)
-
-
-NO_SOURCE = ControllerSource()
-
-
 class ExternalLaw:
     """An external controller with the methods of `attitude_control.Pid`. Stateful: one object per motion.
 
@@ -298,15 +276,19 @@ def external_law(
     reference: Reference,
     setup: ControllerSetup,
     config: ControlConfig,
-    source: ControllerSource,
+    programs: Programs,
 ) -> ExternalLaw:
-    """Start the controller that the scene names. Raises InputError if it is unknown or refuses the set-up."""
+    """Start the controller that the scene names. Raises InputError if it is unknown or refuses the set-up.
+
+    `programs` has the commands of programs, and factories given in Python, by name.
+    """
     name = config.law
-    source.check_name(name)
+    CONTROLLERS.check_name(name, programs)
+    given = programs.get(name)
     # A factory given in Python runs in this process.
-    if source.factory is not None:
+    if callable(given):
         try:
-            law = build_law(source.factory, setup)
+            law = build_law(given, setup)
         except Exception as error:
             raise InputError(CONTROLLERS.key, f"{name}: {describe_error(error)}") from error
         return ExternalLaw(
@@ -314,8 +296,8 @@ def external_law(
         )
     # A program of the command line, or an entry point that a host process of skysim runs.
     environment = None
-    if name in source.programs:
-        arguments = shlex.split(source.programs[name])
+    if given is not None:
+        arguments = shlex.split(given)
     else:
         arguments, environment = host_command("skysim.dynamics.controller_host", name)
     program = Program(

@@ -15,12 +15,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
 from skysim.dynamics.controllers import (
-    NO_SOURCE,
     ControllerSetup,
-    ControllerSource,
     ExternalLaw,
     external_law,
 )
@@ -96,7 +95,7 @@ class FlightComputer:
         scene: Scene,
         vehicle: VehicleModel,
         reference: Reference,
-        source: ControllerSource = NO_SOURCE,
+        programs: Programs = NO_PROGRAMS,
     ) -> None:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
@@ -120,7 +119,7 @@ class FlightComputer:
         self.motors = motors.get(self.config.actuators, vehicle.torques)
         self.names = [vehicle.model.actuator(number).name for number in self.motors]
         self.limit = self.actuator.command_map()[1]
-        self.law = self.build_law(scene, vehicle, reference, source)
+        self.law = self.build_law(scene, vehicle, reference, programs)
         if self.config.desaturation:
             self.momentum_dump = MomentumDump(
                 self.actuator_sets["fans"], Desaturator(self.config.desaturation)
@@ -131,14 +130,14 @@ class FlightComputer:
         scene: Scene,
         vehicle: VehicleModel,
         reference: Reference,
-        source: ControllerSource,
+        programs: Programs,
     ) -> Pid | ExternalLaw:
         """The control law that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         config = self.config
         assert config is not None
         torque_nm = authority_nm(self.actuator)
         rate_limit_rad_s = return_rate_limit_rad_s(scene)
-        if source.factory is None and config.law in BUILT_IN_LAWS:
+        if config.law in BUILT_IN_LAWS and config.law not in programs:
             return build_controller(
                 reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s
             )
@@ -156,7 +155,7 @@ class FlightComputer:
             scene.seed,
             dict(config.options),
         )
-        return external_law(reference, setup, config, source)
+        return external_law(reference, setup, config, programs)
 
     def close(self) -> None:
         """End the process of an external controller."""

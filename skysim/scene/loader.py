@@ -29,6 +29,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA, SCENES, shipped_files
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
+    MAPPING,
     Files,
     OverrideTexts,
     Tree,
@@ -41,7 +42,7 @@ from skysim.core.yaml_reader import (
 )
 from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
-from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, Scene
+from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, RawKeys, Scene
 from skysim.scene.sections.camera import CameraConfig, focus_distance
 
 PRESETS = DATA / "cameras"
@@ -293,28 +294,32 @@ def find(name: str) -> Path:
 
 
 def load(
-    name: str | Path, overrides: OverrideTexts | None = None, refuses_unused: bool = True
+    name: str | Path | Mapping[str, Any],
+    overrides: OverrideTexts | None = None,
+    refuses_unused: bool = True,
+    folder: Path = Path(),
 ) -> Scene:
-    """The validated scene of a file with overrides.
+    """The validated scene of a file or a mapping with overrides.
 
     Parameters
     ----------
     name
-        Name in scenes/, or path
+        Name in scenes/, or path, or a mapping with the keys of a file
     overrides
         YAML texts by dotted key, `path.to.key`
     refuses_unused
         Whether an option without effect is an error (unused.py)
+    folder
+        Folder of the files that a mapping names
 
     Raises
     ------
     InputError
         With one line: the key, the problem, the allowed values, the file and the line.
     """
-    path = find(str(name))
-    overrides = resolve_overrides(path, overrides or {})
     # 1. Files.
-    layers = read_layers(path)
+    layers = all_layers(name, folder)
+    overrides = resolve_overrides(layers[0].path, overrides or {})
     # 2. to 4. Merging and validation.
     scene = validate(layers, overrides)
     # 5. Options without effect.
@@ -336,7 +341,21 @@ def validate(layers: list[Layer], overrides: OverrideTexts) -> Scene:
         raise explain(error, Scene, tree, files, overrides) from None
     trees = (with_overrides({}, overrides), *(layer.tree for layer in layers))
     scene._inherited = inherited_keys(trees)
+    scene._source = RawKeys(tree)
     return scene
+
+
+def keys_of(scene: Scene) -> Tree:
+    """The keys from which a scene was loaded, with those of its bases. Raises InputError if they give another scene."""
+    keys = dict(scene._source)
+    made = load(keys, refuses_unused=False) if keys else None
+    if made is None or made.model_dump() != scene.model_dump():
+        raise InputError(
+            "scene",
+            "not as skysim.load_scene returned it",
+            "that, a mapping, or changes as overrides",
+        )
+    return keys
 
 
 def with_overrides(tree: Tree, overrides: OverrideTexts) -> Tree:
@@ -351,14 +370,24 @@ def with_overrides(tree: Tree, overrides: OverrideTexts) -> Tree:
     return tree
 
 
-def load_scene(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(
+    name: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
+) -> Scene:
     """`load` for Python: values of overrides may also be numbers, lists and mappings.
 
-        load_scene("shefex2", {"exposure.frames": 3, "exposure.time": "20 ms"})
+        load_scene("shefex2", {"exposure.frames": 3, "exposure": {"time": "20 ms"}})
 
-    A string is YAML, as on the command line; None switches a section off. Raises InputError.
+    A string is YAML, as on the command line; None switches a section off. A mapping changes the keys in it, as dotted
+    keys do; one with another `kind` replaces the section. Raises InputError.
+
+    Parameters
+    ----------
+    name
+        Name or path of a scene, or a mapping with the keys of its file, such as {"base": "shefex2", "seed": 7}, whose
+        file names are relative to the working directory
     """
-    return load(name, yaml_reader.override_texts(overrides))
+    base = merged(all_layers(name)) if overrides else {}
+    return load(name, yaml_reader.override_texts(overrides, base))
 
 
 def list_scenes() -> list[str]:
@@ -390,6 +419,13 @@ class Layer(NamedTuple):
     tree: Tree
 
 
+def all_layers(name: str | Path | Mapping[str, Any], folder: Path = Path()) -> list[Layer]:
+    """The layers of a scene; the arguments are those of `load`. Raises InputError."""
+    if isinstance(name, Mapping):
+        return layers_of(folder / MAPPING, *yaml_reader.as_tree(name))
+    return read_layers(find(str(name)))
+
+
 def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     """The layers of a scene: its file, its `base` scene, the base of that, and so on. Raises InputError.
 
@@ -404,6 +440,13 @@ def read_layers(path: Path, derived: tuple[Path, ...] = ()) -> list[Layer]:
     # A file with only a camera has no schema version.
     if derived or tree.keys() != {"camera"}:
         check_version(tree, path, text)
+    return layers_of(path, tree, text, derived)
+
+
+def layers_of(
+    path: Path, tree: Tree, text: str, derived: tuple[Path, ...] = ()
+) -> list[Layer]:
+    """The layers of a scene with these keys; the arguments are as in `Layer` and `read_layers`. Raises InputError."""
     tree = resolve_files(path, tree)
     if "base" not in tree:
         return [Layer(path, text, tree)]

@@ -162,6 +162,15 @@ def ephemeris_problem(start_time: datetime.datetime) -> str:
     return f"start_time {start_time} is outside {first} to {last}"
 
 
+class RawKeys(dict[str, Any]):
+    """The keys from which a scene was loaded. Equal to any other: the values of scenes are compared."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RawKeys)
+
+    __hash__ = None
+
+
 class SceneKind(ModelMetaclass):
     """The class of `Scene`: a scene from Python's keywords is refused in one line, like one from a file."""
 
@@ -204,6 +213,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
     # Keys of the vehicle that the loader took from a base with another vehicle.model.
     _inherited: tuple[str, ...] = ()
+    # Keys as loaded, see `loader.keys_of`.
+    _source: RawKeys = RawKeys()
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:

@@ -194,7 +194,7 @@ class Flight:
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
         self.motion = Motion(
-            lab, parts.controllers, self.duration_s, None if keeps_history else history_s(lab)
+            lab, parts.programs, self.duration_s, None if keeps_history else history_s(lab)
         )
         self.schedules = [
             Schedule(camera, number, math.inf if endless else camera.scene.exposure.frames)

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,17 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import Detector
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
+from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Mount, Sources
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.controllers import ControllerSource, Factory
+from skysim.dynamics.controllers import CONTROLLERS
 from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
@@ -51,7 +50,6 @@ from skysim.sources.camera_orbit import CameraOrbit, Viewpoint, build_orbit
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.photometry import Band
 from skysim.tracking import factory
-from skysim.tracking.external_tracker import FunctionTracker
 from skysim.tracking.tracker_interface import TRACKERS
 
 # Parts that are given in Python: a controller, a star tracker, or an attitude profile.
@@ -66,24 +64,16 @@ class UserParts:
     Attributes
     ----------
     programs
-        Commands of external trackers and controllers by name; only the user's command line sets them
-    controller
-        Factory of the control law
+        External trackers and controllers by name: commands, or controllers and trackers given in Python
     tracker
         Star tracker of the main camera
     profile
         Table of attitudes that replaces the file of the first maneuver of kind profile
     """
 
-    programs: Mapping[str, str] = field(default_factory=dict)
-    controller: Factory | None = None
+    programs: Programs = field(default_factory=dict)
     tracker: factory.Estimator | None = None
     profile: Any = None
-
-    @property
-    def controllers(self) -> ControllerSource:
-        """External controllers other than entry points."""
-        return ControllerSource(self.programs, self.controller)
 
 
 NO_PARTS = UserParts()
@@ -91,7 +81,7 @@ NO_PARTS = UserParts()
 
 def with_parts(
     scene: Scene,
-    programs: Mapping[str, str] = factory.NO_PROGRAMS,
+    programs: Programs = NO_PROGRAMS,
     controller: Any = None,
     tracker: Any = None,
     profile: Any = None,
@@ -105,31 +95,43 @@ def with_parts(
     """
     check_scene(scene)
     motion = scene.motion
-    law = None
     estimator = None
     if controller is not None:
-        motion, law = with_controller(motion, controller)
+        motion, programs = with_controller(motion, controller, programs)
     if profile is not None:
         motion = with_profile(motion, profile)
     scene = scene.model_copy(update={"motion": motion})
     if tracker is not None:
         scene, estimator = with_tracker(scene, tracker)
     table = None if isinstance(profile, str | Path) else profile
-    return scene, UserParts(programs, law, estimator, table)
+    return scene, UserParts(programs, estimator, table)
 
 
-def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:
-    """The motion with a controller, and the factory of the controller; None if it is given by name."""
+def with_controller(
+    motion: MotionConfig, controller: Any, programs: Programs
+) -> tuple[MotionConfig, Programs]:
+    """The motion with a controller, and the programs with that of Python."""
     config = motion.control or ControlConfig()
+    check_controller(controller)
+    law = controller if isinstance(controller, str) else name_of(controller)
+    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
+    return changed, programs if law is controller else {**programs, law: controller}
+
+
+def check_controller(controller: Any) -> None:
+    """Raise InputError for what is no controller."""
     if not (isinstance(controller, str) or callable(controller)):
         raise InputError(
             "controller",
             type(controller).__name__,
             "a name, or a callable that takes a set-up",
         )
-    law = controller if isinstance(controller, str) else name_of(controller)
-    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
-    return changed, None if isinstance(controller, str) else controller
+
+
+def check_tracker(tracker: Any) -> None:
+    """Raise InputError for what is no tracker."""
+    if not isinstance(tracker, str):
+        factory.tracker_of(name_of(tracker), tracker)
 
 
 def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
@@ -150,21 +152,8 @@ def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
 
 def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
     """The scene with the name of a tracker, and the tracker; None if it is given by name."""
-    estimator: factory.Estimator | None = None
-    if isinstance(tracker, StarTracker | DomeTracker):
-        estimator = tracker
-    elif callable(tracker) and not isinstance(tracker, type):
-        estimator = FunctionTracker(name_of(tracker), tracker)
-    elif not isinstance(tracker, str):
-        what = (
-            f"the class {tracker.__name__}"
-            if isinstance(tracker, type)
-            else type(tracker).__name__
-        )
-        raise InputError(
-            "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
-        )
     name = tracker if isinstance(tracker, str) else name_of(tracker)
+    estimator = None if name is tracker else factory.tracker_of(name, tracker)
     config = scene.tracker.model_copy(update={"name": name})
     return scene.model_copy(update={"tracker": config}), estimator
 
@@ -364,7 +353,7 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     check_scene(scene)
     check_hardware(scene, parts.programs, parts.tracker is None)
     if scene.motion.control:
-        parts.controllers.check_name(scene.motion.control.law)
+        CONTROLLERS.check_name(scene.motion.control.law, parts.programs)
     # 2. Vehicle.
     vehicle = multibody.build(scene.vehicle)
     mount = multibody.camera_mount(vehicle)
@@ -441,7 +430,7 @@ def build_canvas(scene: Scene) -> NDArray:
     return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)
 
 
-def check_hardware(scene: Scene, programs: Mapping[str, str], has_tracker: bool) -> None:
+def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:
     """Raise InputError for unusable names and files of a camera and its tracker.
 
     has_tracker says whether the scene names the tracker; else the user gives it.
@@ -461,7 +450,7 @@ def build_head(
     vehicle: multibody.VehicleModel,
     main: StarCamera,
     shown: catalog.Catalog | None,
-    programs: Mapping[str, str],
+    programs: Programs,
 ) -> StarCamera:
     """Head n of the scene: a further camera on the same vehicle under the same lights.
 
@@ -494,9 +483,7 @@ def lab_from_body_start(
     return guidance.start_attitude(scene.motion, profiles)
 
 
-def build_tracker(
-    camera: StarCamera, programs: Mapping[str, str] = factory.NO_PROGRAMS
-) -> factory.Estimator:
+def build_tracker(camera: StarCamera, programs: Programs = NO_PROGRAMS) -> factory.Estimator:
     """The star tracker of a camera, with the hardware parameters that it assumes (see tracking/factory.py).
 
     Parameters
@@ -504,6 +491,6 @@ def build_tracker(
     camera
         Star camera
     programs
-        Commands of external trackers by name
+        External trackers by name
     """
     return factory.build_tracker(camera.scene, camera.mount, camera.sources, programs)

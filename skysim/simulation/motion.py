@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
+from skysim.core.plugins import Programs
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
 from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.dynamics import guidance, imu, multibody
-from skysim.dynamics.controllers import ControllerSource
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import FlightComputer, controlling_actuator, usage
 from skysim.dynamics.guidance import Reference
@@ -412,8 +412,8 @@ class Motion:
     ----------
     lab
         Laboratory
-    controllers
-        External controllers other than entry points
+    programs
+        External controllers other than entry points, by name
     duration_s
         Greatest duration; may be infinite with `kept_s`
     kept_s
@@ -428,7 +428,7 @@ class Motion:
     def __init__(
         self,
         lab: Lab,
-        controllers: ControllerSource,
+        programs: Programs,
         duration_s: float,
         kept_s: float | None = None,
     ) -> None:
@@ -446,7 +446,7 @@ class Motion:
             self.vibration.subdivisions(
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
-        self.flight_computer = FlightComputer(scene, vehicle, self.reference, controllers)
+        self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
         self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
         impulses = guidance.impulses(scene.motion, self.reference)
         self.disturbances = build_disturbances(lab, impulses, self.flight_computer.period_s)

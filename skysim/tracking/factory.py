@@ -33,6 +33,7 @@ from estimator.trackers.pipeline import Report, Settings, monochrome
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
@@ -130,11 +131,21 @@ def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -
 UserTracker = ExternalTracker | FunctionTracker  # each frame must reach it once, in order
 Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
 
-NO_PROGRAMS: Mapping[str, str] = {}
+
+def tracker_of(name: str, given: Any) -> Estimator:
+    """A star tracker given in Python, as `UserTracker` if it is a function of an image. Raises InputError."""
+    if isinstance(given, StarTracker | DomeTracker | FunctionTracker):
+        return given
+    if callable(given) and not isinstance(given, type):
+        return FunctionTracker(name, given)
+    what = f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
+    raise InputError(
+        "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
+    )
 
 
 def build_tracker(
-    scene: Scene, mount: Mount, sources: Sources, programs: Mapping[str, str] = NO_PROGRAMS
+    scene: Scene, mount: Mount, sources: Sources, programs: Programs = NO_PROGRAMS
 ) -> Estimator:
     """The star tracker with the hardware parameters that it assumes: those of the scene's section `tracker`, or the
     true ones.
@@ -148,13 +159,16 @@ def build_tracker(
     sources
         LEDs or stars of the scene's light
     programs
-        Commands of external trackers by name, for `tracker.name`
+        Commands of external trackers, and trackers given in Python, by name, for `tracker.name`
 
     Raises
     ------
     InputError
         For a dome or a catalog that the tracker cannot use.
     """
+    name = scene.tracker.name
+    if not isinstance(programs.get(name, ""), str):
+        return tracker_of(name, programs[name])
     if isinstance(scene.light, DomeConfig):
         return build_dome_tracker(scene, scene.light, mount, sources, programs)
     return build_sky_tracker(scene, programs)
@@ -165,7 +179,7 @@ def build_dome_tracker(
     dome: DomeConfig,
     mount: Mount,
     sources: Sources,
-    programs: Mapping[str, str],
+    programs: Programs,
 ) -> DomeTracker | CodedTracker | ExternalTracker:
     """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
     settings = assumed_settings(scene)
@@ -185,9 +199,7 @@ def build_dome_tracker(
         raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
 
 
-def build_sky_tracker(
-    scene: Scene, programs: Mapping[str, str]
-) -> StarTracker | ExternalTracker:
+def build_sky_tracker(scene: Scene, programs: Programs) -> StarTracker | ExternalTracker:
     """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)

@@ -103,7 +103,7 @@ def test_an_interrupt_in_another_exception_is_no_failed_trial(
 
     monkeypatch.setitem(trials.TRIALS, "centroids", wrapped)
     with pytest.raises(KeyboardInterrupt):
-        trials.run_trial(SKY, trials.Segment(0, {}, 0, range(1)), 0, 0)
+        trials.run_block(SKY, trials.Segment(0, {}, 0, range(1)))
 
 
 @pytest.mark.slow

@@ -1,9 +1,12 @@
 """Every command of docs/howto/study.md runs, in its order, in one folder; its study is one."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from skysim.core.paths import ROOT
 from tests.helpers import doc_pages as pages
 
 PAGE = "docs/howto/study.md"
@@ -31,3 +34,13 @@ def test_the_study_block_loads_as_a_study(folder):
     )
     assert (report["done"], report["failed"], report["wrong"]) == (4 * 2 * 2 * 2, 0, 0)
     assert (folder / "out" / "lens" / "report.html").is_file()
+
+
+def test_the_python_blocks_run_in_order(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    session: dict[str, Any] = {}
+    page = (ROOT / PAGE).read_text("utf-8")
+    for block in re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE):
+        exec(compile(block, PAGE, "exec"), session)
+    assert list(session["result"].table()["refused"]) == [0, 1]
+    assert (tmp_path / "out" / "pyramid" / "pyramid.yaml").is_file()

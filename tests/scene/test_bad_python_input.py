@@ -49,7 +49,7 @@ def test_numbers_of_numpy_are_those_of_python() -> None:
         "camera.detector.noise": np.bool_(False),
     }
     plain = {key: value.tolist() for key, value in values.items()}
-    assert override_texts(values) == override_texts(plain)
+    assert override_texts(values, {}) == override_texts(plain, {})
 
 
 @pytest.mark.parametrize("schema", ["scene", "study"])

@@ -24,7 +24,13 @@ from skysim.simulation.flight import Flight, open_flight, simulate_motion
 from skysim.simulation.lab import build_lab
 from skysim.tracking.tracker_interface import Answer
 
-ONE = {"exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "2 s"}}
+
+def exposures(first: str, frames: int = 1, rate_hz: int = 1) -> dict[str, Any]:
+    keys = {"time": "10 ms", "rate_hz": rate_hz, "frames": frames, "first": first}
+    return {f"exposure.{key}": value for key, value in keys.items()}
+
+
+ONE = exposures("2 s")
 PRESCRIBED = {"motion.control": "prescribed", **ONE}
 TIMES = np.arange(0.0, 4.05, 0.1)
 
@@ -101,7 +107,7 @@ def test_a_prescribed_motion_is_measured_by_the_gyros() -> None:
             {"kind": "slew", "yaw_deg": 8, "rate_deg_s": 4, "acceleration_deg_s2": 4}
         ],
         "filter": None,
-        "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"},
+        **exposures("4 s"),
     }
     samples = moved("simsat_bump", changes).imu_samples()
     assert samples is not None
@@ -238,9 +244,7 @@ def test_a_profile_that_the_vehicle_cannot_follow_is_refused(
     scene: str, changes: dict[str, Any], size_deg: float, message: str
 ) -> None:
     """The torque of Euler's equation, the gyros' range and the tilt stop. A fifth of the angles is followed."""
-    ways = {
-        "exposure": {"time": "10 ms", "rate_hz": 1, "frames": 1, "first": "4 s"}
-    } | changes
+    ways = exposures("4 s") | changes
     with pytest.raises(InputError, match=message) as raised:
         moved(scene, ways, profile=swing(TIMES, size_deg))
     assert str(raised.value).startswith("motion.maneuver")
@@ -458,7 +462,7 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
     changes = {
         "motion.start": {},
         "motion.maneuver": [],
-        "exposure": {"time": "10 ms", "rate_hz": 4, "frames": 12, "first": "0.1 s"},
+        **exposures("0.1 s", frames=12, rate_hz=4),
         "filter.gate_sigma": 1e9,
         "filter.latency": "0 s",
     }

@@ -536,8 +536,9 @@ def measure(
     cells = list(designer.cells())
     tree = study_tree(scene_name, scene, overrides, size, cells)
     path = make_folder(folder) / STUDY
-    write_text(path, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120))
-    plan = make_plan(path, Study.model_validate(tree), tree["trial"], {})
+    text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120)
+    write_text(path, text)
+    plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
     for cell in cells:
         try:
             resolve_point(plan.spec, cell.settings)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import yaml
@@ -24,6 +24,7 @@ from pydantic import (
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES
+from skysim.core.plugins import Programs
 from skysim.core.units import (
     ConfigModel,
     Declination,
@@ -39,6 +40,7 @@ from skysim.core.units import (
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
+from skysim.experiments.study.own_code import digests_of
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
 from skysim.scene.scene import Requirements, Scene
@@ -254,76 +256,76 @@ class Budget(ConfigModel):
     failures: PositiveInt | None = None
 
 
-class Curve(ConfigModel):
-    """A figure: one response against a factor, with a line for each level of another factor."""
+class Selection(ConfigModel):
+    """Base of what a study shows: at some levels of the factors.
 
-    kind: Literal["curve"]
-    x: str
-    y: str
-    by: str | None = None
+    Attributes
+    ----------
+    AXES
+        Keys that name a factor
+    """
+
+    AXES: ClassVar[tuple[str, ...]]
     where: dict[str, Value] = Field(default_factory=dict)
+
+    @property
+    def axes(self) -> dict[str, str | None]:
+        """The factors that it shows, by key."""
+        return {key: getattr(self, key) for key in self.AXES}
+
+
+class FigureKeys(Selection):
+    """Base of the figures; RESPONSE is the key of the response."""
+
+    RESPONSE: ClassVar[str]
     log: bool = False
 
     @property
     def response(self) -> str:
         """The response that the figure shows."""
-        return self.y
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"x": self.x, "by": self.by}
+        return str(getattr(self, self.RESPONSE))
 
 
-class Map(ConfigModel):
+class Curve(FigureKeys):
+    """A figure: one response against a factor, with a line for each level of another factor."""
+
+    AXES = ("x", "by")
+    RESPONSE = "y"
+    kind: Literal["curve"]
+    x: str
+    y: str
+    by: str | None = None
+
+
+class Map(FigureKeys):
     """A figure: one response over the directions of the random attitudes, a panel for each level of another factor.
 
     Under a dome the direction is that of the body's z axis, tilt as radius and azimuth as angle; under the stars it is
     the boresight's, in a projection of the whole sky.
     """
 
+    AXES = ("by",)
+    RESPONSE = "value"
     kind: Literal["map"]
     value: str
     by: str | None = None
-    where: dict[str, Value] = Field(default_factory=dict)
-    log: bool = False
-
-    @property
-    def response(self) -> str:
-        """The response that the figure shows."""
-        return self.value
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"by": self.by}
 
 
-class Heat(ConfigModel):
+class Heat(FigureKeys):
     """A figure: one response over two factors."""
 
+    AXES = ("x", "y")
+    RESPONSE = "value"
     kind: Literal["heat"]
     x: str
     y: str
     value: str
-    where: dict[str, Value] = Field(default_factory=dict)
-    log: bool = False
-
-    @property
-    def response(self) -> str:
-        """The response that the figure shows."""
-        return self.value
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors that it shows, by key."""
-        return {"x": self.x, "y": self.y}
 
 
 Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
 
 
-class Threshold(ConfigModel):
+class Threshold(Selection):
     """Where along a factor a proportion crosses a limit, such as the rate at which 95 % of the frames are identified.
 
     Attributes
@@ -336,16 +338,11 @@ class Threshold(ConfigModel):
         One threshold for each level of this factor
     """
 
+    AXES = ("along", "by")
     response: str
     limit: InnerFraction
     along: str
     by: str | None = None
-    where: dict[str, Value] = Field(default_factory=dict)
-
-    @property
-    def axes(self) -> dict[str, str | None]:
-        """The factors of the threshold, by key."""
-        return {"along": self.along, "by": self.by}
 
 
 class Cost(ConfigModel):
@@ -407,8 +404,8 @@ class Study(ConfigModel):
     Attributes
     ----------
     scene
-        Name, or path relative to the study file's folder; `set` overrides keys of it at all
-        points
+        Name, or path relative to the study file's folder, or the keys of a scene; `set`
+        overrides keys of it at all points
     paired
         Use the same random attitudes and noise at every point for each replicate (common random
         numbers); by default in all designs but lhs and sobol, whose trials are evaluated together
@@ -426,7 +423,7 @@ class Study(ConfigModel):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    scene: str
+    scene: str | dict[str, Any]
     seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
@@ -479,18 +476,21 @@ class TrialSpec:
     hardware
         Keys of the seeds that every replicate draws anew
     programs
-        Commands of external trackers by name, from the command line; not part of the study's
-        digest
+        External trackers and controllers by name: commands from the command line, functions and
+        objects from Python; not part of the study's digest
+    digests
+        Digests of these functions and objects
     """
 
-    scene: str
+    scene: str | Tree
     folder: str
     seed: int
     base: Settings
     trial: Tree
     paired: bool
     hardware: tuple[str, ...] = ()
-    programs: Mapping[str, str] = field(default_factory=dict)
+    programs: Programs = field(default_factory=dict)
+    digests: Mapping[str, str] = field(default_factory=dict)
 
     def trial_settings(self, settings: Settings, replicate: int) -> Settings:
         """The settings of a point's trial: those of the point, and the replicate's draws of the hardware.
@@ -513,6 +513,8 @@ class Plan:
     ----------
     prices
         Prices of `optimize.cost.parts`
+    text
+        Text of the study's file
     """
 
     path: Path
@@ -520,6 +522,7 @@ class Plan:
     spec: TrialSpec
     points: list[Point]
     prices: Prices | None = None
+    text: str = ""
 
     @property
     def name(self) -> str:
@@ -563,7 +566,9 @@ def find(name: str) -> Path:
     return yaml_reader.find_file(name, STUDIES, "study")
 
 
-def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]) -> Plan:
+def make_plan(
+    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
+) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -575,11 +580,13 @@ def make_plan(path: Path, study: Study, trial: Tree, programs: Mapping[str, str]
         study.paired,
         study.hardware,
         dict(programs),
+        digests_of(programs),
     )
     if study.optimize is None:
-        return Plan(path, study, spec, points(study.design, study.factors, study.seed))
+        chosen = points(study.design, study.factors, study.seed)
+        return Plan(path, study, spec, chosen, text=text)
     parts = study.optimize.cost.parts
-    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None)
+    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None, text)
 
 
 def prices_of(parts: str, folder: Path) -> Prices:
@@ -594,16 +601,16 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     """The scene and the trial at a point, with its settings applied. Raises InputError with one line."""
     trial = resolve_trial(spec, settings)
     values = spec.base | settings
-    name = str(values.pop("scene", spec.scene))
-    local = Path(spec.folder) / name
-    path = (
-        local if local.suffix in {".yaml", ".yml"} and is_file(local) else loader.find(name)
-    )
+    name = values.pop("scene", spec.scene)
+    folder = Path(spec.folder)
+    local = folder / str(name)
+    if local.suffix in {".yaml", ".yml"} and is_file(local):
+        name = local
     overrides = {
         key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
     }
     # `unused_options` refuses unused keys, for the whole study.
-    return loader.load(path, overrides, refuses_unused=False), trial
+    return loader.load(name, overrides, refuses_unused=False, folder=folder), trial
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:

@@ -9,7 +9,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.plugins import Programs
 from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
@@ -73,7 +76,7 @@ MEASURED_BY: dict[str, tuple[str, ...]] = {
 def load(
     name: str | Path,
     overrides: OverrideTexts | None = None,
-    programs: Mapping[str, str] | None = None,
+    programs: Programs | None = None,
 ) -> Plan:
     """Read, override (`path.to.key` -> YAML value) and validate a study and every level of its factors.
 
@@ -103,7 +106,7 @@ def plan_of(
     base: Path | None = None,
     *,
     overrides: OverrideTexts | None = None,
-    programs: Mapping[str, str] | None = None,
+    programs: Programs | None = None,
 ) -> Plan:
     """The validated plan of a study's tree, read from a text.
 
@@ -124,7 +127,7 @@ def plan_of(
     except ValidationError as error:
         raise explain(error, Study, tree, [(path, text)], overrides or {}) from None
     try:
-        plan = make_plan(base or path, study, tree["trial"], programs or {})
+        plan = make_plan(base or path, study, tree["trial"], programs or {}, text)
         check(plan, to_run=programs is not None)
     except InputError as error:  # about a key of the study: add file and line
         if error.where in (None, OVERRIDES):
@@ -272,9 +275,10 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
         TRACKERS.check_name(tracker, plan.spec.programs)
         if scene.motion.control:
             CONTROLLERS.check_name(scene.motion.control.law, plan.spec.programs)
-        if tracker != OWN and isinstance(
-            trial, CentroidTrial
-        ):  # an external tracker takes images
+        # An external tracker takes images.
+        given = plan.spec.programs.get(tracker)
+        takes_centroids = tracker == OWN or isinstance(given, StarTracker | DomeTracker)
+        if isinstance(trial, CentroidTrial) and not takes_centroids:
             raise InputError(
                 "tracker.name", f"{tracker} needs frames", f"{OWN}, or another trial.kind"
             )

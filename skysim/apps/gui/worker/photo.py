@@ -40,7 +40,7 @@ from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.setups import prepared_setup
 from skysim.experiments.study.execution.store import STORE
-from skysim.experiments.study.execution.trials import run_trial
+from skysim.experiments.study.execution.trials import run_block
 from skysim.results import plots, scoring
 
 
@@ -114,7 +114,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     plan = study_file.load(study)
     with store.open_store(folder / STORE) as stored:
         segment = runner.segment_of(plan, stored, trial)
-    row = run_trial(plan.spec, segment, trial, segment.replicates[0])
+    (row,) = run_block(plan.spec, segment)
     setup = prepared_setup(plan.spec, segment.settings)
     frame, truth, report = runner.replayed_frame(setup, row.seed)
     result = tracker_result(setup.lab, setup.estimator, frame, truth, report)

@@ -216,18 +216,19 @@ def prepare_store(
             store.path, problem, f"{code_version()}, the version here, or another store"
         )
     if done:
+        check_functions(plan, store)
         check_scene(plan, store)
     if stored != plan.digest or not done:
-        text = plan.path.read_text(encoding="utf-8")
         file = str(plan.path.resolve())
         store.begin(
             plan.points,
             grown=(kept, plan.study.replicates) if done else None,
-            study=text,
+            study=plan.text,
             file=file,
             title=plan.study.title,
             code=code_version(),
             digest=plan.digest,
+            functions=json.dumps(plan.spec.digests),
             replicates=str(plan.study.replicates),
             overrides=json.dumps(dict(overrides or {})),
         )
@@ -249,13 +250,25 @@ def stored_replicates(plan: Plan, store: Store) -> int:
     return fewer if same and 0 < fewer < plan.study.replicates else 0
 
 
+def check_functions(plan: Plan, store: Store) -> None:
+    """Raise InputError if a tracker or controller given in Python differs from that of the stored trials."""
+    with store.corruption_as_input_error():
+        kept = dict(json.loads(store.meta("functions") or "{}"))
+    now = plan.spec.digests
+    for name in sorted({*kept, *now}):
+        if kept.get(name) != now.get(name):
+            then = f"code {kept[name]} then" if name in kept else "not given in Python then"
+            problem = f"{name}: {then}, {now.get(name, 'not given')} now"
+            raise InputError(store.path, problem, "another store, or the original function")
+
+
 def check_scene(plan: Plan, store: Store) -> None:
     """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
     points = store.points()
     for point, replicate, stored in store.scenes():
         with store.corruption_as_input_error():
             settings = plan.spec.trial_settings(points[point].settings, replicate)
-        now = scene_hash(resolve_point(plan.spec, settings)[0])
+        now = scene_hash(resolve_point(plan.spec, settings)[0], plan.spec.digests)
         if now != stored:
             raise InputError(
                 store.path,
@@ -373,7 +386,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     rendered before it are also written.
     """
     segment = segment_of(plan, store, trial)
-    row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
+    (row,) = trials.run_block(plan.spec, segment)
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
     changed = [name for name, value in now.items() if stored and stored[name] != value]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.paths import DATA, ROOT
+from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Trial, TrialSpec, digest, resolve_point
@@ -33,7 +34,7 @@ class TrialSetup(NamedTuple):
     estimator: factory.Estimator
     trial: Trial
     scene_hash: str
-    programs: Mapping[str, str] = factory.NO_PROGRAMS
+    programs: Programs = NO_PROGRAMS
 
 
 class SetupCache(threading.local):
@@ -48,7 +49,8 @@ CACHE = SetupCache()
 
 def setup_key(spec: TrialSpec, settings: Settings) -> str:
     """Key of a design point's setup in the cache."""
-    return digest([spec.scene, spec.folder, spec.base, spec.trial, spec.programs, settings])
+    programs = {**spec.programs, **spec.digests}
+    return digest([spec.scene, spec.folder, spec.base, spec.trial, programs, settings])
 
 
 def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialSetup:
@@ -73,7 +75,7 @@ def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialS
 def build_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
     """Build hardware and tracker of a point, or reuse those of a cached setup that differs only in its trial."""
     scene, trial = resolve_point(spec, settings)
-    hash_ = scene_hash(scene)
+    hash_ = scene_hash(scene, spec.digests)
     for setup in CACHE.setups.values():
         if setup.scene_hash == hash_ and setup.programs == spec.programs:
             return setup._replace(trial=trial)
@@ -91,8 +93,11 @@ def build_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
     )
 
 
-def scene_hash(scene: Scene) -> str:
-    """Hash of a scene, of the files it names, and of the releases of external tracker, controller and lights."""
+def scene_hash(scene: Scene, digests: Mapping[str, str] = NO_PROGRAMS) -> str:
+    """Hash of a scene, of the files it names, and of the releases of external tracker, controller and lights.
+
+    A tracker or controller given in Python has a digest by its name.
+    """
     tree = scene.model_dump(mode="json", by_alias=True)
     contents = [
         sha256(Path(path).read_bytes()).hexdigest()
@@ -105,6 +110,8 @@ def scene_hash(scene: Scene) -> str:
     ]
     if scene.motion.control and (release := CONTROLLERS.release(scene.motion.control.law)):
         releases.append(release)
+    law = scene.motion.control.law if scene.motion.control else ""
+    releases += [digests[name] for name in (scene.tracker.name, law) if name in digests]
     return digest([tree, contents, *releases])
 
 

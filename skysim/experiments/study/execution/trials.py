@@ -214,13 +214,6 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     ]
 
 
-def run_trial(spec: TrialSpec, segment: Segment, trial: int, replicate: int) -> Row:
-    """Run one trial of a segment's point; an exception is stored in its row."""
-    return run_block(
-        spec, segment._replace(first=trial, replicates=range(replicate, replicate + 1))
-    )[0]
-
-
 def run_centroid_trials(setup: TrialSetup, seeds: Sequence[int]) -> list[Outcome]:
     """Centroid trials: at a random attitude, noisy true detections and false ones are identified and solved.
 

@@ -200,8 +200,9 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
     changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
     attitudes = f"{'the same' if study.paired else 'other'} attitudes at every point"
+    name = study.scene if isinstance(study.scene, str) else scene.title
     return [
-        ("scene", study.scene + (f", with {changed}" if changed else "")),
+        ("scene", name + (f", with {changed}" if changed else "")),
         ("light", light_text(scene, lab)),
         ("camera", camera_text(scene.camera)),
         ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
@@ -216,6 +217,10 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, s
         *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
         ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
         *([("drawn in every trial", ", ".join(study.hardware))] if study.hardware else []),
+        *(
+            (f"given in Python: {own}", f"code {code}")
+            for own, code in plan.spec.digests.items()
+        ),
     ]
 
 
