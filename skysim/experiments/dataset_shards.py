@@ -115,6 +115,7 @@ class Storage:
 
 ZARR = "images.zarr"
 ZARR_ARRAY = "images"
+IMAGE_NAME = {False: "image.npy", True: "image.npz"}  # of a frame in a tar; True: compressed
 BLOCK = 512  # bytes of a block of a tar file
 COCO_SNR = 3.0  # sources below have no annotation; they are in the other labels
 CATEGORIES = ("source", *MASKS)
@@ -169,11 +170,19 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
     return f"{folder}/{shard:06d}.{suffix}"
 
 
-def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: Record) -> int:
-    """Append a frame with its labels; return the position of its first pixel."""
+def add_frame(
+    tar: TarWriter, number: int, one: LabelledFrame, labels: Record, compress: bool
+) -> int:
+    """Append a frame with its labels; return the position of its first pixel, -1 if it is compressed (an .npz)."""
     key = key_of(number)
     image = np.ascontiguousarray(one.frame.image_dn)
-    position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
+    if compress:
+        packed = io.BytesIO()
+        np.savez_compressed(packed, image=image)
+        tar.add(f"{key}.{IMAGE_NAME[True]}", packed.getvalue())
+        position = -1
+    else:
+        position = tar.add(f"{key}.{IMAGE_NAME[False]}", to_npy(image), image.data.cast("B"))
     tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
     masks = {
         name: {"size": list(image.shape), "counts": counts}
@@ -217,14 +226,12 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
 # COCO.
 
 
-def coco_image(labels: Record) -> Record:
+def coco_image(labels: Record, compress: bool) -> Record:
     """The entry of an image; its file is in the tar of the shard."""
-    name = (
-        f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
-    )
+    tar = shard_name("shards", labels["shard"], "tar")
     return {
         "id": labels["frame"],
-        "file_name": name,
+        "file_name": f"{tar}/{key_of(labels['frame'])}.{IMAGE_NAME[compress]}",
         "height": labels["height"],
         "width": labels["width"],
     }

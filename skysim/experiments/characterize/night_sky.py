@@ -325,7 +325,7 @@ def read_frame(
     as_stored takes the first row of a file without a row order for the highest.
     """
     picture = images.read_picture(path)
-    numbers = raw_numbers(path, picture.pixels)
+    numbers = raw_numbers(path, picture)
     if as_stored and not picture.row_order_known:
         numbers = np.ascontiguousarray(numbers[::-1])
     images.check_size(path, numbers, (config.height_px, config.width_px))
