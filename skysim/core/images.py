@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core import encoded
+from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
 from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
@@ -258,7 +259,6 @@ NPY = ".npy"
 CAMERA_RAW = (".dng", ".cr2", ".nef", ".arw")  # of digital cameras with a Bayer mosaic
 IMAGE_SUFFIXES = (*SUFFIXES, *encoded.SUFFIXES, NPY, *CAMERA_RAW)
 NOISE_E = 10.0  # assumed noise of a pixel, of read-out and sky, in frames of unknown scale
-SIGMA_PER_MAD = 1.4826  # of a Gaussian
 WHOLE_SCALE = 65535.0  # of frames without noise
 LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order
 
