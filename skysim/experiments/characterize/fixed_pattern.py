@@ -30,6 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Transfer,
     exposures_s,
     median_and_spread,
+    slopes,
 )
 from skysim.results import metrics
 
@@ -191,13 +192,8 @@ def maximize(
     total = counts.sum()
     p = probabilities(theta, edges, noise)
     for _ in range(STEPS):
-        slope = np.empty((len(theta), p.size))
-        for n in range(len(theta)):
-            moved = np.zeros(len(theta))
-            moved[n] = DIFFERENCE
-            above = probabilities(theta + moved, edges, noise)
-            below = probabilities(theta - moved, edges, noise)
-            slope[n] = (above - below) / (2 * DIFFERENCE)
+        step = np.full(len(theta), DIFFERENCE)
+        slope = slopes(lambda one: probabilities(one, edges, noise), theta, step)
         information = total * (slope / p) @ slope.T
         score = slope @ (counts / p)
         step = np.linalg.solve(information, score)
@@ -345,5 +341,5 @@ def smooth(image: Floats, usable: Bools) -> Floats:
     root = np.sqrt(count)
     matrix = np.zeros(low.shape)
     matrix[low] = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)[0]
-    sides = (2 * np.arange(size) / size - 1 for size in image.shape)
-    return np.asarray(polynomial.polygrid2d(*sides, matrix), dtype=np.float64)
+    down, across = (2 * np.arange(size) / size - 1 for size in image.shape)
+    return np.asarray(polynomial.polygrid2d(down, across, matrix), dtype=np.float64)

@@ -91,9 +91,8 @@ def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
         raise InputError(
             path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel"
         )
-    if images.image_suffix(path.name) in (".jpg", ".jpeg", ".webp"):
-        kind = "WebP" if path.suffix.lower() == ".webp" else "JPEG"
-        raise InputError(path, f"{kind} changes the noise", "raw frames in FITS, PNG or TIFF")
+    if images.image_suffix(path.name) in (".jpg", ".jpeg"):
+        raise InputError(path, "JPEG changes the noise", "raw frames in FITS, PNG or TIFF")
     if pixels.dtype.kind == "f" and not np.all(pixels == np.rint(pixels)):
         raise InputError(path, "numbers that are not whole, as of an average", "raw frames")
     if pixels.min() < 0 or pixels.max() > 65535:
