@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, ndimage
 
 from skysim.camera.optics import Optics
 from skysim.camera.projection import image_tracks, in_view, poses, project, sample_times
@@ -372,12 +371,7 @@ def whole(
     """The truth of one body, as one row, from its own light on a part of the image that begins at corner_px (x, y)."""
     electrons = own_e.sum(dtype=float)
     y, x = np.unravel_index(np.argmax(own_e), own_e.shape)
-    columns = own_e.sum(axis=0, dtype=float)
-    rows = own_e.sum(axis=1, dtype=float)
-    # Center of gravity (sum e x, sum e y) / sum e.
-    center = (
-        np.array([columns @ np.arange(len(columns)), rows @ np.arange(len(rows))]) / electrons
-    )
+    center = np.array(ndimage.center_of_mass(own_e.astype(float)))[::-1]
     return SourceTruth(
         id=np.array([body.id]),
         xy_px=center_px[None],
@@ -437,7 +431,5 @@ def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
     """The rows of several truths, in their order, as one."""
     if len(truths) == 1:
         return truths[0]
-    names = [field.name for field in fields(SourceTruth)]
-    return SourceTruth(
-        **{name: np.concatenate([getattr(truth, name) for truth in truths]) for name in names}
-    )
+    columns = ([getattr(truth, name) for truth in truths] for name in SourceTruth.__slots__)
+    return SourceTruth(*map(np.concatenate, columns))

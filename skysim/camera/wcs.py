@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -196,15 +197,13 @@ def brown(camera: OpencvCalibration) -> tuple[Coefficients, Coefficients]:
     y^2 are multiplied out by the binomial theorem.
     """
     k1, k2, p1, p2, k3 = camera.distortion
-    binomials = {1: (1, 1), 2: (1, 2, 1), 3: (1, 3, 3, 1)}
     across: Coefficients = {(1, 1): 2 * p1, (2, 0): 3 * p2, (0, 2): p2}
     down: Coefficients = {(1, 1): 2 * p2, (0, 2): 3 * p1, (2, 0): p1}
     for n, k in ((1, k1), (2, k2), (3, k3)):
-        for m, times in enumerate(binomials[n]):
+        for m in range(n + 1):
             p = 2 * (n - m)
             q = 2 * m
-            across[p + 1, q] = k * times
-            down[p, q + 1] = k * times
+            across[p + 1, q] = down[p, q + 1] = k * math.comb(n, m)
     return in_pixels(across, camera.focal_px), in_pixels(down, camera.focal_px)
 
 

@@ -1,8 +1,9 @@
-"""PNG, TIFF, JPEG and BMP images, whose declared size is checked before OpenCV decodes them.
+"""PNG, TIFF, JPEG, BMP, WebP and PGM or PPM images, whose declared size is checked before OpenCV decodes them.
 
-A few bytes of a damaged or hostile file can declare an image that exceeds the memory. Pillow reads the headers of JPEG
-and BMP. PNG and TIFF headers are parsed here: the chunks of a PNG can be as harmful as its size, and Pillow does not
-open TIFF files of 64-bit floats and uses the last of a repeated tag where libtiff uses the first.
+A few bytes of a damaged or hostile file can declare an image that exceeds the memory. Pillow reads the headers of JPEG,
+BMP and PGM. Those of PNG, WebP and TIFF are parsed here: the chunks of a PNG can be as harmful as its size, Pillow
+decodes a WebP to open it, does not open TIFF files of 64-bit floats and uses the last of a repeated tag where libtiff
+uses the first.
 """
 
 from __future__ import annotations
@@ -41,12 +42,16 @@ ORIENTATION_TAG = 274
 EXIF_TAG = 34665
 FOCAL_35MM_TAG = 41989
 MAX_ENTRIES = 1 << 16
-MAX_DIRECTORIES = 100
+MAX_DIRECTORIES = 1000
 # A reduced version of another image, in the bits of SUBFILE_TAG; white is 0, by PHOTOMETRIC_TAG.
 SUBFILE_TAG = 254
 REDUCED = 1
 PHOTOMETRIC_TAG = 262
 WHITE_IS_ZERO = 0
+BLACK_IS_ZERO = 1
+COLOR_FILTERS = (
+    32803  # a mosaic of color filters (TIFF/EP, ISO 12234-2); OpenCV does not read it
+)
 
 
 class TiffEntry(NamedTuple):
@@ -118,15 +123,16 @@ class Tiff:
         return self.number("H", at)
 
 
-def image_size(data: bytes) -> tuple[int, int, int, int, bool] | None:
+def image_size(data: bytes, at: int | None = None) -> tuple[int, int, int, int, bool] | None:
     """Width, height, samples per pixel, bits per sample, and whether samples are planar; None without a size.
 
-    The greatest value of a repeated tag counts, since libtiff uses the first.
+    They are those of the directory at an offset, or of the first one. The greatest value of a repeated tag counts,
+    since libtiff uses the first.
     """
     tiff = Tiff(data)
     values = {WIDTH_TAG: 0, HEIGHT_TAG: 0, SAMPLES_TAG: 1, PLANAR_TAG: 1}
     bits = 8
-    for entry in tiff.entries():
+    for entry in tiff.entries(at):
         if entry.tag in values:
             values[entry.tag] = max(values[entry.tag], tiff.value(entry) or 0)
         elif entry.tag == BITS_TAG:
@@ -229,28 +235,33 @@ MAX_DEFLATE_RATIO = 1032  # greatest compression ratio of deflate (zlib's techni
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 JPEG_MAGIC = b"\xff\xd8\xff"
 BMP_MAGIC = b"BM"
-SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+WEBP_MAGIC = b"RIFF"
+PNM_MAGICS = (b"P2", b"P3", b"P5", b"P6")  # PGM and PPM, as text and binary
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
 
 
-def decode_image(path: Path, data: bytes) -> NDArray:
-    """The pixels (H, W) or (H, W, channels), blue first, of a file's bytes. Raises InputError.
+def decode_images(path: Path, data: bytes) -> tuple[list[NDArray], bool]:
+    """The images (H, W) or (H, W, channels), blue first, of a file's bytes, and whether they are raw Bayer frames.
 
-    OpenCV applies the orientation of a TIFF file, but not that of PNG and JPEG.
+    OpenCV applies the orientation of a TIFF file, but not that of PNG and JPEG. Raises InputError.
     """
     check_encoded_size(path, data)
-    check_tiff(path, data)
+    data, pages, is_mosaic = check_tiff(path, data)
+    buffer = np.frombuffer(data, np.uint8)
     try:
         with silent_stderr():
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            images: Any = (cv2.imdecode(buffer, cv2.IMREAD_UNCHANGED),)
+            if pages != [0]:
+                images = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED)[1]
     except cv2.error as error:
         raise InputError(path, f"cannot be decoded: {error}") from None
-    if image is None:
+    if len(images) <= max(pages) or images[0] is None:
         raise InputError(path, "cannot be decoded; it may be truncated or not an image")
-    return image
+    return [images[page] for page in pages], is_mosaic
 
 
 def check_encoded_size(path: Path, data: bytes) -> None:
-    """Raise InputError unless these are the bytes of a PNG, TIFF, JPEG or BMP file with at most MAX_PIXELS pixels."""
+    """Raise InputError unless these are the bytes of an image of FORMATS with at most MAX_PIXELS pixels."""
     reader = next(
         (reader for magic, reader in FORMATS.items() if data.startswith(magic)), None
     )
@@ -262,6 +273,8 @@ def check_encoded_size(path: Path, data: bytes) -> None:
         raise InputError(path, "cannot be decoded; it may be truncated or not an image")
     for sides, each_bytes in sizes:
         check_pixels(path, *sides, each_bytes=each_bytes)
+    total = sum(prod(sides) for sides, _ in sizes)
+    check_pixels(path, total, each_bytes=max(each_bytes for _, each_bytes in sizes))
 
 
 # Width and height, and the bytes of each pixel as decoded by OpenCV.
@@ -297,71 +310,96 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def pillow_size(data: bytes) -> Sizes:
-    """Yield the size of a JPEG or BMP file."""
+    """Yield the size of a JPEG, BMP, PGM or PPM file."""
     with opened_by_pillow(data) as image:
         yield image.size, 1 if image.mode in ("1", "L") else 4
 
 
 @contextlib.contextmanager
 def opened_by_pillow(data: bytes) -> Iterator[Any]:
-    """A JPEG or BMP file as an image of Pillow, which reads only the header; its warnings are suppressed."""
-    from PIL import BmpImagePlugin, JpegImagePlugin
+    """A file as an image of Pillow, which reads only the header; its warnings are suppressed."""
+    from PIL import BmpImagePlugin, JpegImagePlugin, PpmImagePlugin
 
     # Image.open has its own limit of size, so its class is used.
-    plugin = (
-        BmpImagePlugin.BmpImageFile
-        if data.startswith(BMP_MAGIC)
-        else JpegImagePlugin.JpegImageFile
-    )
+    plugin: Any = PpmImagePlugin.PpmImageFile
+    if data.startswith(BMP_MAGIC):
+        plugin = BmpImagePlugin.BmpImageFile
+    elif data.startswith(JPEG_MAGIC):
+        plugin = JpegImagePlugin.JpegImageFile
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of damaged EXIF
         with plugin(io.BytesIO(data)) as image:
             yield image
 
 
+def webp_size(data: bytes) -> Sizes:
+    """Yield the size of the canvas (WebP container specification), or of a single lossless or lossy image."""
+    if data[12:16] == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") for at in (24, 27))
+    elif data[12:16] == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        width, height = (bits & 0x3FFF, bits >> 14 & 0x3FFF)
+    else:
+        width, height = (side - 1 & 0x3FFF for side in struct.unpack_from("<HH", data, 26))
+    yield (width + 1, height + 1), 4
+
+
 def tiff_size(data: bytes) -> Sizes:
-    """Yield the size from the first directory; samples count as pixels, because each may have eight bytes."""
-    if size := image_size(data):
-        width, height, samples, bits, _ = size
-        yield (width, height, samples) if samples > 1 else (width, height), min(bits // 8, 8)
+    """Yield the size of each directory; samples count as pixels, because each may have eight bytes."""
+    with contextlib.suppress(struct.error):  # the file ends before its last directory
+        for at in Tiff(data).directories():
+            if size := image_size(data, at):
+                width, height, samples, bits, _ = size
+                sides = (width, height, samples) if samples > 1 else (width, height)
+                yield sides, min(bits // 8, 8)
 
 
 FORMATS: dict[bytes, Callable[[bytes], Sizes]] = {
     PNG_MAGIC: png_size,
-    **dict.fromkeys((JPEG_MAGIC, BMP_MAGIC), pillow_size),
+    **dict.fromkeys((JPEG_MAGIC, BMP_MAGIC, *PNM_MAGICS), pillow_size),
+    WEBP_MAGIC: webp_size,
     **dict.fromkeys(MAGICS, tiff_size),
 }
 
 
-def check_tiff(path: Path, data: bytes) -> None:
-    """Raise InputError for a TIFF file that OpenCV misreads, or of which it reads one image of several.
+def check_tiff(path: Path, data: bytes) -> tuple[bytes, list[int], bool]:
+    """Raise InputError for a TIFF file that OpenCV misreads.
 
     It misreads separate color planes unless they have 8 bits, and inverts white zeros in some formats only. Reduced
     versions of an image are no images of their own.
+
+    Returns
+    -------
+    The file for OpenCV, in which a mosaic is a gray image; the numbers of its images; whether one is a mosaic
     """
-    if not data.startswith(MAGICS):
-        return
+    pages = list[int]()
+    is_mosaic = False
     tiff = Tiff(data)
-    pages = 0
     with contextlib.suppress(struct.error):  # the file ends before its last directory
-        for at in tiff.directories():
-            tags = {entry.tag: tiff.value(entry) for entry in tiff.entries(at)}
+        for number, at in enumerate(tiff.directories() if data.startswith(MAGICS) else ()):
+            entries = {entry.tag: entry for entry in tiff.entries(at)}
+            tags = {tag: tiff.value(entry) for tag, entry in entries.items()}
             if tags.get(PHOTOMETRIC_TAG) == WHITE_IS_ZERO:
                 raise InputError(
                     path,
                     "a TIFF file in which 0 is white (PhotometricInterpretation 0)",
                     "1, 0 is black",
                 )
-            pages += not (tags.get(SUBFILE_TAG) or 0) & REDUCED
-    if pages > 1:
-        raise InputError(path, f"a TIFF file of {pages} images", "a file for each")
-    size = image_size(data)
-    if size and size[2] > 1 and size[3] > 8 and size[4]:
-        raise InputError(
-            path,
-            f"a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits",
-            "interleaved colors, monochrome, or planes of 8 bits",
-        )
+            size = image_size(data, at)
+            if size and size[2] > 1 and size[3] > 8 and size[4]:
+                raise InputError(
+                    path,
+                    f"a TIFF file of separate color planes (PlanarConfiguration 2) of {size[3]} bits",
+                    "interleaved colors, monochrome, or planes of 8 bits",
+                )
+            if tags.get(PHOTOMETRIC_TAG) == COLOR_FILTERS:
+                is_mosaic = True
+                place = entries[PHOTOMETRIC_TAG].at
+                gray = struct.pack(f"{tiff.order}H", BLACK_IS_ZERO)
+                data = data[:place] + gray + data[place + 2 :]
+            if not (tags.get(SUBFILE_TAG) or 0) & REDUCED:
+                pages.append(number)
+    return data, pages or [0], is_mosaic
 
 
 def read_exif(data: bytes) -> Exif:

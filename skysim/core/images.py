@@ -1,13 +1,17 @@
-"""Image files (FITS, PNG, TIFF, JPEG, BMP) and frames of a live camera, read with limits on their size.
+"""Image files (FITS, those of `encoded`, NPY, camera raw) and frames of a live camera, read with limits on their size.
 
 A few bytes of a damaged or hostile file can declare an image that exceeds the memory. The declared size is therefore
 read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`) decodes the file.
+
+1. `read_pictures` reads the pictures of a file as they are stored; `read_picture` the only one.
+2. `as_light` makes a picture that a tracker takes: monochrome, without a mosaic of filters, in digital numbers.
 """
 
 from __future__ import annotations
 
 import datetime
 import gzip
+import importlib.util
 import math
 import re
 import tempfile
@@ -15,7 +19,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -25,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core import encoded
+from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
 from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
@@ -48,20 +53,22 @@ MAX_CARDS = 100_000
 AXES = re.compile(rb"NAXIS *= *(\d+)")
 MAX_AXES = 999
 MAX_COLUMNS = 999  # of a table (FITS standard 4.0, section 7.3.1)
-# for a compressed image
+# for a compressed image, or camera raw
 TILES_CPU_S = 10
 TILES_BYTES = 1 << 31
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")  # seconds
 # Of the chip, degrees Celsius: conventions of imaging programs.
 TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP")
+# Color filters of the first 2 x 2 pixels, such as RGGB: conventions of imaging programs.
+MOSAIC_KEYS = ("BAYERPAT", "COLORTYP")
 # Values of ROWORDER, which is a convention of imaging programs.
 TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}
 TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
 ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
 
 
-def read_fits_image(path: Path) -> ViewedImage:
-    """The first image of a FITS file, in the machine's byte order. Raises InputError with one line."""
+def read_fits_images(path: Path) -> list[ViewedImage]:
+    """The first image of a FITS file, or the planes of a cube, in the machine's byte order. Raises InputError."""
     from astropy.io import fits
 
     try:
@@ -72,7 +79,9 @@ def read_fits_image(path: Path) -> ViewedImage:
             for number, hdu in enumerate(islice(hdus, MAX_HDUS)):
                 check_hdu(path, hdu)
                 if hdu.header.get("ZIMAGE"):
-                    pixels = decode_tiles(path, file, number)
+                    pixels = decode_guarded(
+                        path, "a complete FITS file", file.name, str(number)
+                    )
                 elif getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) > 0:
                     pixels = np.ascontiguousarray(
                         hdu.data.astype(hdu.data.dtype.newbyteorder("="))
@@ -83,10 +92,11 @@ def read_fits_image(path: Path) -> ViewedImage:
                     check_header(path, file, place["datLoc"] + place["datSpan"])
                     continue
                 values = header_values(hdu.header, hdus[0].header)
-                pixels = channels_last(path, pixels)
-                if values["flipped"]:
-                    pixels = np.ascontiguousarray(pixels[::-1])
-                return ViewedImage(pixels, **values)
+                step = -1 if values["flipped"] else 1
+                return [
+                    ViewedImage(np.ascontiguousarray(page[::step]), **values)
+                    for page in planes(path, pixels)
+                ]
     except InputError:
         raise
     except (
@@ -175,21 +185,20 @@ def check_hdu(path: Path, hdu: Any) -> None:
     check_pixels(path, int(hdu.size) // 8)
 
 
-def decode_tiles(path: Path, file: BinaryIO, number: int) -> NDArray:
-    """The pixels of a compressed image, the HDU of this number. Raises InputError with one line."""
+def decode_guarded(path: Path, what: str, *arguments: str) -> NDArray:
+    """The pixels that the script `fits_tiles` decodes in a child process. Raises InputError with one line."""
     with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
         out = Path(folder) / "pixels.npy"
         script = Path(__file__).with_name("fits_tiles.py")
-        arguments = file.name, str(number), str(out)
         if fault := run_guarded(
-            script, *arguments, cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES
+            script, *arguments, str(out), cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES
         ):
-            raise InputError(path, f"not a complete FITS file: {fault}")
+            raise InputError(path, f"not {what}: {fault}")
         return np.asarray(np.load(out))
 
 
-def channels_last(path: Path, pixels: NDArray) -> NDArray:
-    """A color cube, (3, H, W) or (H, W, 3), red first, as (H, W, 3), blue first; a monochrome image as (H, W).
+def planes(path: Path, pixels: NDArray) -> list[NDArray]:
+    """The images of an array: (H, W), a color image (3, H, W) or (H, W, 3), red first, as (H, W, 3), blue first, or N.
 
     Raises
     ------
@@ -202,26 +211,33 @@ def channels_last(path: Path, pixels: NDArray) -> NDArray:
     if pixels.ndim == 3 and pixels.shape[0] == 3:
         pixels = np.moveaxis(pixels, 0, 2)
     if pixels.ndim == 3 and pixels.shape[2] == 3:
-        return np.ascontiguousarray(pixels[:, :, ::-1])
+        return [np.ascontiguousarray(pixels[:, :, ::-1])]
+    if pixels.ndim == 3 and min(pixels.shape) > 0:
+        return list(pixels)
     if pixels.ndim != 2:
+        kind = "NPY" if path.suffix.lower() == NPY else "FITS"
         raise InputError(
-            path, f"a FITS image of shape {shape}", "(H, W), color (3, H, W) and (H, W, 3)"
+            path,
+            f"a {kind} image of shape {shape}",
+            "(H, W), color (3, H, W) and (H, W, 3), or (N, H, W)",
         )
-    return pixels
+    return [pixels]
 
 
 def header_values(*headers: Any) -> dict[str, Any]:
     """ViewedImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
     found: dict[str, str] = {}
     for header in reversed(headers):
-        for key in ("ROWORDER", "DATE-OBS", *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
+        for key in ("ROWORDER", "DATE-OBS", *MOSAIC_KEYS, *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
             with suppress(Exception):  # of many types, for a damaged card
                 found[key] = str(header[key]).strip()
     date_utc = None
     with suppress(ValueError):
         date_utc = datetime.datetime.fromisoformat(found.get("DATE-OBS", ""))
     top_down = TOP_DOWN.get(found.get("ROWORDER", "").upper())
+    filters = [found[key].upper() for key in MOSAIC_KEYS if key in found]
     return {
+        "mosaic": next((one for one in filters if sorted(one) == ["B", "G", "G", "R"]), ""),
         "date_utc": date_utc,
         "row_order_known": top_down is not None,
         "exposure_s": first_number(found, EXPOSURE_KEYS),
@@ -239,7 +255,11 @@ def first_number(found: dict[str, str], keys: tuple[str, ...]) -> float | None:
     return None
 
 
-IMAGE_SUFFIXES = (*SUFFIXES, *encoded.SUFFIXES)
+NPY = ".npy"
+CAMERA_RAW = (".dng", ".cr2", ".nef", ".arw")  # of digital cameras with a Bayer mosaic
+IMAGE_SUFFIXES = (*SUFFIXES, *encoded.SUFFIXES, NPY, *CAMERA_RAW)
+NOISE_E = 10.0  # assumed noise of a pixel, of read-out and sky, in frames of unknown scale
+WHOLE_SCALE = 65535.0  # of frames without noise
 LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order
 
 
@@ -257,6 +277,12 @@ class ViewedImage:
         Focal length of the 35 mm camera with the same diagonal field, mm; None if unknown
     flipped
         Whether the file's first row is the lowest one here
+    mosaic
+        What says that the pixels have color filters, in Bayer's mosaic: RGGB of a header, or the file's kind; or empty
+    scale
+        Digital numbers per unit of the file, by which `as_light` multiplied the pixels
+    notes
+        What `as_light` changed, for the answer
     row_order_known
         False for a FITS file without ROWORDER, whose last row is then taken for the highest, as
         the standard recommends; but programs that do not follow it leave the keyword out too
@@ -271,33 +297,123 @@ class ViewedImage:
     exposure_s: float | None = None
     temperature_c: float | None = None
     flipped: bool = False
+    mosaic: str = ""
+    scale: float = 1.0
+    notes: tuple[str, ...] = ()
 
 
 def read_picture(path: Path) -> ViewedImage:
-    """The image of a FITS, PNG, TIFF, JPEG or BMP file as a person sees it.
+    """The image of a file as a person sees it.
 
     Raises
     ------
     InputError
-        With one line for a file that is missing, truncated, not an image, or has too many
-        pixels.
+        With one line for a file that is missing, truncated, not an image, has too many pixels, or several images.
     """
+    pages = read_pictures(path)
+    if len(pages) > 1:
+        kind = "TIFF" if path.suffix.lower() in (".tif", ".tiff") else "FITS or NPY"
+        raise InputError(path, f"a {kind} file of {len(pages)} images", "a file for each")
+    return pages[0]
+
+
+def read_pictures(path: Path) -> list[ViewedImage]:
+    """The images of a file as a person sees them, as `read_picture`."""
     check_name(path)
-    if not is_fits(path):
+    suffix = image_suffix(path.name)
+    if suffix in SUFFIXES:
+        pages = read_fits_images(path)
+    elif suffix == NPY:
+        pages = [ViewedImage(page) for page in planes(path, read_npy(path))]
+    else:
         data = path.read_bytes()
-        pixels = encoded.decode_image(path, data)
-        exif = encoded.read_exif(data)
-        return ViewedImage(
-            check_numbers(path, encoded.upright(pixels, exif.orientation)),
-            focal_35mm=exif.focal_35mm,
+        if suffix in CAMERA_RAW:
+            found, mosaic = [read_camera_raw(path)], "camera raw"
+            exif = encoded.read_exif_block(data)
+        else:
+            found, is_mosaic = encoded.decode_images(path, data)
+            mosaic = "TIFF" * is_mosaic
+            exif = encoded.read_exif(data)
+        pages = [
+            ViewedImage(
+                encoded.upright(pixels, exif.orientation),
+                focal_35mm=exif.focal_35mm,
+                mosaic=mosaic,
+            )
+            for pixels in found
+        ]
+    for page in pages:
+        check_numbers(path, page.pixels)
+    return pages
+
+
+def read_npy(path: Path) -> NDArray:
+    """The array of an NPY file, mapped until its size is checked, since it may declare any. Raises InputError."""
+    try:
+        stored = np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # of many types, for a damaged header
+        raise InputError(path, f"not a complete NPY file: {error}") from None
+    check_pixels(path, *stored.shape, each_bytes=stored.itemsize)
+    return np.array(stored, stored.dtype.newbyteorder("="), order="C")
+
+
+def read_camera_raw(path: Path) -> NDArray:
+    """The pixels of a digital camera's raw file, each with its color filter. Raises InputError, also without rawpy."""
+    if importlib.util.find_spec("rawpy") is None:
+        raise InputError(
+            path, "camera raw needs an optional package", "pip install 'skysim[raw]'"
         )
-    image = read_fits_image(path)
-    check_numbers(path, image.pixels)
-    return image
+    return decode_guarded(path, "a complete camera raw file", str(path), "raw")
+
+
+def as_light(picture: ViewedImage) -> ViewedImage:
+    """The picture as a tracker takes it: monochrome, in digital numbers, with what was changed in `notes`.
+
+    1. Colors become luminance.
+    2. A pixel without a number (NaN: a border, a mask) gets the level of the nearest pixels that have one.
+    3. In a mosaic the binomial filter [1 2 1] x [1 2 1] / 16 gives (R + 2 G + B) / 4 at every pixel, whichever filter
+       the pixel has: the weights of each color add up to the same in all four positions.
+    4. Floats that do not exceed 1 are no digital numbers. They are scaled so that the noise of the background is
+       NOISE_E: a digital number then is about an electron, which is assumed of unknown cameras. The noise follows from
+       the median difference of neighbors, in which few pixels have stars.
+    """
+    pixels = monochrome(picture.pixels)
+    notes = list[str]()
+    # 2. Masked pixels.
+    is_float = pixels.dtype.kind == "f"
+    if is_float and (masked := np.isnan(pixels)).any() and not masked.all():
+        from scipy import ndimage
+
+        nearest = tuple(ndimage.distance_transform_edt(masked, return_indices=True)[1])
+        filled = pixels[nearest]
+        level = cv2.medianBlur(filled.astype(np.float32), 5)[nearest]
+        pixels = np.where(masked, level, filled)
+        notes.append(f"{masked.sum()} pixels without a number (NaN) are left out")
+    # 3. Mosaic.
+    if picture.mosaic and picture.pixels.ndim == 2:
+        raw = pixels if pixels.dtype.itemsize < 4 else pixels.astype(np.float64)
+        pixels = cv2.GaussianBlur(raw, (3, 3), 0)
+        notes.append(f"a raw Bayer frame ({picture.mosaic}): its luminance over 3x3 pixels")
+    # 4. Scale.
+    scale = 1.0
+    if is_float and pixels.size and pixels.max() <= 1:
+        change = np.abs(np.diff(pixels.astype(np.float64)))
+        noise = np.median(change) * SIGMA_PER_MAD / math.sqrt(2) if change.size else 0.0
+        scale = float(NOISE_E / noise) if noise > 0 else WHOLE_SCALE
+        pixels = pixels * scale
+        notes.append(
+            f"floats up to 1, scaled by {scale:.4g}: the gain is estimated, {NOISE_E:g} e- of noise are assumed"
+        )
+    return replace(picture, pixels=pixels, scale=scale, notes=tuple(notes))
 
 
 def read_image(path: Path) -> NDArray:
-    """The pixels of `read_picture`, for callers that cannot try both row orders: a FITS file must have ROWORDER."""
+    """The pixels of `read_ordered`."""
+    return read_ordered(path).pixels
+
+
+def read_ordered(path: Path) -> ViewedImage:
+    """`read_picture` for callers that cannot try both row orders: a FITS file must have ROWORDER."""
     picture = read_picture(path)
     if not picture.row_order_known and not np.array_equal(
         picture.pixels, picture.pixels[::-1]
@@ -307,7 +423,7 @@ def read_image(path: Path) -> NDArray:
             "no ROWORDER in the header",
             f"{' or '.join(TOP_DOWN)}, or a PNG or TIFF file",
         )
-    return picture.pixels
+    return picture
 
 
 def image_suffix(name: str) -> str:

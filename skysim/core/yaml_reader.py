@@ -354,23 +354,20 @@ EXPECTED = {
     "string_too_long": "at most {max_length} characters",
     "too_short": "at least {min_length} values",
     "too_long": "at most {max_length} values",
-    "model_type": "a mapping of keys to values",
-    "model_attributes_type": "a mapping of keys to values",
-    "int_type": "a valid integer",
-    "int_parsing": "a valid integer",
-    "int_parsing_size": "a valid integer",
-    "int_from_float": "a valid integer",
-    "float_type": "a valid number",
-    "float_parsing": "a valid number",
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
-    "tuple_type": "a list",
-    "list_type": "a list",
-    "datetime_type": "a valid datetime",
-    "datetime_parsing": "a valid datetime",
-    "datetime_from_date_parsing": "a valid datetime",
-    "dict_type": "a mapping of keys to values",
     "string_type": "text",
+    **dict.fromkeys(
+        ("model_type", "model_attributes_type", "dict_type"), "a mapping of keys to values"
+    ),
+    **dict.fromkeys(
+        ("int_type", "int_parsing", "int_parsing_size", "int_from_float"), "a valid integer"
+    ),
+    **dict.fromkeys(("float_type", "float_parsing"), "a valid number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
+    **dict.fromkeys(("tuple_type", "list_type"), "a list"),
+    **dict.fromkeys(
+        ("datetime_type", "datetime_parsing", "datetime_from_date_parsing"),
+        "a valid datetime",
+    ),
 }
 
 

@@ -300,11 +300,8 @@ def draw_component(
 
 def concatenate(sets: Sequence[Sines]) -> Sines:
     """The sines of several sets as one set."""
-    return Sines(
-        np.concatenate([sines.omega_rad_s for sines in sets]),
-        np.concatenate([sines.sine_rad for sines in sets]),
-        np.concatenate([sines.cosine_rad for sines in sets]),
-    )
+    columns = ([getattr(sines, name) for sines in sets] for name in Sines.__slots__)
+    return Sines(*map(np.concatenate, columns))
 
 
 def subdivide(t_s: Floats, counts: Ints) -> Floats:

@@ -1,14 +1,21 @@
-"""Attitude samples from a CCSDS Attitude Ephemeris Message (AEM) in keyword = value notation, versions 1.0 and 2.0.
+"""Attitude samples from a CCSDS Attitude Ephemeris Message (AEM), versions 1.0 and 2.0, as keyword = value or as XML.
 
 CCSDS 504.0-B-1 and 504.0-B-2. The quaternion "from A to B" turns the axes of A into those of B (annex F2 of 504.0-B-2),
 which is the quaternion of the rotation a_from_b of coordinates. Version 1.0 also names the direction (ATTITUDE_DIR: A2B
 or B2A) and whether the scalar is FIRST or LAST (QUATERNION_TYPE). In version 2.0 the direction is A to B and the scalar
-is last, but these keywords are obeyed if a file has them. Rates and derivatives after the quaternion are not used, nor
-is the interpolation that the file recommends.
+is last, but these keywords are obeyed if a file has them. Euler angles likewise turn A into B, each about an axis that
+the ones before it have turned, in the order of EULER_ROT_SEQ (312 or ZXY). A spinning vehicle has its spin axis, z of
+B, at right ascension alpha and declination delta of A, and the spin angle about it from the axis z x z_B to x of B:
 
-1. `split_segments` reads the lines into segments of metadata and data.
-2. `segment_samples` converts each segment to checked samples within its useable span.
-3. `join` appends them to each other.
+    a_from_b = Rz(90 deg + alpha) Rx(90 deg - delta) Rz(spin angle)
+
+Nutation, rates and derivatives after the angles or the quaternion are not used, nor is the interpolation that the file
+recommends.
+
+1. `from_xml` writes an XML message as the lines of its keyword = value notation.
+2. `split_segments` reads the lines into segments of metadata and data.
+3. `segment_samples` converts each segment to checked samples within its useable span.
+4. `join` appends them to each other.
 """
 
 from __future__ import annotations
@@ -16,6 +23,8 @@ from __future__ import annotations
 import datetime
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError, XMLPullParser
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,13 +52,25 @@ from skysim.dynamics.profile_samples import (
 
 VERSION = "CCSDS_AEM_VERS"
 VERSIONS = ("1.0", "2.0")
-# Numbers after the epoch; the first four are the quaternion.
+# Numbers after the epoch: first the four of a quaternion, or three angles in degrees.
 TYPES = {
     "QUATERNION": 4,
     "QUATERNION/DERIVATIVE": 8,
     "QUATERNION/RATE": 7,
     "QUATERNION/ANGVEL": 7,
+    "EULER_ANGLE": 3,
+    "EULER_ANGLE/RATE": 6,
+    "EULER_ANGLE/DERIVATIVE": 6,
+    "EULER_ANGLE/ANGVEL": 6,
+    "SPIN": 4,
+    "SPIN/NUTATION": 7,
+    "SPIN/NUTATION_MOM": 7,
 }
+NUMBERED = str.maketrans("123", "XYZ")
+# Elements of an XML message, and what their keywords begin with.
+XML_SECTIONS = {"metadata": "META", "data": "DATA"}
+# Order of the elements of an attitude; others keep theirs after them.
+XML_ORDER = {"EPOCH": 0, "Q1": 1, "Q2": 2, "Q3": 3, "QC": 4}
 DIRECTIONS = ("A2B", "B2A")
 ORDERS = ("FIRST", "LAST")
 REQUIRED = ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE")
@@ -58,7 +79,9 @@ SAME_ATTITUDE_RAD = 1e-6
 
 
 def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
-    """The samples of all segments. Raises InputError for a file that is not an AEM of quaternions."""
+    """The samples of all segments. Raises InputError for a file that is not an AEM."""
+    if lines[0][1].startswith("<"):
+        lines = from_xml(path, lines)
     version, segments = split_segments(path, lines)
     if not segments:
         raise InputError(
@@ -69,6 +92,48 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     for part in parts[1:]:
         joined = join(joined, part)
     return joined
+
+
+def from_xml(path: Path, lines: list[Line]) -> list[Line]:
+    """The lines of an AEM in XML (CCSDS 505.0-B) as keyword = value. Raises InputError for damaged or unsafe XML."""
+    out = list[Line]()
+    section = ""
+    parser: Any = XMLPullParser(("start", "end"))
+    for n, line in lines:
+        if "<!DOCTYPE" in line:  # it may declare entities that expand
+            raise InputError(path, "XML with a document type", "none", Where(path, n))
+        try:
+            parser.feed(f"{line}\n")
+            events = list(parser.read_events())
+        except ParseError as error:
+            raise InputError(path, f"not XML: {error}", where=Where(path, n)) from None
+        for event, element in events:
+            tag = element.tag
+            if event == "start":
+                if tag == "aem":
+                    out.append((n, f"{VERSION} = {element.get('version', '')}"))
+                elif tag in XML_SECTIONS:
+                    section = XML_SECTIONS[tag]
+                    out.append((n, f"{section}_START"))
+            elif tag == "attitudeState":
+                out.append((n, state_line(element)))
+                element.clear()
+            elif tag in XML_SECTIONS:
+                if section == "META":
+                    # Its quaternions are put in this order by their names.
+                    out.append((n, "QUATERNION_TYPE = LAST"))
+                out.append((n, f"{section}_STOP"))
+                section = ""
+            elif section == "META":
+                out.append((n, f"{tag} = {(element.text or '').strip()}"))
+    return out
+
+
+def state_line(state: Element) -> str:
+    """The epoch and the numbers of an attitude: a quaternion with its scalar last, others in their order."""
+    leaves = [one for one in state.iter() if not len(one) and one.tag != "COMMENT"]
+    leaves.sort(key=lambda one: XML_ORDER.get(str(one.tag), len(XML_ORDER)))
+    return " ".join("".join((one.text or "-").split()) for one in leaves)
 
 
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
@@ -129,11 +194,14 @@ def segment_samples(
     # 1. Metadata.
     metadata = segment.metadata
     source = str(path)
-    segment.require(
-        path, (*REQUIRED, *(("ATTITUDE_DIR", "QUATERNION_TYPE") if version == "1.0" else ()))
-    )
+    segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR",) if version == "1.0" else ())))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
-    width = TYPES[one_of(path, metadata, "ATTITUDE_TYPE", TYPES)]
+    kind = one_of(path, metadata, "ATTITUDE_TYPE", TYPES)
+    width = TYPES[kind]
+    if kind.startswith("EULER"):
+        segment.require(path, ("EULER_ROT_SEQ",))
+    elif kind.startswith("QUATERNION") and version == "1.0":
+        segment.require(path, ("QUATERNION_TYPE",))
     frames = [
         frame_of(Where(path, metadata[key][0]), metadata[key][1]) for key in REQUIRED[:2]
     ]
@@ -158,20 +226,40 @@ def segment_samples(
     numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
     t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
     # 3. Conventions: scalar last and A to B, unless the keywords say otherwise.
-    first = (
-        "QUATERNION_TYPE" in metadata
-        and one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "FIRST"
-    )
+    xyzw = quaternions(path, metadata, kind, numbers)
     reverse = (
         "ATTITUDE_DIR" in metadata
         and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
     )
-    xyzw: Floats = numbers[:, [1, 2, 3, 0] if first else [0, 1, 2, 3]]
     a, b = frames[::-1] if reverse else frames
     samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
     # 4. Frame bias and useable span.
     useable = within_span(path, metadata, t_s, start, system)
     return take(to_icrs(samples, names), useable)
+
+
+def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Floats) -> Floats:
+    """(N, 4) quaternions of a_from_b, scalar last, from the numbers of a type of attitude. Raises InputError."""
+    if kind.startswith("QUATERNION"):
+        first = (
+            "QUATERNION_TYPE" in metadata
+            and one_of(path, metadata, "QUATERNION_TYPE", ORDERS) == "FIRST"
+        )
+        return numbers[:, [1, 2, 3, 0] if first else [0, 1, 2, 3]]
+    angles_deg = numbers[:, :3]
+    if kind.startswith("SPIN"):
+        angles_deg = angles_deg * [1, -1, 1] + [90, 90, 0]
+    line, sequence = metadata["EULER_ROT_SEQ"] if kind.startswith("EULER") else (0, "ZXZ")
+    try:
+        axes = sequence.upper().translate(NUMBERED)
+        return np.asarray(Rotation.from_euler(axes, angles_deg, degrees=True).as_quat())
+    except ValueError:
+        raise InputError(
+            path,
+            f"EULER_ROT_SEQ = {excerpt(sequence)}",
+            "three axes, such as 321 or ZYX",
+            Where(path, line),
+        ) from None
 
 
 def within_span(

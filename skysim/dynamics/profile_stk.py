@@ -8,6 +8,7 @@ seconds from ScenarioEpoch (UTC). The interpolation that the file names is not u
 from __future__ import annotations
 
 import datetime
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,15 +18,10 @@ from skysim.dynamics.profile_samples import REFERENCES, Samples, from_quaternion
 
 # By section: count of numbers in a data line, including its time, and the columns of x, y, z, w.
 SECTIONS = {
-    "attitudetimequaternions": (5, [1, 2, 3, 4]),
-    "attitudetimequatscalarfirst": (5, [2, 3, 4, 1]),
-    "attitudetimequatangvels": (8, [1, 2, 3, 4]),
+    "AttitudeTimeQuaternions": (5, [1, 2, 3, 4]),
+    "AttitudeTimeQuatScalarFirst": (5, [2, 3, 4, 1]),
+    "AttitudeTimeQuatAngVels": (8, [1, 2, 3, 4]),
 }
-SECTION_NAMES = (
-    "AttitudeTimeQuaternions",
-    "AttitudeTimeQuatScalarFirst",
-    "AttitudeTimeQuatAngVels",
-)
 UNUSED = (
     "MessageLevel",
     "InterpolationMethod",
@@ -69,23 +65,21 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
         elif section:
             rows.append((n, words))
         elif lower.startswith("attitudetime"):
-            if lower not in SECTIONS:
-                raise InputError(
-                    path, *unknown_name("data", words[0], SECTION_NAMES), Where(path, n)
-                )
-            section = lower
+            section = spelled("data", " ".join(words), SECTIONS, Where(path, n))
         else:
-            name = next(
-                (known for known in KEYWORDS if known.lower() == words[0].lower()), None
-            )
-            if name is None:
-                raise InputError(
-                    path, *unknown_name("keyword", words[0], KEYWORDS), Where(path, n)
-                )
+            name = spelled("keyword", words[0], KEYWORDS, Where(path, n))
             keywords[name] = (n, " ".join(words[1:]))
     if not section:
-        raise InputError(path, "no attitudes", ", ".join(SECTION_NAMES))
+        raise InputError(path, "no attitudes", ", ".join(SECTIONS))
     return to_samples(path, keywords, section, rows, start)
+
+
+def spelled(what: str, name: str, known: Iterable[str], where: Where) -> str:
+    """A name in the standard's spelling, whatever its case. Raises InputError for an unknown one."""
+    for one in known:
+        if one.lower() == name.lower():
+            return one
+    raise InputError(where.file, *unknown_name(what, name, list(known)), where)
 
 
 def to_samples(
@@ -156,18 +150,13 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
     """The epoch "1 Jul 2005 12:00:00.00" in UTC. Raises InputError."""
     try:
         day, month, year, clock = text.split()
-        hours, minutes, seconds = clock.split(":")
-        date = datetime.datetime(int(year), MONTHS.index(month[:3].lower()) + 1, int(day))
-        if (
-            not 0 <= float(seconds) < 60
-            or not 0 <= int(minutes) < 60
-            or not 0 <= int(hours) < 24
-        ):
-            raise ValueError
-        return date + datetime.timedelta(
-            hours=int(hours), minutes=int(minutes), seconds=float(seconds)
+        whole, _, fraction = clock.partition(".")
+        number = MONTHS.index(month[:3].lower()) + 1
+        date = datetime.datetime.strptime(
+            f"{year} {number} {day} {whole}", "%Y %m %d %H:%M:%S"
         )
-    except (ValueError, OverflowError):
+        return date + datetime.timedelta(seconds=int(fraction or 0) / 10 ** len(fraction))
+    except ValueError:
         raise InputError(
             path,
             f"ScenarioEpoch {excerpt(text)}",

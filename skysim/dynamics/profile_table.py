@@ -224,13 +224,11 @@ def to_samples(
         else np.asarray(columns["t_s"], dtype=np.float64)
     )
     ends = np.array(places, np.int64)
-    # 3-2-1 angles of the body in the lab.
-    if "yaw_deg" in columns:
-        body = Rotation.from_euler("ZYX", stack(columns, BODY_ANGLES[::-1]), degrees=True)
-        return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
-    if "azimuth_deg" in columns:
-        body = Rotation.from_euler("ZY", stack(columns, GIMBAL_ANGLES), degrees=True)
-        return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
+    # 3-2-1 angles of the body in the lab, or those of its mount.
+    for order, names in (("ZYX", BODY_ANGLES[::-1]), ("ZY", GIMBAL_ANGLES)):
+        if names[0] in columns:
+            body = Rotation.from_euler(order, stack(columns, names), degrees=True)
+            return Samples(source, unit, ends, t_s, "lab", "body", body, absolute)
     # Right ascension, declination and roll of the camera.
     if "ra_deg" in columns:
         if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):

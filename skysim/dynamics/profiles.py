@@ -83,7 +83,10 @@ def read_profile(
     # AEM and STK files name their format and frames; other files are tables.
     lines = read_lines(source)
     first = next((line for _, line in lines if not line.startswith("COMMENT")), "")
-    is_aem = first.startswith("CCSDS_AEM_VERS")
+    is_xml = first.startswith("<")
+    is_aem = first.startswith("CCSDS_AEM_VERS") or (
+        is_xml and any("<aem" in line for _, line in lines)
+    )
     is_stk = first.lower().startswith("stk.v.")
     if (is_aem or is_stk) and rotation is not None:
         raise InputError(
@@ -95,10 +98,8 @@ def read_profile(
         return profile_stk.read_stk(source, lines, start)
     if first.startswith("# %ECSV"):
         return profile_table.read_ecsv(source, start, rotation)
-    if first.startswith("<"):
-        raise InputError(
-            source, "XML", "CSV, ECSV, CCSDS AEM in keyword = value notation, or STK (.a)"
-        )
+    if is_xml:
+        raise InputError(source, "XML", "CSV, ECSV, CCSDS AEM, or STK (.a)")
     return profile_table.read_csv(source, lines, start, rotation)
 
 

@@ -15,7 +15,6 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.jit import jit
 from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
@@ -183,21 +182,17 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
     return rows, found_px[chosen < 0]
 
 
-@jit
 def brightest_near(
     found_px: Floats, source_px: Floats, reach_px: Floats
 ) -> NDArray[np.int64]:
     """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
     is_free = np.ones(len(source_px), np.bool_)
-    for m in range(len(found_px)):
-        for n in range(len(source_px)):
-            dx = source_px[n, 0] - found_px[m, 0]
-            dy = source_px[n, 1] - found_px[m, 1]
-            if is_free[n] and dx * dx + dy * dy <= reach_px[n] * reach_px[n]:
-                chosen[m] = n
-                is_free[n] = False
-                break
+    for m, place in enumerate(found_px):
+        near = is_free & (np.sum((source_px - place) ** 2, axis=1) <= reach_px**2)
+        if near.any():
+            chosen[m] = np.argmax(near)
+            is_free[chosen[m]] = False
     return chosen
 
 

@@ -70,6 +70,7 @@ class DatasetPlan:
     frames: int
     frames_per_shard: int
     formats: tuple[str, ...]
+    compress: bool = False
 
     @property
     def shards(self) -> int:
@@ -115,6 +116,7 @@ class DatasetPlan:
             "frames": self.frames,
             "frames_per_shard": self.frames_per_shard,
             "formats": list(self.formats),
+            **({"compress": True} if self.compress else {}),
         }
 
     @property
@@ -138,6 +140,7 @@ def load(
     overrides: Mapping[str, str] | None = None,
     frames_per_shard: int = 64,
     formats: tuple[str, ...] = ("webdataset", "coco"),
+    compress: bool = False,
 ) -> DatasetPlan:
     """The plan of a dataset. Raises InputError with one line.
 
@@ -147,6 +150,8 @@ def load(
         Name or path of the scene
     vary
         File with the sections `set`, `trial`, `factors` and `hardware` of a study, or None
+    compress
+        Whether the images of the tars are compressed
     """
     for name, count in (("frames", frames), ("frames_per_shard", frames_per_shard)):
         if count < 1:
@@ -164,6 +169,7 @@ def load(
         frames,
         frames_per_shard,
         tuple(dict.fromkeys(formats)),
+        compress,
     )
 
 
@@ -285,7 +291,9 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
             row = dataset_shards.frame_labels(one, setup.lab.scene, numbers)
             row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
             row["position"] = (
-                dataset_shards.add_frame(tar, frame, one, row | {"levels": levels})
+                dataset_shards.add_frame(
+                    tar, frame, one, row | {"levels": levels}, plan.compress
+                )
                 if tar
                 else -1
             )
@@ -302,7 +310,9 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     if "coco" in plan.formats:
         storage.write(
             shard_name(COCO, shard, "json"),
-            dataset_shards.coco_file(list(map(dataset_shards.coco_image, rows)), coco),
+            dataset_shards.coco_file(
+                [dataset_shards.coco_image(row, plan.compress) for row in rows], coco
+            ),
         )
     storage.write(
         shard_name(SOURCES, shard, "parquet"),

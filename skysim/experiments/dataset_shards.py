@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import json
 import tarfile
 from collections.abc import Iterator
@@ -18,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
-from skysim.core.jit import jit
 from skysim.core.types import ATTITUDES, Floats, Record
 from skysim.experiments.dataset_labels import MASKS, Extents, LabelledFrame
 from skysim.scene.scene import Scene
@@ -117,10 +115,10 @@ class Storage:
 
 ZARR = "images.zarr"
 ZARR_ARRAY = "images"
+IMAGE_NAME = {False: "image.npy", True: "image.npz"}  # of a frame in a tar; True: compressed
 BLOCK = 512  # bytes of a block of a tar file
 COCO_SNR = 3.0  # sources below have no annotation; they are in the other labels
 CATEGORIES = ("source", *MASKS)
-COMMA, SPACE, MINUS, POINT, ZERO = b", -.0"
 SOURCE_JSON = (
     '{"id": %d, "image_id": %d, "category_id": 1, "bbox": [%s], "area": %r, '
     '"segmentation": [[%s]], "iscrowd": 0, "source": %d, "electrons": %r, "detected": %s}'
@@ -172,11 +170,19 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
     return f"{folder}/{shard:06d}.{suffix}"
 
 
-def add_frame(tar: TarWriter, number: int, one: LabelledFrame, labels: Record) -> int:
-    """Append a frame with its labels; return the position of its first pixel."""
+def add_frame(
+    tar: TarWriter, number: int, one: LabelledFrame, labels: Record, compress: bool
+) -> int:
+    """Append a frame with its labels; return the position of its first pixel, -1 if it is compressed (an .npz)."""
     key = key_of(number)
     image = np.ascontiguousarray(one.frame.image_dn)
-    position = tar.add(f"{key}.image.npy", to_npy(image), image.data.cast("B"))
+    if compress:
+        packed = io.BytesIO()
+        np.savez_compressed(packed, image=image)
+        tar.add(f"{key}.{IMAGE_NAME[True]}", packed.getvalue())
+        position = -1
+    else:
+        position = tar.add(f"{key}.{IMAGE_NAME[False]}", to_npy(image), image.data.cast("B"))
     tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
     masks = {
         name: {"size": list(image.shape), "counts": counts}
@@ -220,14 +226,12 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
 # COCO.
 
 
-def coco_image(labels: Record) -> Record:
+def coco_image(labels: Record, compress: bool) -> Record:
     """The entry of an image; its file is in the tar of the shard."""
-    name = (
-        f"{shard_name('shards', labels['shard'], 'tar')}/{key_of(labels['frame'])}.image.npy"
-    )
+    tar = shard_name("shards", labels["shard"], "tar")
     return {
         "id": labels["frame"],
-        "file_name": name,
+        "file_name": f"{tar}/{key_of(labels['frame'])}.{IMAGE_NAME[compress]}",
         "height": labels["height"],
         "width": labels["width"],
     }
@@ -236,7 +240,7 @@ def coco_image(labels: Record) -> Record:
 def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
 
-    Ids are unique in the dataset. A source is written as `json.dumps` would, but ten times as fast.
+    Ids are unique in the dataset. A source is written as `json.dumps` would, but faster.
     """
     seen = one.sources["snr"] >= COCO_SNR
     rows = one.sources[seen]
@@ -294,47 +298,7 @@ def outlines(extents: Extents) -> tuple[Floats, Floats]:
 
 def hundredths(numbers: Floats) -> list[str]:
     """The rows of (N, K) finite numbers with two decimals, as `json.dumps` writes a list without its brackets."""
-    steps = np.rint(100 * np.abs(numbers)).astype(np.int64)
-    text, ends = _hundredths(steps, np.signbit(numbers))
-    whole = text[: ends[-1]].tobytes().decode("ascii")
-    return [whole[begin:end] for begin, end in itertools.pairwise(ends.tolist())]
-
-
-@jit
-def _hundredths(
-    steps: NDArray[np.int64], negative: NDArray[np.bool_]
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """ASCII text of numbers in hundredths with their signs, and the end of each row in it, after a leading 0."""
-    digits = np.empty(20, np.uint8)
-    ends = np.zeros(len(steps) + 1, np.int64)
-    text = np.empty(steps.size * 25, np.uint8)
-    at = 0
-    for n in range(len(steps)):
-        for k in range(steps.shape[1]):
-            if k:
-                text[at] = COMMA
-                text[at + 1] = SPACE
-                at += 2
-            if negative[n, k]:
-                text[at] = MINUS
-                at += 1
-            left = steps[n, k] // 100
-            count = 0
-            while left or count == 0:
-                digits[count] = ZERO + left % 10
-                left //= 10
-                count += 1
-            for i in range(count):
-                text[at + i] = digits[count - 1 - i]
-            at += count
-            text[at] = POINT
-            text[at + 1] = ZERO + steps[n, k] // 10 % 10
-            at += 2
-            if steps[n, k] % 10:
-                text[at] = ZERO + steps[n, k] % 10
-                at += 1
-        ends[n + 1] = at
-    return text, ends
+    return [str(row)[1:-1] for row in np.round(numbers, 2).tolist()]
 
 
 def mask_box(counts: list[int], height: int) -> list[float]:

@@ -331,7 +331,7 @@ def test_a_folder_stands_for_the_list_of_its_images(tmp_path: Path) -> None:
     assert listed == [other, inner / "a.fits.gz", inner / "b.JPG", inner / "d.tiff"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(
-        InputError, match=r"empty: a folder without images; allowed: \.fits, .*\.bmp$"
+        InputError, match=r"empty: a folder without images; allowed: \.fits, .*\.arw$"
     ):
         plate_solver.pictures_in([tmp_path / "empty"])
 

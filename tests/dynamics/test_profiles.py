@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from pathlib import Path
 
 import numpy as np
@@ -563,6 +564,170 @@ def test_segments_are_joined(tmp_path: Path) -> None:
     assert angle(read.a_from_b, MOTION).max() < 1e-14
 
 
+def turned(axis: int, angle_deg: float) -> np.ndarray:
+    """The matrix that converts coordinates to axes turned about the x, y or z axis: R1, R2, R3 of textbooks."""
+    sine = math.sin(math.radians(angle_deg))
+    cosine = math.cos(math.radians(angle_deg))
+    matrix = np.eye(3)
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    matrix[[j, k, j, k], [j, k, k, j]] = cosine, cosine, sine, -sine
+    return matrix
+
+
+def with_rows(kind: str, rows: list[str], version: str = "1.0", **meta: str) -> str:
+    """An AEM with these numbers, a line for each second."""
+    lines = segment(
+        Rotation.identity(len(rows)), np.arange(len(rows)), ATTITUDE_TYPE=kind, **meta
+    ).split("\n")
+    at = lines.index("DATA_START") + 1
+    for n, row in enumerate(rows):
+        lines[at + n] = f"{lines[at + n].split()[0]} {row}"
+    return aem("\n".join(lines), version=version)
+
+
+@pytest.mark.parametrize("more", ["", "/RATE", "/DERIVATIVE", "/ANGVEL"])
+@pytest.mark.parametrize("sequence", ["312", "321", "ZXZ", "131"])
+def test_euler_angles_turn_a_into_b_in_their_order(
+    sequence: str, more: str, tmp_path: Path
+) -> None:
+    """b_from_a = R(third) R(second) R(first); CCSDS 504.0-B-1, 4.2.5.4.5: the order is that of the sequence."""
+    angles = [[-26.78, 46.26, 144.10], [10.0, 20.0, -30.0]]
+    rows = [" ".join(map(str, row + [0.1, 0.2, 0.3] * bool(more))) for row in angles]
+    content = with_rows(
+        f"EULER_ANGLE{more}", rows, QUATERNION_TYPE="", EULER_ROT_SEQ=sequence
+    )
+    read = read_text(content, tmp_path)
+    axes = ["123".find(one) + "XYZ".find(one) + 1 for one in sequence]
+    for found, (a, b, c) in zip(read.a_from_b.as_matrix(), angles, strict=True):
+        b_from_a = turned(axes[2], c) @ turned(axes[1], b) @ turned(axes[0], a)
+        np.testing.assert_allclose(found.T, b_from_a, rtol=0, atol=1e-14)
+    back = with_rows(
+        f"EULER_ANGLE{more}",
+        rows,
+        QUATERNION_TYPE="",
+        EULER_ROT_SEQ=sequence,
+        ATTITUDE_DIR="B2A",
+    )
+    inverse = read_text(back, tmp_path)
+    assert (inverse.a, inverse.b) == ("body", "icrs")
+    assert angle(inverse.a_from_b, read.a_from_b).max() < 1e-14
+
+
+# Of CCSDS 504.0-B-1, figures 4-2 and 4-3: the spacecraft ST5-224.
+SPIN_ROWS = [
+    "2.6862511e+002 6.8448486e+001 1.5969509e+002 -1.0996528e+002",
+    "2.6863990e+002 6.8432197e+001 1.4593720e+002 -1.0996493e+002",
+]
+NUTATION_ROWS = [
+    "268.62512 68.407179 159.5566582 -109.9677896 0.366382445 18.16999799 -156.19211",
+    "268.59578 68.395597 148.3145228 -109.9677896 0.366382445 18.16999799 -169.93808",
+]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows"),
+    [
+        ("SPIN", SPIN_ROWS),
+        ("SPIN/NUTATION", NUTATION_ROWS),
+        ("SPIN/NUTATION_MOM", NUTATION_ROWS),
+    ],
+)
+def test_the_spin_axis_is_at_alpha_and_delta(
+    kind: str, rows: list[str], tmp_path: Path
+) -> None:
+    """And x of B is turned about it, by the spin angle, from the node of its equator on that of A."""
+    read = read_text(with_rows(kind, rows, QUATERNION_TYPE=""), tmp_path)
+    for matrix, row in zip(read.a_from_b.as_matrix(), rows, strict=True):
+        alpha, delta, spin = np.radians([float(word) for word in row.split()[:3]])
+        axis = [
+            math.cos(delta) * math.cos(alpha),
+            math.cos(delta) * math.sin(alpha),
+            math.sin(delta),
+        ]
+        node = np.array([-math.sin(alpha), math.cos(alpha), 0.0])  # z x axis
+        x = math.cos(spin) * node + math.sin(spin) * np.cross(axis, node)
+        np.testing.assert_allclose(matrix[:, 2], axis, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(matrix[:, 0], x, rtol=0, atol=1e-14)
+
+
+def as_xml(content: str, elements: str) -> str:
+    """A message in XML; `elements` are the names of its numbers, with / for an element within another."""
+    lines = [line for line in content.split("\n") if line and not line.startswith("COMMENT")]
+    out = ['<?xml version="1.0" encoding="UTF-8"?>', "<!-- a comment -->"]
+    begin = {"META_START": "<segment><metadata>", "DATA_START": "<data>"}
+    end = {"META_STOP": "</metadata>", "DATA_STOP": "</data></segment>"}
+    for line in lines:
+        key, equals, value = (part.strip() for part in line.partition("="))
+        if key == "CCSDS_AEM_VERS":
+            out.append(f'<aem id="CCSDS_AEM_VERS" version="{value}"><header>')
+        elif line in begin or line in end:
+            out.append((begin | end)[line])
+        elif equals:
+            out.append(f"  <{key}>{value}</{key}>")
+        else:
+            epoch, *numbers = line.split()
+            names = elements.split()
+            inner = "\n".join(
+                f"<{name}>{number}</{name}>"
+                for name, number in zip(names, numbers, strict=True)
+            )
+            out.append(
+                f"<attitudeState><x><EPOCH>{epoch}</EPOCH><y>{inner}</y></x></attitudeState>"
+            )
+        if key == "ORIGINATOR":
+            out.append("</header><body>")
+    return "\n".join([*out, "</body></aem>"])
+
+
+def test_xml_is_read_as_its_keywords_are(tmp_path: Path) -> None:
+    """A quaternion's scalar is known by its name, wherever it stands; a state takes several lines."""
+    last = aem(segment(MOTION, TIMES), version="2.0")
+    read = read_text(as_xml(last, "Q1 Q2 Q3 QC"), tmp_path, "p.xml")
+    assert read.direction == "icrs_from_body"
+    np.testing.assert_allclose(read.t_s, TIMES, rtol=0, atol=1e-9)
+    assert angle(read.a_from_b, MOTION).max() < 1e-14
+    first = aem(segment(MOTION, TIMES, scalar_first=True, QUATERNION_TYPE="FIRST"))
+    read = read_text(as_xml(first, "QC Q1 Q2 Q3"), tmp_path, "p.xml")
+    assert angle(read.a_from_b, MOTION).max() < 1e-14
+    spin = with_rows("SPIN", SPIN_ROWS, QUATERNION_TYPE="")
+    names = "SPIN_ALPHA SPIN_DELTA SPIN_ANGLE SPIN_ANGLE_VEL"
+    assert (
+        angle(
+            read_text(as_xml(spin, names), tmp_path, "p.xml").a_from_b,
+            read_text(spin, tmp_path).a_from_b,
+        ).max()
+        < 1e-15
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "<aem",
+            "<!DOCTYPE aem [<!ENTITY a 'b'>]>\n<aem",
+            "line 3: XML with a document type",
+        ),
+        ("</metadata>", "", "not XML: mismatched tag"),
+        ("</body></aem>", "", None),
+        ("</data></segment>\n</body></aem>", "", "ends within a segment, after DATA_START"),
+        ("<Q2>", "<Q2>x", "'x.*' is not a number"),
+        ("<SCALAR", "", None),
+        ("ICRF", "MARS", "line 10: unknown frame 'MARS'"),
+    ],
+)
+def test_an_error_in_xml_is_reported_with_its_line(
+    old: str, new: str, message: str | None, tmp_path: Path
+) -> None:
+    content = as_xml(aem(segment(MOTION, TIMES)), "Q1 Q2 Q3 QC").replace(old, new)
+    if message is None:
+        assert len(read_text(content, tmp_path, "p.xml").t_s) == len(TIMES)
+        return
+    with pytest.raises(InputError, match=message) as raised:
+        read_text(content, tmp_path, "p.xml")
+    assert "\n" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -587,8 +752,20 @@ def test_segments_are_joined(tmp_path: Path) -> None:
             "line 13: TIME_SYSTEM = 'UT1'; allowed: UTC, TAI",
         ),
         (
-            aem(segment(MOTION, TIMES, ATTITUDE_TYPE="SPIN")),
-            "line 16: ATTITUDE_TYPE = 'SPIN'; allowed: QUATERNION",
+            aem(segment(MOTION, TIMES, ATTITUDE_TYPE="MATRIX")),
+            "line 16: ATTITUDE_TYPE = 'MATRIX'; allowed: QUATERNION",
+        ),
+        (
+            aem(segment(MOTION, TIMES, ATTITUDE_TYPE="EULER_ANGLE")),
+            "EULER_ROT_SEQ is missing",
+        ),
+        (
+            with_rows("EULER_ANGLE", ["1 2 3"], EULER_ROT_SEQ="112"),
+            "line 18: EULER_ROT_SEQ = '112'; allowed: three axes, such as 321 or ZYX",
+        ),
+        (
+            with_rows("SPIN", ["1 2 3"]),
+            "line 21: 4 values; allowed: an epoch and 4 numbers",
         ),
         (
             aem(segment(MOTION, TIMES, " 7")),

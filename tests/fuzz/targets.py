@@ -94,12 +94,13 @@ def overrides(data: bytes) -> None:
 
 def fits(data: bytes) -> None:
     path = write_file(data, "frame.fits.gz" if data.startswith(GZIP_MAGIC) else "frame.fits")
-    rejects(lambda: images.monochrome(images.read_picture(path).pixels), InputError)
+    rejects(lambda: [images.as_light(one) for one in images.read_pictures(path)], InputError)
 
 
 def pictures(data: bytes) -> None:
-    path = write_file(data, "frame.png")
-    rejects(lambda: images.monochrome(images.read_picture(path).pixels), InputError)
+    suffix = "npy" if data.startswith(b"\x93NUMPY") else "png"
+    path = write_file(data, f"frame.{suffix}")
+    rejects(lambda: [images.as_light(one) for one in images.read_pictures(path)], InputError)
 
 
 def catalogs(data: bytes) -> None:

@@ -349,6 +349,6 @@ def test_packed_fits_is_refused_before_it_is_unpacked(tmp_path: Path, packer: An
 
 
 def test_an_unsupported_format_that_opencv_reads_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "x.png").write_bytes(b"P5 2 2 255\n" + bytes(4))  # portable graymap
+    (tmp_path / "x.png").write_bytes(b"Pf\n2 2\n-1.0\n" + bytes(16))  # portable floats
     with pytest.raises(InputError, match="cannot be decoded"):
         images.read_image(tmp_path / "x.png")

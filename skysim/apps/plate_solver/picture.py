@@ -57,7 +57,7 @@ FOCAL_35MM_UNCERTAINTY = 0.10
 
 
 class Reading(NamedTuple):
-    """One reading of a picture: its pixels as they would be viewed, the solver for its field, and its assumption.
+    """One reading of a picture: its pixels as they would be viewed, the solver for its field, and its assumptions.
 
     `flipped`: whether the file's first row is the lowest of these pixels.
     """
@@ -355,9 +355,13 @@ def load_picture(
     picture = picture or images.read_picture(path)
     if camera:
         check_image(path, picture.pixels, camera)
-    pixels = images.monochrome(picture.pixels)
-    check_size(pixels)
-    return replace(picture, pixels=pixels)
+    light = images.as_light(picture)
+    check_size(light.pixels)
+    if light.scale != 1 and camera and (detector := camera.detector):
+        # Floats up to 1 of a known camera: 1 is the end of its converter.
+        top = 2**detector.bits - 1
+        return replace(light, pixels=light.pixels * (top / light.scale), notes=())
+    return light
 
 
 def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
@@ -445,7 +449,8 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     """
     height_px, width_px = picture.pixels.shape
     solvers = [solver]
-    readings = [(picture.pixels, "", picture.flipped)]
+    notes = list(picture.notes)
+    readings = [(picture.pixels, notes, picture.flipped)]
     if picture.focal_35mm and not solver.field_is_known:
         focal_px = picture.focal_35mm / DIAGONAL_35MM * math.hypot(width_px, height_px)
         fov_deg = math.degrees(2 * math.atan((width_px - 1) / 2 / focal_px))
@@ -455,12 +460,12 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
             )
     if not picture.row_order_known:
         turned = np.ascontiguousarray(picture.pixels[::-1])
-        readings.append((turned, images.ASSUMED_TOP_DOWN, not picture.flipped))
+        readings.append((turned, [*notes, images.ASSUMED_TOP_DOWN], not picture.flipped))
     count = len(solvers) * len(readings)
     return [
-        Reading(pixels, replace(one, hypotheses=count), text, flipped)
+        Reading(pixels, replace(one, hypotheses=count), "; ".join(texts), flipped)
         for one in solvers
-        for pixels, text, flipped in readings
+        for pixels, texts, flipped in readings
     ]
 
 
@@ -489,7 +494,9 @@ def outcome_fields(
     refusal = diagnosis.Refusal(
         pixels, report.centroids, tuple(solvers), date_utc, rows_known
     )
-    return seen | {"hint": diagnosis.likely_cause(refusal)}
+    notes = outcome.tried[0].assumption
+    hint = diagnosis.likely_cause(refusal) + f" ({notes})" * bool(notes)
+    return seen | {"hint": hint}
 
 
 def annotated_image(image: NDArray, report: Report, names: list[str]) -> NDArray[np.uint8]:

@@ -294,9 +294,13 @@ def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
     return *pixel_directions(xy_px, optics), shape
 
 
-def nodes_px(camera: CameraConfig) -> tuple[Floats, tuple[int, int]]:
-    """(h * w, 2) pixel positions of the nodes, row by row, and (h, w)."""
-    spacing = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
+def nodes_px(
+    camera: CameraConfig, spacing: float | None = None
+) -> tuple[Floats, tuple[int, int]]:
+    """(h * w, 2) pixel positions of the nodes, row by row, and (h, w); the glow's spacing if none is given."""
+    spacing = spacing or min(
+        MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0)
+    )
     w, h = (
         math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px)
     )

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
     angular_separation_deg,
-    even_grid_px,
+    nodes_px,
     pixel_directions,
     transmittance,
     viewing_geometry,
@@ -96,11 +96,8 @@ def earth_light(
 @lru_cache(maxsize=4)
 def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
     """Viewing directions and solid angles of pixels at nodes NODE_PX apart, and the nodes' (h, w)."""
-    camera = optics.camera
-    w, h = (
-        math.ceil((size - 1) / NODE_PX) + 1 for size in (camera.width_px, camera.height_px)
-    )
-    return *pixel_directions(even_grid_px(camera, w, h), optics), (h, w)
+    xy_px, shape = nodes_px(optics.camera, NODE_PX)
+    return *pixel_directions(xy_px, optics), shape
 
 
 # Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side. A body's irradiance

@@ -16,10 +16,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.polynomial import polynomial
 from scipy import special
 
 from skysim.core.types import Bools, Floats
@@ -30,6 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Transfer,
     exposures_s,
     median_and_spread,
+    slopes,
 )
 from skysim.results import metrics
 
@@ -191,13 +192,8 @@ def maximize(
     total = counts.sum()
     p = probabilities(theta, edges, noise)
     for _ in range(STEPS):
-        slope = np.empty((len(theta), p.size))
-        for n in range(len(theta)):
-            moved = np.zeros(len(theta))
-            moved[n] = DIFFERENCE
-            above = probabilities(theta + moved, edges, noise)
-            below = probabilities(theta - moved, edges, noise)
-            slope[n] = (above - below) / (2 * DIFFERENCE)
+        step = np.full(len(theta), DIFFERENCE)
+        slope = slopes(lambda one: probabilities(one, edges, noise), theta, step)
         information = total * (slope / p) @ slope.T
         score = slope @ (counts / p)
         step = np.linalg.solve(information, score)
@@ -338,19 +334,12 @@ def smooth(image: Floats, usable: Bools) -> Floats:
     count = blocks(weight)
     y, x = np.mgrid[0:rows:SAMPLE, 0:columns:SAMPLE] + (SAMPLE - 1) / 2
     mean = blocks(weight * image[:rows, :columns]) / np.maximum(count, 1)
-    terms = [(p, q) for p in range(ORDER + 1) for q in range(ORDER + 1 - p)]
-
-    def powers(at: NDArray[Any], size: int) -> Floats:
-        return np.stack([((2.0 * at - size) / size) ** p for p in range(ORDER + 1)])
-
-    by_x = powers(x.ravel(), width)
-    by_y = powers(y.ravel(), height)
+    # Powers of y and x, from -1 to 1 over the chip, of total order ORDER at most.
+    low = np.add.outer(*[np.arange(ORDER + 1)] * 2) <= ORDER
+    places = (2 * y.ravel() / height - 1, 2 * x.ravel() / width - 1)
+    design = polynomial.polyvander2d(*places, (ORDER, ORDER))[:, low.ravel()]
     root = np.sqrt(count)
-    design = np.column_stack([by_x[p] * by_y[q] for p, q in terms])
-    found = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)[0]
-    matrix = np.zeros((ORDER + 1, ORDER + 1))
-    for (p, q), value in zip(terms, found, strict=True):
-        matrix[p, q] = value
-    by_row = powers(np.arange(height), height)
-    by_column = powers(np.arange(width), width)
-    return np.asarray(by_row.T @ matrix.T @ by_column, dtype=np.float64)
+    matrix = np.zeros(low.shape)
+    matrix[low] = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)[0]
+    down, across = (2 * np.arange(size) / size - 1 for size in image.shape)
+    return np.asarray(polynomial.polygrid2d(down, across, matrix), dtype=np.float64)

@@ -80,13 +80,14 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
         yield (
             path,
             setting_of(path, folder, picture, tables[parent]),
-            raw_numbers(path, picture.pixels),
+            raw_numbers(path, picture),
         )
 
 
-def raw_numbers(path: Path, pixels: NDArray) -> NDArray[np.uint16]:
+def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
     """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
-    if pixels.ndim != 2:
+    pixels = picture.pixels
+    if pixels.ndim != 2 or picture.mosaic:
         raise InputError(
             path, "a color image", "monochrome frames, raw, of 8 to 16 bits a pixel"
         )

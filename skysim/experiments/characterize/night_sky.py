@@ -90,12 +90,9 @@ class ImageSize(NamedTuple):
 def windows(image_dn: Floats, xy_px: Floats) -> tuple[Floats, Floats]:
     """(N, M) pixels of each star's window, and (N, 2) their upper left corners; stars are HALF_PX from the border."""
     corner = np.rint(xy_px).astype(int) - HALF_PX
-    span = np.arange(2 * HALF_PX + 1)
-    rows = corner[:, 1, None, None] + span[:, None]
-    columns = corner[:, 0, None, None] + span[None, :]
-    return np.asarray(
-        image_dn[rows, columns].reshape(len(xy_px), -1), dtype=np.float64
-    ), corner.astype(np.float64)
+    every = np.lib.stride_tricks.sliding_window_view(image_dn, (2 * HALF_PX + 1,) * 2)
+    chosen = every[corner[:, 1], corner[:, 0]].reshape(len(xy_px), -1)
+    return chosen.astype(np.float64), corner.astype(np.float64)
 
 
 def integrals(center: Floats, ln_sigma: Floats) -> tuple[Floats, Floats, Floats]:
@@ -325,7 +322,7 @@ def read_frame(
     as_stored takes the first row of a file without a row order for the highest.
     """
     picture = images.read_picture(path)
-    numbers = raw_numbers(path, picture.pixels)
+    numbers = raw_numbers(path, picture)
     if as_stored and not picture.row_order_known:
         numbers = np.ascontiguousarray(numbers[::-1])
     images.check_size(path, numbers, (config.height_px, config.width_px))

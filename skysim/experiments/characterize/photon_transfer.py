@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,16 +77,18 @@ class Estimate(NamedTuple):
         return cls(value, sigma / (2 * value) if value else high / SIGMAS, low, high)
 
 
+def slopes(function: Callable[[Floats], Any], at: Floats, step: Floats) -> Floats:
+    """(K, ...) derivatives by K parameters, by central differences; 0 for a parameter without a step."""
+    moved = (np.diag(step)[n] for n in range(len(at)))
+    rises = [function(at + one) - function(at - one) for one in moved]
+    return np.array([rise / (2 * one or 1.0) for rise, one in zip(rises, step, strict=True)])
+
+
 def propagate(
     function: Callable[[Floats], float], at: Floats, covariance: Floats
 ) -> tuple[float, float]:
     """Value and standard error of a function of parameters, by central differences."""
-    step = STEP * np.sqrt(np.diag(covariance))
-    slope = np.zeros(len(at))
-    for n in np.flatnonzero(step > 0):
-        moved = np.zeros(len(at))
-        moved[n] = step[n]
-        slope[n] = (function(at + moved) - function(at - moved)) / (2 * step[n])
+    slope = slopes(function, at, STEP * np.sqrt(np.diag(covariance)))
     return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
 
 

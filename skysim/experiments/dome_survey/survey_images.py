@@ -97,7 +97,7 @@ def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
 
 def pixels_of(path: Path, camera: Camera) -> NDArray:
     """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
-    pixels = images.monochrome(images.read_image(path))
+    pixels = images.as_light(images.read_ordered(path)).pixels
     images.check_size(path, pixels, (camera.height_px, camera.width_px))
     return pixels
 

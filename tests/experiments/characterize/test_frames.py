@@ -238,6 +238,16 @@ def jpeg(folder: Path) -> None:
     write(folder / "flats/flat_50000us_20C_9.jpg", np.full(SHAPE, 50, np.uint8))
 
 
+def webp(folder: Path) -> None:
+    write(folder / "flats/flat_50000us_20C_9.webp", np.full(SHAPE, 50, np.uint8))
+
+
+def mosaic(folder: Path) -> None:
+    header = fits.Header({"ROWORDER": "TOP-DOWN", "BAYERPAT": "RGGB"})
+    path = folder / "flats/flat_50000us_20C_9.fits"
+    fits.PrimaryHDU(np.full(SHAPE, 50, np.uint16), header).writeto(path)
+
+
 def average(folder: Path) -> None:
     write(folder / "flats/flat_50000us_20C_9.fits", np.full(SHAPE, 50.25, np.float32))
 
@@ -300,6 +310,8 @@ BAD: list[tuple[Callable[[Path], None], str]] = [
         jpeg,
         "flat_50000us_20C_9.jpg: JPEG changes the noise; allowed: raw frames in FITS, PNG or TIFF",
     ),
+    (webp, "flat_50000us_20C_9.webp: a color image; allowed: monochrome frames, raw"),
+    (mosaic, "flat_50000us_20C_9.fits: a color image; allowed: monochrome frames, raw"),
     (
         average,
         "flat_50000us_20C_9.fits: numbers that are not whole, as of an average; allowed: raw frames",

@@ -60,7 +60,7 @@ def samples(folder: Path) -> dict[str, dict[str, Any]]:
                 assert file is not None
                 data = file.read()
                 value = (
-                    np.load(io.BytesIO(data)) if ending.endswith("npy") else json.loads(data)
+                    json.loads(data) if ending.endswith("json") else np.load(io.BytesIO(data))
                 )
                 found.setdefault(key, {})[ending] = value
     return found
@@ -341,6 +341,28 @@ def test_an_object_store_holds_the_same_bytes(
             dataset_run.run(small(vary), "s3://nowhere/x", engines.Serial())
     finally:
         server.stop()
+
+
+def test_compressed_frames_are_the_same_in_less_space(
+    whole: Path, vary: Path, tmp_path: Path
+) -> None:
+    """And a compressed dataset is another one than the same without."""
+    plan = small(vary, compress=True, formats=("webdataset", "coco"))
+    assert dataset_run.run(plan, str(tmp_path / "x"), engines.Serial()).done == 5
+    packed = samples(tmp_path / "x")
+    for key, one in samples(whole).items():
+        np.testing.assert_array_equal(packed[key]["image.npz"]["image"], one["image.npy"])
+        assert packed[key]["sources.npy"].tobytes() == one["sources.npy"].tobytes()
+    sizes = [
+        sum(path.stat().st_size for path in folder.glob("shards/*.tar"))
+        for folder in (tmp_path / "x", whole)
+    ]
+    assert sizes[0] < 0.5 * sizes[1]
+    assert {row["position"] for row in index(tmp_path / "x")} == {-1}
+    coco = json.loads((tmp_path / "x" / "coco" / "000000.json").read_text())
+    assert coco["images"][0]["file_name"] == "shards/000000.tar/000000000.image.npz"
+    with pytest.raises(InputError, match="another dataset"):
+        dataset_run.run(small(vary, compress=True), str(whole), engines.Serial())
 
 
 def test_a_complete_dataset_is_unchanged(whole: Path, vary: Path) -> None:

@@ -45,6 +45,12 @@ def dataset(
     vary: Variations = None,
     to: Formats = None,
     shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
+    compress: Annotated[
+        bool,
+        typer.Option(
+            "--compress", help="Compress the images of the tars: .npz in place of .npy."
+        ),
+    ] = False,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Workers = None,
@@ -71,6 +77,7 @@ def dataset(
         overrides=parse_overrides(set_),
         frames_per_shard=shard_frames,
         formats=formats,
+        compress=compress,
     )
     with (
         closing(create_engine(engine, workers, scheduler)) as chosen,

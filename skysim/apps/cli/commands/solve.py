@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +33,8 @@ def solve(
         list[Path] | None,
         typer.Argument(
             metavar="IMAGES",
-            help="FITS, PNG, TIFF, JPEG, BMP files, folders, or lists of lights (CSV or ECSV: x_px, y_px, flux).",
+            help="Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:"
+            " x_px, y_px, flux).",
         ),
     ] = None,
     fov: Annotated[
@@ -223,16 +224,14 @@ def solve_all(
     errors = []
     warnings = []
     annotated = plate_solver.annotated_paths(out, paths)
-    videos = [video_numbers(path) for path in paths]
-    count = sum(length for _, length in videos)
+    count = sum(video_numbers(path)[1] for path in paths)
     frames = (
-        (name, picture, marked)
-        for path, (rate_hz, length), marked in zip(paths, videos, annotated, strict=True)
-        for name, picture in (video_frames(path, length) if rate_hz else [(path, None)])
+        frame
+        for path, marked in zip(paths, annotated, strict=True)
+        for frame in frames_of(path, marked, chosen)
     )
     for name, picture, marked in progress(frames, count, "solving", quiet or count == 1):
-        # The frames of a video are not drawn: they are thousands.
-        outputs = chosen if picture or chosen.annotated else chosen._replace(annotated=marked)
+        outputs = chosen if chosen.annotated else chosen._replace(annotated=marked)
         result = plate_solver.solve_file(name, solver, outputs, picture)
         warning = result.pop("warning")
         if warning:
@@ -243,13 +242,34 @@ def solve_all(
     return results, warnings, errors
 
 
-def video_frames(path: Path, count: int) -> Iterator[tuple[Path, ViewedImage]]:
-    """Names and pictures of a video's frames."""
-    from skysim.core.images import LiveCamera, ViewedImage
+def frames_of(
+    path: Path, marked: Path, chosen: Outputs
+) -> Iterator[tuple[Path, ViewedImage | None, Path | None]]:
+    """Names and pictures of a file's images, and where each is drawn; one that cannot be read has no picture.
 
-    with closing(LiveCamera(str(path))) as video:
-        for n in range(count):
-            yield path.with_name(f"{path.name}#{n}"), ViewedImage(video.frame())
+    The frames of a video are not drawn: they are thousands. Raises InputError for several images of one output.
+    """
+    from skysim.core import images
+
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        with closing(images.LiveCamera(str(path))) as video:
+            for n in range(video_numbers(path)[1]):
+                name = path.with_name(f"{path.name}#{n}")
+                yield name, images.ViewedImage(video.frame()), None
+        return
+    pages: list[ViewedImage] = []
+    with suppress(InputError, OSError):
+        pages = images.read_pictures(path)
+    if len(pages) < 2:
+        yield path, pages[0] if pages else None, marked
+        return
+    if any(chosen):
+        raise InputError(
+            path, f"{len(pages)} images", "one with --annotate, --table or --wcs"
+        )
+    for n, page in enumerate(pages):
+        name = path.with_name(f"{path.name}[{n}]")
+        yield name, page, marked.with_name(f"{path.name}[{n}].annotated.png")
 
 
 def video_numbers(path: Path) -> tuple[float | None, int]:
