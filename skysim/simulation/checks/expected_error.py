@@ -24,7 +24,7 @@ axes and R the rotation from lab to camera axes:
 
 The approximation of a solver (thesis, infinity, ...) has the error of its solution for exact rays. `pnp` also fits the
 camera's position, so its J_i has three more columns. Errors of star places are those of the catalog and of neighbors
-(beliefs.py). Neighbors of LEDs, jitter and wrong identifications are left out.
+(beliefs.py). Neighbors of LEDs, jitter beside a uniform path and wrong identifications are left out.
 
 `causes_at` computes the variances at one attitude:
 
@@ -49,7 +49,7 @@ from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Bools, Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -71,10 +71,19 @@ class Common(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights."""
+    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights.
+
+    They are NaN also where most streaks break: those that are left are not fitted as well as expected.
+    """
 
     cross_rad2: dict[str, Floats]
     roll_rad2: dict[str, Floats]
+
+    def without(self, lost: Bools) -> Expected:
+        """These with NaN at some attitudes."""
+        for variance in (self.cross_rad2[CENTROIDS], self.roll_rad2[CENTROIDS]):
+            variance[lost] = np.nan
+        return self
 
     def by_cause(self, angle: str) -> dict[str, Floats]:
         """The variances of the angle `cross` or `roll`, by cause."""
@@ -306,6 +315,17 @@ def believed_px2(view: View, context: Context, prnu: float | None = None) -> Flo
 def believed_sigma_px(view: View, context: Context) -> Floats:
     """(n,) standard deviation of each image position that the tracker believes, see `believed_px2`."""
     return np.sqrt(np.trace(believed_px2(view, context), axis1=1, axis2=2) / 2)
+
+
+def within_gate(view: View, context: Context) -> View:
+    """The lights whose errors of the believed directions are within the tracker's matching radius.
+
+    The others are no matches, for example a star that a neighbor displaces.
+    """
+    error_px = context.camera.optics.camera.focal_px * np.linalg.norm(
+        context.beliefs.direction_error[view.row], axis=1
+    )
+    return view.take(error_px <= GATE_SIGMA * believed_sigma_px(view, context))
 
 
 class Mismatch(NamedTuple):
