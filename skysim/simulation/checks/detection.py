@@ -139,18 +139,21 @@ def full_scale_e(detector: DetectorConfig) -> float:
     return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
 
 
-def detected_radius_px(view: View, context: Context) -> Floats:
-    """(n,) distance from its path up to which each image is above the detection threshold; 0 if it is below."""
+def peak_ratio(view: View, context: Context) -> Floats:
+    """(n,) peak of each image over the detection threshold, both after the detector's filter."""
     share = peak_share(
         view.blur2_px2 + BINOMIAL_VARIANCE_PX2,
         view.disk_px,
         view.defocus_px,
         view.streak_length_px,
     )
-    median_px = np.median(view.streak_px, axis=0) if len(view) else STILL_PX
-    log_ratio = np.log(
-        np.maximum(view.electrons * share / threshold_e(context, median_px), 1.0)
-    )
+    path_px = np.median(view.streak_px, axis=0) if len(view) else STILL_PX
+    return view.electrons * share / threshold_e(context, path_px)
+
+
+def detected_radius_px(view: View, context: Context) -> Floats:
+    """(n,) distance from its path up to which each image is above the detection threshold; 0 if it is below."""
+    log_ratio = np.log(np.maximum(peak_ratio(view, context), 1.0))
     radius = np.zeros(len(view))
     for rows, blur_px, ((u, v), image, *_) in shapes_of(view, BINOMIAL_VARIANCE_PX2):
         outward = v[0] >= 0
@@ -194,10 +197,7 @@ def broken(view: View, context: Context) -> Bools:
     if context.settings.detector != "default" or not (length_px >= SHORTEST_PX).any():
         return lost
     path_px = np.median(view.streak_px, axis=0)
-    share = peak_share(
-        view.blur2_px2 + BINOMIAL_VARIANCE_PX2, view.disk_px, view.defocus_px, length_px
-    )
-    q = view.electrons * share / threshold_e(context, path_px)
+    q = peak_ratio(view, context)
     rows = np.flatnonzero(q > 1)
     reach_px = length_px[rows] * (1 - 1 / q[rows])
     x, y = path_px / np.linalg.norm(path_px)

@@ -49,7 +49,7 @@ from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Bools, Floats, normalized
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -78,12 +78,6 @@ class Expected(NamedTuple):
 
     cross_rad2: dict[str, Floats]
     roll_rad2: dict[str, Floats]
-
-    def without(self, lost: Bools) -> Expected:
-        """These with NaN at some attitudes."""
-        for variance in (self.cross_rad2[CENTROIDS], self.roll_rad2[CENTROIDS]):
-            variance[lost] = np.nan
-        return self
 
     def by_cause(self, angle: str) -> dict[str, Floats]:
         """The variances of the angle `cross` or `roll`, by cause."""
@@ -318,14 +312,16 @@ def believed_sigma_px(view: View, context: Context) -> Floats:
 
 
 def within_gate(view: View, context: Context) -> View:
-    """The lights whose errors of the believed directions are within the tracker's matching radius.
+    """The lights whose errors of the believed directions, but their median, are within the tracker's matching radius.
 
-    The others are no matches, for example a star that a neighbor displaces.
+    The others are no matches, for example a star that a neighbor displaces. A rotation removes what all share.
     """
-    error_px = context.camera.optics.camera.focal_px * np.linalg.norm(
-        context.beliefs.direction_error[view.row], axis=1
-    )
-    return view.take(error_px <= GATE_SIGMA * believed_sigma_px(view, context))
+    error = context.beliefs.direction_error[view.row]
+    if not error.any():
+        return view
+    off_px = np.linalg.norm(error - np.median(error, axis=0), axis=1)
+    off_px *= context.camera.optics.camera.focal_px
+    return view.take(off_px <= GATE_SIGMA * believed_sigma_px(view, context))
 
 
 class Mismatch(NamedTuple):

@@ -451,8 +451,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         failing = int(np.isnan(sampled.error.total("roll")).sum())
         broken = int(sampled.broken().sum())
         total = len(sampled.seen)
-        # Those where few streaks break are not typical if they are the exception.
-        known = 2 * broken <= total
+        known = sampled.predicted()
         cross, roll = sampled.error.rms_arcsec() if known else (math.nan, math.nan)
         few = f"; too few lights at {failing - broken} of {total}" if failing > broken else ""
         if broken:
@@ -477,7 +476,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
     lines += [
         f"{angle}: {cause_text(chosen, angle)}"
         for angle in ("cross", "roll")
-        if 2 * chosen.broken().sum() <= len(chosen.seen) and causes(chosen, angle)
+        if chosen.predicted() and causes(chosen, angle)
     ]
     lines.append(
         "cross: sqrt(x² + y²), x and y the errors about both axes across the boresight"

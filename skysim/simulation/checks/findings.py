@@ -472,7 +472,8 @@ def uneven_motion(context: Context, samples: CheckedSamples) -> str:
         shorter_s /= 1.1
     return (
         f"exposure.time: jitter moves images by {short(moved_px, 2)} px (rms) beside their uniform path within an"
-        f" exposure, which is in neither the expected nor the claimed error; change it to {short(1e3 * shorter_s, 2)} ms"
+        " exposure, which is in neither the expected nor the claimed error; change it to"
+        f" {short(1e3 * shorter_s, 2)} ms"
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from skysim.core.types import Bools, Floats
 from skysim.simulation.checks.attitudes import CheckedAttitudes
-from skysim.simulation.checks.detection import Context, broken, detected_area_px, usable
+from skysim.simulation.checks.detection import Context, broken, usable
 from skysim.simulation.checks.expected_error import Expected, expected, within_gate
 from skysim.simulation.checks.views import VISIBLE, View, view
 from skysim.simulation.exposure import expected_exposure
@@ -63,6 +63,10 @@ class Sampled(NamedTuple):
         """(A,) whether the errors are unknown because most streaks break, see `detection.broken`."""
         return np.isnan(self.error.total("roll")) & (self.counts() >= MIN_EVIDENCE_MATCHES)
 
+    def predicted(self) -> bool:
+        """Whether the errors are known at most of the attitudes; those where few streaks break are not typical."""
+        return bool(2 * self.broken().sum() <= len(self.used))
+
     def hidden_counts(self) -> Floats:
         """(A,) number of hidden lights that the tracker knows."""
         return np.array([sum(hidden.values()) for hidden in self.hidden])
@@ -94,7 +98,6 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     known = []
     seen = []
     whole = []
-    lost = []
     hidden = []
     others = []
     for exposure, beam in zip(exposures, beams, strict=True):
@@ -103,15 +106,19 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         known.append(found)
         seen.append(found.take(visible))
         whole.append(found.take(visible & ~breaks))
-        large = detected_area_px(found, context) >= context.settings.min_area_px
-        lost.append(2 * (large & breaks).sum() > large.sum())
         hidden.append(
             Counter(names[number] for number in found.behind[found.behind != VISIBLE])
         )
         others.append(other_lights(beam, exposure, context))
     # 3. Detected lights, and the expected errors of a solution with them.
-    used = [within_gate(usable(view, context), context) for view in whole]
-    error = expected(used, at, context).without(np.array(lost))
+    detected = [usable(view, context) for view in whole]
+    used = [within_gate(view, context) for view in detected]
+    # Those that are left where most streaks break are not fitted as well as expected.
+    fitted = [
+        view.take(view.row < 0) if 2 * len(left) < len(usable(all_, context)) else view
+        for view, left, all_ in zip(used, detected, seen, strict=True)
+    ]
+    error = expected(fitted, at, context)
     return Sampled(at, exposures, beams, known, seen, used, hidden, others, error)
 
 

@@ -170,7 +170,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     settings = replace(context.settings, centroid_sigma_px=floor_px)
     claiming = context._replace(settings=settings)
     cam_from_body = context.lab.camera.mount.cam_from_body
-    if 2 * sampled.broken().sum() > len(sampled.used):
+    if not sampled.predicted():
         return math.nan
     for view, lab_from_body in zip(
         sampled.used, sampled.attitudes.lab_from_body, strict=True
