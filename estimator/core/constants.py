@@ -16,6 +16,7 @@ STANDARD_PRESSURE_HPA = 1013.25  # one atmosphere
 STANDARD_TEMPERATURE_K = 288.15  # of Edlen's refractivity: 15 C
 ARCSEC_RAD = np.pi / 180 / 3600
 MAS_RAD = np.pi / 180 / 3.6e6
+INCH_M = 0.0254  # exact: international yard and pound agreement, 1959
 # Standard deviation of a normal distribution over its median absolute deviation.
 SIGMA_PER_MAD = 1.4826
 

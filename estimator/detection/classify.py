@@ -204,11 +204,12 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     background = blobs.background
     # 1. Shapes
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
-    # 2. Text
-    text = find_captions(blobs.box_px, blobs.peak)
+    # 2. Text. Streaks of a known length have boxes of one height, as letters do.
+    text = np.zeros(len(blobs), bool)
     streak_px = priors.streak_px
     turn_rad = priors.turn_rad
     if streak_px is None:
+        text = find_captions(blobs.box_px, blobs.peak)
         # 3. and 4. Shared streaks. Columns of readout smear are no streaks: a blob across half the frame does not vote.
         x0, y0, x1, y1 = blobs.box_px.T
         votes = ~text & (x1 - x0 < image.shape[1] / 2) & (y1 - y0 < image.shape[0] / 2)

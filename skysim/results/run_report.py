@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from estimator.trackers.star_tracker import NO_STARS
 from skysim.core.types import FrameRow
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
@@ -32,7 +33,7 @@ from skysim.results.requirements import NOT_MET, Judgment
 
 # Settings that help where the tracker's own refusal names none.
 HELP = {
-    "too few stars detected": "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
+    NO_STARS: "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
     "no identification beyond chance": "raise tracker.centroid_sigma_px if the camera or the map is less accurate than"
     " assumed, or leave out false lights with tracker.brightest",
     "ambiguous: another attitude fits the lights as well": "tell the lights apart by tracker.brightness_sigma with"
@@ -116,7 +117,9 @@ def run_report(
         ),
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
-        Section("Frames", [frame_table(angles, rows), Items(refusals(rows)), *last]),
+        Section(
+            "Frames", [frame_table(angles, rows), Items(refusals(rows, findings)), *last]
+        ),
     ]
     return Report(title, blocks, command)
 
@@ -225,10 +228,15 @@ def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
     return Items(lines, "Requirements" if lines else "", "bad" if unmet else "")
 
 
-def refusals(rows: Sequence[FrameRow]) -> list[str]:
-    """Each reason why frames were not solved, their number, and the settings that would help."""
+def refusals(rows: Sequence[FrameRow], findings: Sequence[str]) -> list[str]:
+    """Each reason why frames were not solved, their number, and the settings that would help.
+
+    Whether stars are too few in too long or too short an exposure is known to the check, by its `findings`.
+    """
+    exposure = [line for line in findings if line.startswith("exposure.time: ")]
+    advice = HELP | ({NO_STARS: exposure[0]} if exposure else {})
     counts = Counter(row.status for row in rows if row.status in HELP)
-    return [f"{count} frames: {status}; {HELP[status]}" for status, count in counts.items()]
+    return [f"{count} frames: {status}; {advice[status]}" for status, count in counts.items()]
 
 
 def motion_lines(motion: Mapping[str, float]) -> list[str]:

@@ -137,7 +137,7 @@ def test_a_known_camera_s_floats_are_fractions_of_its_converter(
     """SHEFEX-2 has 12 bits: its gain is known, and nothing is estimated."""
     solver = plate_solver.make_solver(None, Path("shefex2"))
     path = as_fits(tmp_path / "x.fits", frame[0] / 4095)
-    picture = plate_solver.load_picture(path, solver)
+    picture = plate_solver.load_picture(path, solver.camera)
     np.testing.assert_allclose(picture.pixels, frame[0], rtol=1e-9)
     assert picture.notes == ()
 

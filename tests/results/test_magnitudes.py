@@ -1,4 +1,6 @@
-"""Magnitude errors of a run: PTASE's mean and deviation, by hand and over several frames."""
+"""The run's report: PTASE's magnitude errors, by hand and over several frames, and the advice for refused frames."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Report
 from skysim.core.types import FrameRow
-from skysim.results.run_report import magnitude_errors, magnitude_text, summary
+from skysim.results.run_report import magnitude_errors, magnitude_text, refusals, summary
 from skysim.results.scoring import magnitude_errors_mag
 
 
@@ -69,3 +71,12 @@ def test_the_run_s_mean_and_deviation_are_those_of_all_stars_together() -> None:
     assert magnitude_text(rows).startswith(
         "Magnitudes of 25 stars, measured (-2.5 log10 DN/s)"
     )
+
+
+def test_too_few_stars_in_long_streaks_want_the_shorter_exposure_of_the_check() -> None:
+    refused = [replace(row(0, 2, 0.0, 0.1), status="too few stars detected")]
+    shorter = "exposure.time: images move by up to 125 px; change it to 4.9 ms"
+    assert refusals(refused, ["light.catalog: short", shorter]) == [
+        f"1 frames: too few stars detected; {shorter}"
+    ]
+    assert "expose longer" in refusals(refused, [])[0]

@@ -37,6 +37,7 @@ from skysim.simulation.checks.expected_error import (
 )
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure
+from skysim.simulation.flight import Flight
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.simulation.lights.light import Exposure, Lit, beam_of
 from skysim.simulation.timing import exposure_window
@@ -620,3 +621,66 @@ def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
     assert met == [True, True, True, True, False]
     assert "not forecast" in fact.lines[-1]
     assert not any(": met" in one for one in fact.lines)
+
+
+LONG_STREAKS = {
+    "camera.width_px": "1024",
+    "camera.height_px": "1024",
+    "camera.focal_length": "35 mm",
+    "camera.f_number": "1.6",
+    "exposure.time": "100 ms",
+    "tracker.limit_mag": "6.5",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("rate_deg_s", "known"), [(4, True), (7, True), (24, False)])
+def test_long_streaks_break_in_the_forecast_as_in_frames(
+    rate_deg_s: float, known: bool
+) -> None:
+    """The stars matched, and the errors or that these are unknown, over 16 attitudes of the whole sky."""
+    keys = LONG_STREAKS | {"motion.rate_deg_s": f"[{rate_deg_s}, 0, 0]"}
+    lab = build_lab(loader.load("shefex2", keys))
+    context = detection.context_of(lab)
+    rate_rad_s = np.radians([rate_deg_s, 0.0, 0.0])
+    turned = Rotation.random(16, random_state=1)
+    at = CheckedAttitudes(turned, np.tile(rate_rad_s, (16, 1)), np.zeros(16))
+    expected = sampling.sampled(at, context)
+    tracker = build_tracker(lab.camera)
+    matched = np.zeros(16)
+    squares = []
+    for n in range(16):
+        frame, truth = render_at(lab.in_run(n), turned[n], rate_rad_s, 0.0)
+        solved = factory.solve_frame(tracker, frame).attitude
+        if solved.cam_from_ref is not None and solved.match is not None:
+            matched[n] = len(solved.match.observed)
+            error_rad = metrics.cross_and_roll_rad(solved.cam_from_ref, truth.cam_from_lab)
+            squares.append(error_rad[0] ** 2 / expected.error.total("cross")[n])
+    # Some streaks whose fit fails are matched by their center of gravity, to a few pixels.
+    assert 0.6 < expected.counts().mean() / matched.mean() < 1.1
+    assert (2 * expected.broken().sum() <= 16) == known
+    if known:
+        assert 0.4 < np.nanmean(squares) < 2.5
+
+
+@pytest.mark.slow
+def test_jitter_moves_images_as_in_the_run() -> None:
+    """Streaks of the frames, and uneven motion: over whole periods a sine of rms s about two axes has sqrt(2) s."""
+    for frequency_hz in (3, 60):
+        jitter = f"[{{kind: line, frequency_hz: {frequency_hz}, rms_arcsec: [300, 300, 0]}}]"
+        keys = LONG_STREAKS | {"motion.jitter": jitter}
+        keys |= {"motion.rate_deg_s": "[0, 0, 0]", "exposure.frames": "3"}
+        lab = build_lab(loader.load("shefex2", keys))
+        context = detection.context_of(lab)
+        at = attitudes.of_frames(lab)
+        length_px = np.array(
+            [np.median(view.streak_length_px) for view in sampling.sampled(at, context).seen]
+        )
+        flight = Flight(lab).simulate_motion()
+        for n in range(3):
+            sources = flight.render(n)[1].sources
+            streak_px = np.nanmedian(np.linalg.norm(sources.streak_xy_px, axis=1))
+            assert streak_px == pytest.approx(length_px[n], rel=0.05, abs=0.05)
+        uneven_px = facts.uneven_px(context, at.t_s, context.camera.exposure_s)
+        whole_px = context.camera.optics.camera.focal_px * 300 * ARCSEC_RAD * 2**0.5
+        assert (uneven_px == pytest.approx(whole_px, rel=0.05)) == (frequency_hz == 60)

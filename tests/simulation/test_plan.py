@@ -433,6 +433,20 @@ def test_a_solver_s_own_error_is_listed_as_a_cause() -> None:
         ),
         (
             "shefex2",
+            {"tracker__limit_mag": "8.5"},
+            "tracker.limit_mag",
+            "V 8.5, but tracker.catalog ends at V 6.7; change it to 6.5",
+        ),
+        (
+            "shefex2",
+            {
+                "motion__jitter": "[{kind: line, frequency_hz: 500, rms_arcsec: [100, 100, 0]}]"
+            },
+            "exposure.time",
+            "jitter moves images by",
+        ),
+        (
+            "shefex2",
             {"camera__detector__prnu": "0.1"},
             "tracker.centroid_sigma_px",
             "1.3 times too small (NEES 5.3",
@@ -763,6 +777,8 @@ def warned_of_bodies(ra_deg: float, dec_deg: float, **changes: str) -> list[str]
     scene = lab_of(
         "shefex2", motion__start=f"{{ra_deg: {ra_deg}, dec_deg: {dec_deg}}}", **MOON | changes
     )
+    drawn = check(scene, drawn=True).findings
+    assert not [line for line in drawn if line.startswith("light.bodies")]
     return [line for line in check(scene).findings if line.startswith("light.bodies")]
 
 

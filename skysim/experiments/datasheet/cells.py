@@ -30,6 +30,8 @@ from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
+from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
+from skysim.tracking.onboard_model import onboard_catalog
 
 MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 MODEL_FIELDS = 2 * MIN_FIELDS  # for an error model: each half of them tests that of the other
@@ -181,6 +183,10 @@ class Designer:
         self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
         self.under_stars = isinstance(scene.light, StarsConfig)
+        self.catalog_end_mag = math.inf
+        if self.under_stars:
+            stars = onboard_catalog("tracker.catalog", scene.tracker.catalog)
+            self.catalog_end_mag = float(stars.v_mag.max()) + CATALOG_MARGIN_MAG
         self.noise = 0
 
     @property
@@ -314,6 +320,8 @@ class Designer:
             return
         for step in (0.0, *FAINTER):
             limit = self.scene.tracker.limit_mag + step
+            if step > 0 and limit > self.catalog_end_mag:
+                continue
             change: Settings = {"tracker.limit_mag": limit}
             yield from self.pair("magnitude", "limit_mag", limit, change)
 
@@ -352,10 +360,9 @@ class Designer:
         if self.scene.thermal:
             reference = {"kind": "steady", "temperature_c": self.scene.thermal.reference_c}
             changes["the temperature held"] = {"thermal.temperature": reference}
-        if self.under_stars:
-            changes["half a magnitude more stars known"] = {
-                "tracker.limit_mag": self.scene.tracker.limit_mag + 0.5
-            }
+        fainter_mag = self.scene.tracker.limit_mag + 0.5
+        if self.under_stars and fainter_mag <= self.catalog_end_mag:
+            changes["half a magnitude more stars known"] = {"tracker.limit_mag": fainter_mag}
         return changes
 
     def disturbances(self) -> dict[str, Settings]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core import files
+from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError, unknown_name
 from skysim.results.files.templates import (
     CAPTION_MM,
@@ -32,7 +33,7 @@ from skysim.results.files.templates import (
     scale_line,
 )
 
-INCH_MM = 25.4
+INCH_MM = 1e3 * INCH_M
 POINT_MM = INCH_MM / 72
 SHEETS_MM = {"a4": (210.0, 297.0), "a3": (297.0, 420.0)}
 PAPERS = (*SHEETS_MM, "roll", "gore")

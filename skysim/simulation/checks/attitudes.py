@@ -1,7 +1,7 @@
 """Attitudes at which a scene is checked: those of its frames, and a sample of those that its motion could reach.
 
-The attitudes of the frames are those of the reference maneuver, or of a constant rate without a controller. The motion
-itself is not simulated.
+The attitudes of the frames are those of the reference maneuver, or of a constant rate without a controller; their rates
+contain the run's jitter. The motion itself is not simulated.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
+from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
+from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.lab import Lab
@@ -22,6 +24,7 @@ from skysim.simulation.lab import Lab
 MAX_FRAMES = 400  # frames among which the fastest and the most tilted one are sought
 FRAMES = 16  # evenly spaced frames that are checked
 DIRECTIONS = 48  # attitudes that sample the reach of the motion
+SAMPLES = 101  # of the jitter in an exposure
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
@@ -72,15 +75,35 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
 def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
     """The commanded attitudes at (N,) times; without a controller those of the constant initial rate."""
     scene = lab.scene
+    jitter, _ = jitter_in_exposures(lab, t_s, scene.exposure.time_s)
     if scene.motion.control is None:
         rate = guidance.body_rate_rad_s(scene, lab.start)
         lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rate))
-        return CheckedAttitudes(lab_from_body, np.tile(rate, (len(t_s), 1)), t_s)
+        return CheckedAttitudes(lab_from_body, rate + jitter, t_s)
     reference = guidance.plan(scene.motion, lab.start, lab.profiles)
     states = [reference.state_at(float(t)) for t in t_s]
     wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
     lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
-    return CheckedAttitudes(lab_from_body, rates, t_s)
+    return CheckedAttitudes(lab_from_body, rates + jitter, t_s)
+
+
+def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Floats, Floats]:
+    """The run's jitter in exposures about N times: (N, 3) mean rate in rad/s, and the rest (N, K, 3) in rad.
+
+    The rest is the rotation relative to one at the mean rate, K samples of zero mean, in body axes.
+    """
+    scene = lab.scene
+    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+    vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), reference)
+    if not vibration.components:
+        return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 1, 3))
+    after_s = exposure_s * np.linspace(-0.5, 0.5, SAMPLES)
+    # `evaluate` wants ascending times.
+    phi = np.array([vibration.evaluate(one + after_s)[0] for one in t_s])
+    # Whole periods leave rounding errors.
+    rate = ((phi[:, -1] - phi[:, 0]) / exposure_s).round(12)
+    rest = phi - rate[:, None] * after_s[:, None]
+    return rate, rest - rest.mean(axis=1, keepdims=True)
 
 
 def tilts_rad(attitudes: CheckedAttitudes) -> Floats:

@@ -46,6 +46,12 @@ DISK_POINTS = 24  # points of a disk
 SHAPES = 10  # images whose sizes differ by less than one in this number count as equal
 COG_MARGIN_PX = 4.0  # margin of the window about the pixels above the threshold
 STILL_PX = np.zeros(2)
+STREAK_CENTROIDERS = ("default", "streak")
+# Error of a streak's ends at which half of the fits converge (frames of paths of 25 to 150 px)
+MAX_END_SIGMA_PX = 1.1
+# Streaks less far apart across their paths touch; a blob whose center is displaced by more is lost (same frames).
+ACROSS_PX = 3.0
+MERGED_PX = 3.0
 PHASES = 64  # number of phases of the pulses relative to the exposure
 # Number of pulses in an exposure from which the mean time of the light does not vary
 MAX_PULSES = 500
@@ -133,18 +139,21 @@ def full_scale_e(detector: DetectorConfig) -> float:
     return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
 
 
-def detected_radius_px(view: View, context: Context) -> Floats:
-    """(n,) distance from its path up to which each image is above the detection threshold; 0 if it is below."""
+def peak_ratio(view: View, context: Context) -> Floats:
+    """(n,) peak of each image over the detection threshold, both after the detector's filter."""
     share = peak_share(
         view.blur2_px2 + BINOMIAL_VARIANCE_PX2,
         view.disk_px,
         view.defocus_px,
         view.streak_length_px,
     )
-    median_px = np.median(view.streak_px, axis=0) if len(view) else STILL_PX
-    log_ratio = np.log(
-        np.maximum(view.electrons * share / threshold_e(context, median_px), 1.0)
-    )
+    path_px = np.median(view.streak_px, axis=0) if len(view) else STILL_PX
+    return view.electrons * share / threshold_e(context, path_px)
+
+
+def detected_radius_px(view: View, context: Context) -> Floats:
+    """(n,) distance from its path up to which each image is above the detection threshold; 0 if it is below."""
+    log_ratio = np.log(np.maximum(peak_ratio(view, context), 1.0))
     radius = np.zeros(len(view))
     for rows, blur_px, ((u, v), image, *_) in shapes_of(view, BINOMIAL_VARIANCE_PX2):
         outward = v[0] >= 0
@@ -160,6 +169,46 @@ def detected_area_px(view: View, context: Context) -> Floats:
     """(n,) area pi r^2 + 2 r L in px^2 of each image above the detection threshold, on a path of length L."""
     radius = detected_radius_px(view, context)
     return np.pi * radius**2 + 2 * radius * view.streak_length_px
+
+
+def end_sigma_px(view: View, context: Context) -> Floats:
+    """(n,) error of a streak's center along its path because noise hides the streak's ends; 0 for other images.
+
+    The Cramer-Rao bound omits it. With a electrons per pixel of length and the noise n of such a length after weighting
+    across the path, the variance is 6.5 (n / a)^4 px^2 (Yao 1987, see `estimator.centroiding.streak_fit`).
+    """
+    length_px = view.streak_length_px
+    if context.settings.centroider not in STREAK_CENTROIDERS:
+        return np.zeros(len(view))
+    across_px = 2 * math.sqrt(math.pi) * view.sigma_px
+    a_e = np.maximum(view.electrons, 1e-9) / np.maximum(length_px, 1e-12)
+    n_e2 = across_px * context.camera.noise_e**2 + a_e
+    return np.where(length_px >= SHORTEST_PX, math.sqrt(6.5) * n_e2 / a_e**2, 0.0)
+
+
+def broken(view: View, context: Context) -> Bools:
+    """(n,) whether a streak is lost: its fit does not converge, or the detector joins it with others.
+
+    The fit fails if the ends are too uncertain. The filter along a path of length L spreads a streak of q times the
+    threshold over |u| < L (1 - 1 / q); others that it touches move its center, by more than MERGED_PX if it is lost.
+    """
+    lost = end_sigma_px(view, context) > MAX_END_SIGMA_PX
+    length_px = view.streak_length_px
+    if context.settings.detector != "default" or not (length_px >= SHORTEST_PX).any():
+        return lost
+    path_px = np.median(view.streak_px, axis=0)
+    q = peak_ratio(view, context)
+    rows = np.flatnonzero(q > 1)
+    reach_px = length_px[rows] * (1 - 1 / q[rows])
+    x, y = path_px / np.linalg.norm(path_px)
+    apart_px = view.xy_px[rows, None] - view.xy_px[rows]
+    along_px = np.abs(apart_px @ [x, y])
+    across_px = np.abs(apart_px @ [-y, x])
+    electrons = view.electrons[rows]
+    touch = (across_px < ACROSS_PX) & (along_px < reach_px[:, None] + reach_px)
+    moved_px = touch * along_px * electrons / (electrons[:, None] + electrons)
+    lost[rows] |= moved_px.max(axis=1, initial=0.0) > MERGED_PX
+    return lost
 
 
 def usable(view: View, context: Context) -> View:
@@ -182,7 +231,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
 
     1. photon noise, and background noise of b electrons^2 a pixel. For a center of gravity in a window of sides A along
        and B across an axis it is sigma^2 / N + b A^3 B / (12 N^2), with sigma^2 increased by L^2 / 12 along the path;
-       for other centroiders see `weighted_variance`; `weighted` adds its S-curve.
+       for other centroiders see `weighted_variance`; `weighted` adds its S-curve, the fit of streaks their ends.
     2. pixel sensitivity that varies by p: p^2 sum(I^2 x^2) / N^2, which is p^2 / (8 pi) for a Gaussian and
        p^2 / (4 pi) for a disk.
     3. the plateau of a saturated image.
@@ -215,6 +264,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
         across = view.sigma_px**2 / n_e
     else:
         along, across = weighted_variance(view, n_e, noise_e2, WEIGHTS.get(centroider, fit))
+        along = along + end_sigma_px(view, context) ** 2
         if centroider == "weighted" and len(view):
             curve_px2 = sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
             floor += np.where(length_px < 1, curve_px2, 0.0)[:, None]  # a path averages it

@@ -24,7 +24,7 @@ axes and R the rotation from lab to camera axes:
 
 The approximation of a solver (thesis, infinity, ...) has the error of its solution for exact rays. `pnp` also fits the
 camera's position, so its J_i has three more columns. Errors of star places are those of the catalog and of neighbors
-(beliefs.py). Neighbors of LEDs, jitter and wrong identifications are left out.
+(beliefs.py). Neighbors of LEDs, jitter beside a uniform path and wrong identifications are left out.
 
 `causes_at` computes the variances at one attitude:
 
@@ -71,7 +71,10 @@ class Common(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights."""
+    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights.
+
+    They are NaN also where most streaks break: those that are left are not fitted as well as expected.
+    """
 
     cross_rad2: dict[str, Floats]
     roll_rad2: dict[str, Floats]
@@ -306,6 +309,19 @@ def believed_px2(view: View, context: Context, prnu: float | None = None) -> Flo
 def believed_sigma_px(view: View, context: Context) -> Floats:
     """(n,) standard deviation of each image position that the tracker believes, see `believed_px2`."""
     return np.sqrt(np.trace(believed_px2(view, context), axis1=1, axis2=2) / 2)
+
+
+def within_gate(view: View, context: Context) -> View:
+    """The lights whose errors of the believed directions, but their median, are within the tracker's matching radius.
+
+    The others are no matches, for example a star that a neighbor displaces. A rotation removes what all share.
+    """
+    error = context.beliefs.direction_error[view.row]
+    if not error.any():
+        return view
+    off_px = np.linalg.norm(error - np.median(error, axis=0), axis=1)
+    off_px *= context.camera.optics.camera.focal_px
+    return view.take(off_px <= GATE_SIGMA * believed_sigma_px(view, context))
 
 
 class Mismatch(NamedTuple):

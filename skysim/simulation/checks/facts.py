@@ -173,7 +173,7 @@ def peak(context: Context, samples: CheckedSamples) -> Fact:
 
 
 def smear(context: Context, samples: CheckedSamples) -> Fact:
-    """Path of the images during an exposure at the rates of the frames."""
+    """Path of the images during an exposure at the mean rates of the frames, their jitter included."""
     frames = samples.frames
     rate_deg_s = np.degrees(frames.attitudes.speed_rad_s)
     length_px = np.array(
@@ -189,6 +189,10 @@ def smear(context: Context, samples: CheckedSamples) -> Fact:
         "median_px": np.median(length_px),
         "rate_deg_s": rate_deg_s[fastest],
     }
+    uneven = uneven_px(context, frames.attitudes.t_s, context.camera.exposure_s)
+    if uneven:
+        values["uneven_px"] = uneven
+        text += f"; jitter moves images by {short(uneven, 2)} px (rms) beside that path"
     if length_px[fastest] > 0:
         width_px = GAUSSIAN_WIDTH * float(
             np.median(np.concatenate([view.sigma_px for view in frames.known]))
@@ -196,6 +200,17 @@ def smear(context: Context, samples: CheckedSamples) -> Fact:
         values["width_rate_deg_s"] = rate_deg_s[fastest] * width_px / length_px[fastest]
         text += f"; as long as the image is wide at {short(values['width_rate_deg_s'])} deg/s"
     return Fact("smear", [text], values)
+
+
+def uneven_px(context: Context, t_s: Floats, exposure_s: float) -> float:
+    """Root mean square distance of images from those at the mean rates of exposures about some times."""
+    lab = context.lab
+    camera = context.camera.optics.camera
+    _, rest = attitudes.jitter_in_exposures(lab, t_s, exposure_s)
+    turned = lab.camera.mount.cam_from_body.apply(rest.reshape(-1, 3))
+    # A roll moves an image at half the way to the corner.
+    arm_px = np.array([camera.focal_px, camera.focal_px, camera.corner_px / 2])
+    return float(np.sqrt(((turned * arm_px) ** 2).sum(axis=1).mean()))
 
 
 class CapMargin(NamedTuple):
@@ -436,15 +451,20 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         ("frames", "at the frames", samples.frames),
         ("reach", "in reach", samples.reach),
     ):
-        cross, roll = sampled.error.rms_arcsec()
         failing = int(np.isnan(sampled.error.total("roll")).sum())
-        few = f"; too few lights at {failing} of {len(sampled.seen)}" if failing else ""
+        broken = int(sampled.broken().sum())
+        total = len(sampled.seen)
+        known = sampled.predicted()
+        cross, roll = sampled.error.rms_arcsec() if known else (math.nan, math.nan)
+        few = f"; too few lights at {failing - broken} of {total}" if failing > broken else ""
+        if broken:
+            few += f"; not predicted at {broken} of {total}, where most streaks break up or join others"
         worst = ""
-        if key == "reach" and failing < len(sampled.seen):
+        if key == "reach" and known and failing < total:
             n = int(np.nanargmax(sampled.error.total("roll")))
             where = attitudes.describe(sampled.attitudes, n, context.lab)
             worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
-        errors = errors_text(cross, roll)
+        errors = errors_text(cross, roll) if known else "unknown"
         rates = attitudes.rates_text(sampled.attitudes)
         lines.append(f"{what}, {rates}: {errors}{worst}{few}")
         values[key] = {
@@ -459,7 +479,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
     lines += [
         f"{angle}: {cause_text(chosen, angle)}"
         for angle in ("cross", "roll")
-        if causes(chosen, angle)
+        if chosen.predicted() and causes(chosen, angle)
     ]
     lines.append(
         "cross: sqrt(x² + y²), x and y the errors about both axes across the boresight"

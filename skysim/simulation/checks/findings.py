@@ -34,7 +34,7 @@ from skysim.simulation.checks.expected_error import (
     gains,
     mismatch,
 )
-from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short
+from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short, uneven_px
 from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
@@ -58,6 +58,7 @@ MAX_BEYOND = 0.25  # fraction of images beyond the tracker's matching radius up 
 # A path that is longer than both gives a warning; the second is in widths of the image.
 MAX_SMEAR_PX = 4.0
 MAX_SMEAR_WIDTHS = 2.0
+MAX_UNEVEN_PX = 0.2  # motion beside a uniform path
 MAX_DEFOCUS = 0.5  # width of the defocus disk, relative to the image in focus
 MIN_DEFOCUS_PX = 1.0
 # Error of the time tags over the filter's value, and the rotation in that time, up to which there is no warning.
@@ -418,9 +419,31 @@ def long_smear(context: Context, samples: CheckedSamples) -> str:
         return ""
     rate_deg_s = float(np.degrees(frames.attitudes.speed_rad_s).max())
     shorter_ms = 1e3 * scene.exposure.time_s * limit_px / longest_px
+    breaking = (
+        ", so that most break up or join others: frames fail, or err by more than their noise"
+        if frames.broken().any()
+        else ""
+    )
     return (
-        f"exposure.time: images move by up to {longest_px:.0f} px during an exposure, at {rate_deg_s:.3g} deg/s; change"
-        f" it to {short(shorter_ms, 2)} ms"
+        f"exposure.time: images move by up to {longest_px:.0f} px during an exposure, at {rate_deg_s:.3g} deg/s"
+        f"{breaking}; change it to {short(shorter_ms, 2)} ms"
+    )
+
+
+def uneven_motion(context: Context, samples: CheckedSamples) -> str:
+    """Warn if jitter moves the images unevenly within an exposure, which the expected errors leave out."""
+    scene = context.lab.scene
+    t_s = samples.frames.attitudes.t_s
+    moved_px = uneven_px(context, t_s, scene.exposure.time_s)
+    if moved_px <= MAX_UNEVEN_PX:
+        return ""
+    shorter_s = scene.exposure.time_s
+    while uneven_px(context, t_s, shorter_s) > MAX_UNEVEN_PX:
+        shorter_s /= 1.1
+    return (
+        f"exposure.time: jitter moves images by {short(moved_px, 2)} px (rms) beside their uniform path within an"
+        " exposure, which is in neither the expected nor the claimed error; change it to"
+        f" {short(1e3 * shorter_s, 2)} ms"
     )
 
 
@@ -511,6 +534,7 @@ FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     cap_too_small,
     out_of_focus,
     long_smear,
+    uneven_motion,
     not_where_expected,
     unknown_tag_error,
     thermal_drift,

@@ -25,7 +25,7 @@ from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, context_of
 from skysim.simulation.checks.facts import FACTS, Fact, errors_text
-from skysim.simulation.checks.findings import FINDINGS
+from skysim.simulation.checks.findings import FINDINGS, hidden_lights
 from skysim.simulation.checks.sampling import CheckedSamples, sampled
 from skysim.simulation.lab import Lab
 from skysim.simulation.motion import check_reference, shortfall
@@ -39,9 +39,13 @@ MAP_WORK = 60_000
 SKY_FINDINGS = (
     sky_warnings.sky_too_shallow,
     sky_warnings.tracker_too_shallow,
+    sky_warnings.beyond_catalog,
     sky_warnings.floor_too_small,
     sky_warnings.refraction,
 )
+# Findings about the directions in which the frames point.
+POINTED = (sky_warnings.bodies_near, sky_warnings.stray_light, sky_warnings.exclusion)
+POINTED_FINDINGS = (sky_warnings.refraction, hidden_lights)
 
 
 class Check(NamedTuple):
@@ -60,7 +64,10 @@ class Check(NamedTuple):
 
 
 def check(
-    lab: Lab, tilt_deg: float | None = None, rate_body_rad_s: Floats | None = None
+    lab: Lab,
+    tilt_deg: float | None = None,
+    rate_body_rad_s: Floats | None = None,
+    drawn: bool = False,
 ) -> Check:
     """Facts and warnings of a lab. Its motion is not simulated.
 
@@ -72,6 +79,8 @@ def check(
         Greatest tilt under a dome; None for that of the scene's motion
     rate_body_rad_s
         (3,) rate of all frames in body axes, for trials of single frames; None for the rates of the motion
+    drawn
+        Whether trials draw other attitudes than those of the scene's motion
 
     Raises
     ------
@@ -103,7 +112,7 @@ def check(
         for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
     ]
     facts = [fact for fact in built if fact is not None]
-    findings = warnings_of(context, samples)
+    findings = warnings_of(context, samples, drawn)
     alike = dome_warnings.of(context, samples)
     if alike is not None and isinstance(scene.light, DomeConfig):
         facts.insert(2, dome_warnings.fact(alike))
@@ -112,7 +121,7 @@ def check(
     findings += [*broken_assumptions(lab), *filter(None, [shortfall(lab)])]
     # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
-    checked = [check(head, tilt_deg, rate_body_rad_s) for head in heads]
+    checked = [check(head, tilt_deg, rate_body_rad_s, drawn) for head in heads]
     if checked:
         facts.append(heads_fact(lab, [facts, *(head.facts for head in checked)]))
     for n, head in enumerate(checked):
@@ -120,18 +129,15 @@ def check(
     return Check(facts, findings)
 
 
-def warnings_of(context: Context, samples: CheckedSamples) -> list[str]:
-    """The warnings of the views."""
+def warnings_of(context: Context, samples: CheckedSamples, drawn: bool) -> list[str]:
+    """The warnings of the views; those about the directions of the frames only if these are not drawn."""
     found = [
         find(context, samples)
         for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
+        if not drawn or find not in POINTED_FINDINGS
     ]
     findings = [line for line in found if line]
-    for finder in (
-        sky_warnings.bodies_near,
-        sky_warnings.stray_light,
-        sky_warnings.exclusion,
-    ):
+    for finder in () if drawn else POINTED:
         findings += finder(context, samples)
     return findings
 

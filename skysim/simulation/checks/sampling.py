@@ -12,10 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Floats
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from skysim.core.types import Bools, Floats
 from skysim.simulation.checks.attitudes import CheckedAttitudes
-from skysim.simulation.checks.detection import Context, usable
-from skysim.simulation.checks.expected_error import Expected, expected
+from skysim.simulation.checks.detection import Context, broken, usable
+from skysim.simulation.checks.expected_error import Expected, expected, within_gate
 from skysim.simulation.checks.views import VISIBLE, View, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import Beam, Exposure, beam_of
@@ -58,6 +59,14 @@ class Sampled(NamedTuple):
         """(A,) number of lights that the tracker uses."""
         return np.array([len(view) for view in self.used])
 
+    def broken(self) -> Bools:
+        """(A,) whether the errors are unknown because most streaks break, see `detection.broken`."""
+        return np.isnan(self.error.total("roll")) & (self.counts() >= MIN_EVIDENCE_MATCHES)
+
+    def predicted(self) -> bool:
+        """Whether the errors are known at most of the attitudes; those where few streaks break are not typical."""
+        return bool(2 * self.broken().sum() <= len(self.used))
+
     def hidden_counts(self) -> Floats:
         """(A,) number of hidden lights that the tracker knows."""
         return np.array([sum(hidden.values()) for hidden in self.hidden])
@@ -88,24 +97,35 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     # 2. Known and other lights on the detector.
     known = []
     seen = []
+    whole = []
     hidden = []
     others = []
     for exposure, beam in zip(exposures, beams, strict=True):
-        found, names = known_lights(beam, exposure, context)
+        found, breaks, names = known_lights(beam, exposure, context)
+        visible = found.behind == VISIBLE
         known.append(found)
-        seen.append(found.take(found.behind == VISIBLE))
+        seen.append(found.take(visible))
+        whole.append(found.take(visible & ~breaks))
         hidden.append(
             Counter(names[number] for number in found.behind[found.behind != VISIBLE])
         )
         others.append(other_lights(beam, exposure, context))
     # 3. Detected lights, and the expected errors of a solution with them.
-    used = [usable(view, context) for view in seen]
-    error = expected(used, at, context)
+    detected = [usable(view, context) for view in whole]
+    used = [within_gate(view, context) for view in detected]
+    # Those that are left where most streaks break are not fitted as well as expected.
+    fitted = [
+        view.take(view.row < 0) if 2 * len(left) < len(usable(all_, context)) else view
+        for view, left, all_ in zip(used, detected, seen, strict=True)
+    ]
+    error = expected(fitted, at, context)
     return Sampled(at, exposures, beams, known, seen, used, hidden, others, error)
 
 
-def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View, list[str]]:
-    """The lights on the detector that the tracker knows, hidden ones included, and the names of their occluders.
+def known_lights(
+    beam: Beam, exposure: Exposure, context: Context
+) -> tuple[View, Bools, list[str]]:
+    """The lights on the detector that the tracker knows, hidden ones included, which are `broken`, and the occluders.
 
     `row` of the view is the row in the tracker's beliefs.
     """
@@ -114,7 +134,9 @@ def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View
     occluders = beam.before(lit)
     found = view(lit, exposure, context.camera, occluders)
     row = context.rows_of(lit.points.id[found.row])
-    return View(row, *found[1:]).take(row >= 0), [occluder.name for occluder in occluders]
+    breaks = broken(found, context)[row >= 0]
+    names = [occluder.name for occluder in occluders]
+    return View(row, *found[1:]).take(row >= 0), breaks, names
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:

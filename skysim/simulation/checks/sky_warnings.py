@@ -159,7 +159,7 @@ LARGEST_FLOOR_PX = 1.0
 
 
 def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
-    """Median of the expected NEES over some attitudes; NaN without lights.
+    """Median of the expected NEES over some attitudes; NaN without lights, or if most streaks break.
 
     The tracker claims the covariance M^-1, the inverse Fisher information for the covariances C_i that it
     believes: those of photon and read-out noise, and the least centroid error floor_px (`tracker.centroid_sigma_px`)
@@ -170,6 +170,8 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     settings = replace(context.settings, centroid_sigma_px=floor_px)
     claiming = context._replace(settings=settings)
     cam_from_body = context.lab.camera.mount.cam_from_body
+    if not sampled.predicted():
+        return math.nan
     for view, lab_from_body in zip(
         sampled.used, sampled.attitudes.lab_from_body, strict=True
     ):
@@ -378,6 +380,22 @@ def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
         f"tracker.limit_mag: the camera detects stars to V {limit_mag:.1f}, but the tracker knows them to V"
         f" {faintest_mag:.1f} only, {100 * known:.0f} % of them; change it to {math.floor(2 * limit_mag) / 2:g}, with a"
         f" tracker.catalog of `skysim catalog build --limit {math.floor(2 * limit_mag) / 2:g}`"
+    )
+
+
+def beyond_catalog(context: Context, samples: CheckedSamples) -> str:
+    """Warn if the tracker's limit is beyond its catalog, which has no stars to add."""
+    scene = context.lab.scene
+    faintest_mag = context.beliefs.faintest_mag
+    limit_mag = scene.tracker.limit_mag
+    if (
+        not isinstance(scene.light, StarsConfig)
+        or limit_mag <= faintest_mag + CATALOG_MARGIN_MAG
+    ):
+        return ""
+    return (
+        f"tracker.limit_mag: V {limit_mag:g}, but tracker.catalog ends at V {faintest_mag:.1f}; change it to"
+        f" {math.floor(2 * faintest_mag) / 2:g}, or the catalog to one of `skysim catalog build --limit {limit_mag:g}`"
     )
 
 

@@ -394,6 +394,18 @@ def test_a_caption_is_flagged_as_text_and_gives_no_streak(height_px: int) -> Non
     assert np.count_nonzero(blobs.flag[written] & Flag.TEXT) >= written.sum() - 1
 
 
+def test_streaks_side_by_side_are_not_flagged_as_text() -> None:
+    """Their boxes have the size of the filter: all are equally high, and rounding makes their widths differ."""
+    light = np.zeros(SHAPE)
+    for n, x in enumerate(range(20, 600, 30)):
+        light[100 + n % 4 : 200 + n % 4, x] = 60.0
+    light = cv2.GaussianBlur(light, (0, 0), 0.8)
+    image = exposed(np.random.default_rng(3), light)
+    blobs = detect.default(image, priors=FramePriors((0.6, 100.0)))
+    assert len(blobs) >= 20
+    assert not (blobs.flag & Flag.TEXT).any()
+
+
 def test_rows_of_equal_lights_are_not_flagged_as_text() -> None:
     """LEDs are disks of one size and may be in a row; letters differ in width."""
     light = np.zeros(SHAPE)

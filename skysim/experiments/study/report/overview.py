@@ -81,7 +81,10 @@ def overview(plan: Plan) -> Overview:
             )
             lab = build_lab(scene, UserParts(plan.spec.programs))
             found_here = checks.check(
-                lab, greatest_tilt_deg(scene, trial), trial_rate_rad_s(trial, lab)
+                lab,
+                greatest_tilt_deg(scene, trial),
+                trial_rate_rad_s(trial, lab),
+                not isinstance(trial, FlightTrial) or trial.start is not None,
             )
         except InputError:
             continue
