@@ -317,6 +317,8 @@ def load(
     layers = read_layers(path)
     # 2. to 4. Merging and validation.
     scene = validate(layers, overrides)
+    changes = f", {dict(overrides)!r}" if overrides else ""
+    scene._call = f"skysim.load_scene({str(name)!r}{changes})"
     # 5. Options without effect.
     if refuses_unused:
         unused.check(

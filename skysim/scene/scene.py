@@ -36,7 +36,7 @@ from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
 from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
-from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
+from skysim.scene.sections.tracker import OWN, FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
@@ -169,6 +169,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
     # Keys of the vehicle that the loader took from a base with another vehicle.model.
     _inherited: tuple[str, ...] = ()
+    # How the loader got it, in Python.
+    _call: str = ""
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
@@ -444,6 +446,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self.light if isinstance(self.light, StarsConfig) else None
 
     @property
+    def call(self) -> str:
+        """The Python call that loads this scene; empty if it was not loaded."""
+        return self._call
+
+    @property
     def inherited(self) -> tuple[str, ...]:
         """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
         return self._inherited
@@ -485,6 +492,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         stages = [
             getattr(tracker, stage)
             for stage in ("detector", "centroider", "identifier", "solver")
+            if tracker.name == OWN
         ]
         focus = "infinity" if math.isinf(camera.focus_m) else f"{camera.focus_m:.4g} m"
         return [

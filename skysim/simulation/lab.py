@@ -73,12 +73,15 @@ class UserParts:
         Star tracker of the main camera
     profile
         Table of attitudes that replaces the file of the first maneuver of kind profile
+    given
+        The arguments of `with_parts` in Python, by name, for reports
     """
 
     programs: Mapping[str, str] = field(default_factory=dict)
     controller: Factory | None = None
     tracker: factory.Estimator | None = None
     profile: Any = None
+    given: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def controllers(self) -> ControllerSource:
@@ -115,7 +118,14 @@ def with_parts(
     if tracker is not None:
         scene, estimator = with_tracker(scene, tracker)
     table = None if isinstance(profile, str | Path) else profile
-    return scene, UserParts(programs, law, estimator, table)
+    parts = {"controller": controller, "tracker": tracker, "profile": profile}
+    given = {
+        name: repr(str(part)) if isinstance(part, str | Path) else name_of(part)
+        for name, part in parts.items()
+        if part is not None
+    }
+    given |= {"programs": repr(dict(programs))} if programs else {}
+    return scene, UserParts(programs, law, estimator, table, given)
 
 
 def with_controller(motion: MotionConfig, controller: Any) -> tuple[MotionConfig, Any]:
