@@ -313,7 +313,7 @@ def check_scene(scene: Scene) -> None:
 
 
 def excited_by_wheels(
-    scene: Scene, vehicle: VehicleModel, tilt_deg: float, longer: float
+    scene: Scene, vehicle: VehicleModel, tilt_deg: float, longer: float = 1.0
 ) -> Scene:
     """The scene with wheels at rest at its start and a maneuver that tilts the vehicle at three yaw angles.
 

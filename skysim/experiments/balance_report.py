@@ -179,15 +179,14 @@ def verdict(statistics: Record) -> Verdict:
     last = flights[-1]
     frames = sum(one["frames"] for one in flights)
     word = "balanced" if statistics["balanced"] else "not balanced"
-    level = "good" if statistics["balanced"] else "bad"
     if not statistics["moves"]:
-        word, level = "estimated", "good"
+        word = "estimated"
     return Verdict(
         f"{word}: gravity torque at most (estimate and 2σ)"
         f" {last['torque_bound_nm']:.2g} N m, bar {statistics['torque_bar_nm']:.2g} N m; the simulated vehicle's is"
         f" {last['true_torque_nm']:.2g} N m; {len(flights)} flights, {frames} frames; misfit {statistics['misfit']:.2f}"
         " (rms residual over its standard error)",
-        level,
+        "bad" if word == "not balanced" else "good",
     )
 
 

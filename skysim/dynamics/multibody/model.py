@@ -266,7 +266,7 @@ def check_options(spec: Any, vehicle: VehicleConfig, path: Path) -> None:
 
     MuJoCo's defaults pass, since a spec does not tell them from a file's.
     """
-    own = {
+    own: dict[str, Any] = {
         "gravity": gravity_lab_m_s2(vehicle),
         "timestep": STEP_S,
         "integrator": int(mujoco.mjtIntegrator.mjINT_RK4),

@@ -65,6 +65,7 @@ def actuators(context: Context, samples: CheckedSamples) -> Fact | None:
     """The actuators that are switched on: names, axes in body axes, limits, and greatest momentum."""
     vehicle = context.lab.vehicle
     config = vehicle.config
+    momentum: Floats | None
     rows: list[tuple[str, str, Any, Floats | None]] = []
     if config.wheels is not None:
         momentum = vehicle.wheels.inertia_kg_m2 * config.wheels.speed_limit_rpm * RPM_RAD_S
