@@ -94,14 +94,8 @@ def test_joints_that_nothing_drives_and_the_file_s_own_parts_are_named(
     tmp_path: Path,
 ) -> None:
     file = model(tmp_path, 'name="wheel_x" axis', 'name="Wheel_x" axis')
-    (line,) = warned(
-        lab_of(
-            "simsat_slew",
-            vehicle__model=file,
-            motion__maneuver="[]",
-            motion__control__actuators="ideal",
-        )
-    )[-1:]
+    wheels = {"vehicle__model": file, "vehicle__wheels": "{torque_limit: 1 N m}"}
+    line = warned(lab_of("afit_simsat", **wheels))[-1]
     assert line.startswith("vehicle.model: joint Wheel_x: not the name of an actuator")
     assert line.endswith("change Wheel_x to wheel_x")
     more = '<sensor><gyro name="mine" site="imu"/></sensor></mujoco>'

@@ -84,8 +84,11 @@ def actuators(context: Context, samples: CheckedSamples) -> Fact | None:
     for key, limit, members, momentum in rows:
         parts = []
         for n, name in enumerate(members.names):
-            stored = f", {short(momentum[n])} N m s" if momentum is not None else ""
-            parts.append(f"{name} about ({numbers(members.axes[:, n], 3)}){stored}")
+            axis = f"({numbers(members.axes[:, n], 3)})"
+            stored = (
+                f"about {axis}, {short(momentum[n])} N m s" if momentum is not None else ""
+            )
+            parts.append(f"{name} {stored or f'along {axis}'}")
         lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
         values[key] = {"names": list(members.names), "axes": members.axes.T.tolist()}
         values[key] |= {} if momentum is None else {"momentum_nms": momentum.tolist()}
