@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +15,8 @@ from skysim.core.types import Floats
 from skysim.core.units import significant
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.actuators import PREFIXES
-from skysim.scene.sections.motion import HoldConfig, Maneuver
 from skysim.simulation.checks.detection import Context
 from skysim.simulation.checks.sampling import CheckedSamples
-from skysim.simulation.lab import Lab
 
 MAX_MANEUVERS = 12  # number of maneuvers that are printed
 CLOSE_NAME = 0.6  # likeness from which a joint's name was meant for an actuator
@@ -99,45 +97,31 @@ def actuators(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("actuators", lines, values) if lines else None
 
 
-def maneuver_times(lab: Lab) -> Iterator[tuple[Maneuver, float, float]]:
-    """Each maneuver with its start and end."""
-    start_s = guidance.plan(lab.scene.motion, lab.start, lab.profiles).start_s
-    return zip(lab.scene.motion.maneuver, start_s, start_s[1:], strict=False)
-
-
 def maneuver(context: Context, samples: CheckedSamples) -> Fact | None:
     """Start and end of each maneuver, and of the exposures; None without a maneuver."""
     lab = context.lab
+    maneuvers = lab.scene.motion.maneuver
+    if not maneuvers:
+        return None
+    exposure = lab.scene.exposure
+    start_s = guidance.plan(lab.scene.motion, lab.start, lab.profiles).start_s
     rows = [
         {"kind": element.kind, "begin_s": begin_s, "end_s": end_s}
-        for element, begin_s, end_s in maneuver_times(lab)
+        for element, begin_s, end_s in zip(maneuvers, start_s, start_s[1:], strict=False)
     ]
-    if not rows:
-        return None
     parts = [f"{row['kind']} {row['begin_s']:.4g} to {row['end_s']:.4g} s" for row in rows]
     more = f", {len(parts) - MAX_MANEUVERS} more" if len(parts) > MAX_MANEUVERS else ""
-    first_s = lab.scene.exposure.first_s
-    text = f"{', '.join(parts[:MAX_MANEUVERS])}{more}; exposures from {first_s:.4g} to {lab.duration_s:.4g} s"
-    return Fact(
-        "maneuver", [text], {"maneuvers": rows, "exposures_s": [first_s, lab.duration_s]}
-    )
-
-
-def unseen_maneuver(context: Context, samples: CheckedSamples) -> str:
-    """Warn if the exposures end before the last maneuver other than a hold."""
-    lab = context.lab
-    exposure = lab.scene.exposure
-    moving = [
-        end_s for one, _, end_s in maneuver_times(lab) if not isinstance(one, HoldConfig)
+    lines = [
+        f"{', '.join(parts[:MAX_MANEUVERS])}{more}; exposures from {exposure.first_s:.4g} to {lab.duration_s:.4g} s"
     ]
-    last_s = max(moving, default=0.0)
-    if last_s <= lab.duration_s + 1 / exposure.rate_hz:
-        return ""
-    frames = math.ceil((last_s - exposure.first_s) * exposure.rate_hz) + 1
-    return (
-        f"exposure.frames: the exposures end at {lab.duration_s:.1f} s, the maneuver lasts until {last_s:.1f} s;"
-        f" change it to {frames}"
-    )
+    if start_s[-1] > lab.duration_s + 1 / exposure.rate_hz:
+        frames = math.ceil((start_s[-1] - exposure.first_s) * exposure.rate_hz) + 1
+        lines.append(
+            f"the exposures end at {lab.duration_s:.1f} s; the maneuver lasts {start_s[-1]:.1f} s:"
+            f" exposure.frames {frames} would show it all"
+        )
+    values = {"maneuvers": rows, "exposures_s": [exposure.first_s, lab.duration_s]}
+    return Fact("maneuver", lines, values)
 
 
 def inherited_vehicle(context: Context, samples: CheckedSamples) -> str:
@@ -182,7 +166,6 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     maneuver,
 )
 FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
-    unseen_maneuver,
     inherited_vehicle,
     free_joints,
     ignored_parts,
