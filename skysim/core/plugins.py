@@ -91,7 +91,11 @@ class PluginKind(NamedTuple):
         allowed = [*self.own, *self.entry_points(), *commands]
         if name not in allowed:
             problem, names = unknown_name(self.kind, name, allowed)
-            raise InputError(self.key, problem, f"{names}, or a program as {name}=COMMAND")
+            raise InputError(
+                self.key,
+                problem,
+                f"{names}, or a program: --program {name}=COMMAND on the command line",
+            )
 
 
 def to_lists(value: Any) -> Any:

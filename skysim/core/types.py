@@ -170,7 +170,7 @@ class Telemetry:
     lab_from_body, rate_body_rad_s
         K true attitudes and (K, 3) true rates in body axes, without the added vibration
     torque_nm
-        (K, 3) torque commanded by the controller, in body axes
+        (K, 3) torque commanded by the controller, in body axes; the actuators may give less
     disturbance_nm
         (K, 3) disturbance torque in body axes, without gravity, drag, spring and actuators
     momentum_nms
@@ -200,6 +200,8 @@ class Telemetry:
         relative to "main"
     loads
         (K,) command, or speed, of each actuator of the controller relative to its limit, by name
+    wheel_names, gimbal_names
+        Names of the joints of wheels and gimbals
     """
 
     t_s: Floats
@@ -223,6 +225,8 @@ class Telemetry:
     sigma_bias_rad_s: Floats | None = None
     mountings: dict[str, Mounting] = field(default_factory=dict)
     loads: dict[str, Floats] = field(default_factory=dict)
+    wheel_names: tuple[str, ...] = ()
+    gimbal_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from skysim.core.constants import INCH_M
@@ -169,6 +170,14 @@ Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
 
 # SI unit, name, example, least and greatest value of a quantity.
 QuantityRange = tuple[str, str, str, float, float]
+
+
+def significant(values: Any, digits: int) -> Any:
+    """The components of a vector; 0 for those below the last of so many digits of the largest one."""
+    values = np.asarray(values, dtype=float)
+    largest = np.abs(values).max(initial=0.0)
+    unit = 10.0 ** (np.floor(np.log10(largest or 1.0)) + 1 - digits)
+    return np.where(np.abs(values) < unit / 2, 0.0, values)
 
 
 def quantities_within(

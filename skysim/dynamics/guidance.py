@@ -63,6 +63,7 @@ State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, accelera
 KNOT_RAD = 0.01
 MIN_KNOTS = 128
 MAX_KNOTS = 5_000_000
+SLEW_DEG_S = 2.0  # greatest rate of a slew without rate and duration
 # Greatest jump of attitude and rate at the beginning of a profile.
 MAX_JUMP_DEG = 0.1
 MAX_JUMP_DEG_S = 0.1
@@ -234,10 +235,16 @@ def step(element: StepConfig, start: LegStart) -> Leg:
 
 
 def slew(element: SlewConfig, start: LegStart) -> Leg:
-    """The shortest eigen-axis rotation from rest to rest, as fast as the two limits allow.
+    """The shortest eigen-axis rotation from rest to rest, as fast as the two limits allow, or in the duration.
 
     With the greatest acceleration a, a ramp to the rate v takes the time 1.5 v / a and the angle 0.75 v^2 / a. A
-    rotation too short for two ramps peaks at v = sqrt(a angle / 1.5) and never cruises.
+    rotation too short for two ramps peaks at v = sqrt(a angle / 1.5) and never cruises. Its duration is
+    T = 1.5 v / a + angle / v, so v = 2 angle / (T + sqrt(T^2 - 6 angle / a)).
+
+    Raises
+    ------
+    InputError
+        For a duration shorter than sqrt(6 angle / a), that of a slew that never cruises.
     """
     # 1. Eigen-axis and angle of the rotation.
     lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
@@ -250,7 +257,12 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
         return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
     # 2. Peak rate, duration of a ramp, and duration of the whole: two ramps, and a cruise over the rest of the angle.
     accel = math.radians(element.acceleration_deg_s2)
-    rate = min(math.radians(element.rate_deg_s), math.sqrt(accel * angle / 1.5))
+    if element.duration_s is None:
+        rate = min(
+            math.radians(element.rate_deg_s or SLEW_DEG_S), math.sqrt(accel * angle / 1.5)
+        )
+    else:
+        rate = slew_rate(angle, accel, element.duration_s)
     ramp = 1.5 * rate / accel
     duration_s = ramp + angle / rate
     return FixedAxisLeg(
@@ -259,6 +271,19 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
         duration_s,
         partial(rest_to_rest, angle, rate, ramp, duration_s),
     )
+
+
+def slew_rate(angle_rad: float, acceleration_rad_s2: float, duration_s: float) -> float:
+    """The greatest rate of a slew of this duration, rad/s, see `slew`."""
+    spare_s2 = duration_s**2 - 6 * angle_rad / acceleration_rad_s2
+    if spare_s2 < 0:
+        raise InputError(
+            "motion.maneuver",
+            f"a slew of {math.degrees(angle_rad):.4g} deg in {duration_s:g} s needs an acceleration_deg_s2 of"
+            f" {math.degrees(6 * angle_rad / duration_s**2):.3g}",
+            f"{math.degrees(acceleration_rad_s2):.4g}, or a longer duration",
+        )
+    return 2 * angle_rad / (duration_s + math.sqrt(spare_s2))
 
 
 def rate(element: RateConfig, start: LegStart) -> Leg:

@@ -168,14 +168,15 @@ LEAST_INFORMATION = 1e-3  # fraction of the needed information below which more 
 AXES = "xyz"
 
 
-def check_observed(
+def uncertain(
     estimate: MassEstimate,
     prior: Prior,
     records: Sequence[BearingRecord],
     inertia_bar: float,
     moment_bar_kg_m: Floats,
-) -> None:
-    """Raise InputError, in one line, if a moment of inertia or the static moment is less certain than required.
+    excitation: Excitation,
+) -> list[str]:
+    """One line for each moment of inertia and component of the static moment that is less certain than required.
 
     Parameters
     ----------
@@ -183,6 +184,8 @@ def check_observed(
         Standard deviation of a moment of inertia over its value
     moment_bar_kg_m
         (3,) standard deviations of the components of mass times center of mass
+    excitation
+        Tilt and length of the flights
     """
     values = estimate.values
     sigma = estimate.sigma
@@ -196,31 +199,46 @@ def check_observed(
             shown = f"after turns of {rate_deg_s[axis]:.2g} deg/s"
             if rate_deg_s[axis] < LEAST_RATE_DEG_S:
                 shown = "after no turn about it"
-            needed = remedy("turn", sigma[axis], prior.sigma[axis], bar)
+            needed = remedy("turn", sigma[axis], prior.sigma[axis], bar, excitation)
             faults.append(f"{known}, not {100 * inertia_bar:.3g} %, {shown}: {needed}")
     for axis in range(3):
         if sigma[6 + axis] > moment_bar_kg_m[axis]:
             known = f"moment along {AXES[axis]} is known to {1e6 * sigma[6 + axis]:.4g} g mm"
             needed = remedy(
-                "tilt", sigma[6 + axis], prior.sigma[6 + axis], moment_bar_kg_m[axis]
+                "tilt",
+                sigma[6 + axis],
+                prior.sigma[6 + axis],
+                moment_bar_kg_m[axis],
+                excitation,
             )
             faults.append(
                 f"{known}, not {1e6 * moment_bar_kg_m[axis]:.3g}, after tilts of {tilt_deg:.1f} deg: {needed}"
             )
-    if faults:
-        raise InputError(
-            "balance", f"{faults[0]}{f' ({len(faults) - 1} more)' if len(faults) > 1 else ''}"
-        )
+    return faults
 
 
-def remedy(motion: str, sigma: float, prior_sigma: float, bar: float) -> str:
+class Excitation(NamedTuple):
+    """Tilt of a flight, its greatest value, and its length relative to the usual one, as options give them."""
+
+    tilt_deg: float
+    most_deg: float
+    longer: float
+
+
+def remedy(
+    motion: str, sigma: float, prior_sigma: float, bar: float, excitation: Excitation
+) -> str:
     """Advice on the motion: the information beyond the prior grows with time and with the square of the motion."""
     needed = bar**-2 - prior_sigma**-2
     gained = max(sigma**-2 - prior_sigma**-2, 0.0)
     if gained < LEAST_INFORMATION * needed:
         return f"a {motion} is needed that the wheels' known momentum or a known trim weighs"
     factor = needed / gained
-    return f"{motion} {np.sqrt(factor):.1f} times as far, or fly {factor:.1f} times as long"
+    # Rounded up to one digit after the point, with a margin of 5 %.
+    tilt_deg = math.ceil(10 * excitation.tilt_deg * math.sqrt(1.05 * factor)) / 10
+    longer = math.ceil(10 * 1.05 * factor * excitation.longer) / 10
+    by_tilt = f"--tilt {tilt_deg:g}, or " if tilt_deg <= excitation.most_deg else ""
+    return f"fly again with {by_tilt}--longer {longer:g}"
 
 
 def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
@@ -294,8 +312,12 @@ def check_scene(scene: Scene) -> None:
         )
 
 
-def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> Scene:
+def excited_by_wheels(
+    scene: Scene, vehicle: VehicleModel, tilt_deg: float, longer: float = 1.0
+) -> Scene:
     """The scene with wheels at rest at its start and a maneuver that tilts the vehicle at three yaw angles.
+
+    The tilting lasts `longer` times PERIODS periods at each of them.
 
     The yaw separates an offset of the center of mass from a horizontal torque that is constant in the lab. The tilt
     shows the height of the offset. The wheels' momentum about all three axes shows the moments of inertia.
@@ -335,7 +357,7 @@ def excited_by_wheels(scene: Scene, vehicle: VehicleModel, tilt_deg: float) -> S
                 "kind": "sine",
                 "amplitude_deg": [tilt_deg * one for one in direction],
                 "frequency_hz": rate_hz,
-                "duration": f"{PERIODS / rate_hz} s",
+                "duration": f"{longer * PERIODS / rate_hz} s",
             }
         )
     control = scene.motion.control

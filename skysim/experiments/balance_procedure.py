@@ -52,6 +52,8 @@ class BalancePlan(NamedTuple):
         Maximum number of flights
     moves
         Whether trim masses are moved; if not, the estimate is from one flight
+    longer
+        Length of a flight relative to the usual one
     """
 
     excite: str
@@ -59,6 +61,7 @@ class BalancePlan(NamedTuple):
     torque_bar_nm: float
     max_flights: int
     moves: bool
+    longer: float = 1.0
 
 
 class Bars(NamedTuple):
@@ -189,10 +192,10 @@ def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) 
     if plan.excite == "swing":
         return balance_flight.with_frames(
             balance_flight.excited_by_swing(scene, plan.tilt_deg, number),
-            balance_flight.SWING_S,
+            plan.longer * balance_flight.SWING_S,
         )
     scene = balance_flight.excited_by_wheels(
-        scene, multibody.build(scene.vehicle), plan.tilt_deg
+        scene, multibody.build(scene.vehicle), plan.tilt_deg, plan.longer
     )
     return balance_flight.with_frames(scene, balance_flight.maneuver_s(scene))
 

@@ -21,6 +21,7 @@ from skysim.results.report_blocks import (
     Column,
     Facts,
     Figure,
+    Items,
     Section,
     Table,
     Text,
@@ -39,6 +40,7 @@ def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -
     return {
         "scene": scene,
         "excite": plan.excite,
+        "moves": plan.moves,
         "torque_bar_nm": plan.torque_bar_nm,
         "balanced": last.torque_bound_nm <= plan.torque_bar_nm,
         "flights": [flight_row(n, one) for n, one in enumerate(iterations, 1)],
@@ -139,8 +141,11 @@ def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
 
 def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
     """The report of a balance with the picture of `draw_flights` as PNG bytes."""
+    trims = bool(statistics["flights"][-1]["trim_mm"])
+    uncertain = statistics.get("uncertain", [])
     blocks = [
         verdict(statistics),
+        *([Items(uncertain, "Less certain than required", "bad")] if uncertain else []),
         Facts(
             [("every number of this page", [Cell("balance.json", link="balance.json")])],
             on_terminal=False,
@@ -150,12 +155,12 @@ def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
             "Flights", [Text(FLIGHTS), flight_table(statistics["flights"])], on_terminal=False
         ),
         Section(
-            "With the trim masses at zero, from all flights",
-            mass_blocks(statistics["estimates"]),
+            f"{'With the trim masses at zero, from' if trims else 'From'} all flights",
+            mass_blocks(statistics["estimates"], trims),
         ),
         Section(
             "By the filter in flight, from the last flight",
-            mass_blocks(statistics.get("in_flight", [])),
+            mass_blocks(statistics.get("in_flight", []), trims),
         ),
     ]
     return Report(f"Balance of {statistics['scene']}", blocks, command)
@@ -173,12 +178,15 @@ def verdict(statistics: Record) -> Verdict:
     flights = statistics["flights"]
     last = flights[-1]
     frames = sum(one["frames"] for one in flights)
+    word = "balanced" if statistics["balanced"] else "not balanced"
+    if not statistics["moves"]:
+        word = "estimated"
     return Verdict(
-        f"{'balanced' if statistics['balanced'] else 'not balanced'}: gravity torque at most (estimate and 2σ)"
+        f"{word}: gravity torque at most (estimate and 2σ)"
         f" {last['torque_bound_nm']:.2g} N m, bar {statistics['torque_bar_nm']:.2g} N m; the simulated vehicle's is"
         f" {last['true_torque_nm']:.2g} N m; {len(flights)} flights, {frames} frames; misfit {statistics['misfit']:.2f}"
         " (rms residual over its standard error)",
-        "good" if statistics["balanced"] else "bad",
+        "bad" if word == "not balanced" else "good",
     )
 
 
@@ -208,19 +216,18 @@ def offset_text(flight: Record) -> str:
     return ", ".join(f"{value:.3g} ± {sigma:.2g}" for value, sigma in found)
 
 
-def mass_blocks(rows: Sequence[Record]) -> list[Block]:
-    """Estimates of the mass properties beside the simulated vehicle's."""
+def mass_blocks(rows: Sequence[Record], trims: bool) -> list[Block]:
+    """Estimates of the mass properties beside the simulated vehicle's, which may have trim masses."""
     heads = ("estimate", "1σ", "simulated vehicle")
     columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
     values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
     for row in values:
+        # A true value far below the standard error is rounding.
+        row[3] *= abs(row[3]) > 1e-6 * row[2]
         row.append((row[1] - row[3]) / row[2])
     table = Table([*columns, Column("error over 1σ", format=".1f")], values)
-    return (
-        [table, Text("J in kg m², of the vehicle with its trim masses at zero.")]
-        if rows
-        else []
-    )
+    of = ", of the vehicle with its trim masses at zero" if trims else ""
+    return [table, Text(f"J in kg m²{of}.")] if rows else []
 
 
 def write_all(

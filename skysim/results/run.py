@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -172,6 +172,8 @@ class Run(Sequence[Score]):
         Every sample of the IMU; None without one
     heads
         The runs of the scene's further star cameras, by name
+    given
+        Further arguments of `skysim.simulate` in Python, by name
     """
 
     lab: Lab
@@ -180,6 +182,7 @@ class Run(Sequence[Score]):
     telemetry: Telemetry = field(repr=False)
     imu_samples: imu.Increments | None = field(repr=False, default=None)
     heads: dict[str, Run] = field(repr=False, default_factory=dict)
+    given: Mapping[str, str] = field(repr=False, default_factory=dict)
 
     @property
     def scene(self) -> Scene:
@@ -222,7 +225,8 @@ class Run(Sequence[Score]):
         recorder = Recorder(Path(folder), self.camera)
         for score in self.scores:
             recorder.add(score)
-        command = f"skysim.simulate(skysim.load_scene({self.scene.name!r}))"
+        given = "".join(f", {name}={text}" for name, text in self.given.items())
+        command = f"skysim.simulate({self.lab.scene.call or self.scene.name}{given})"
         recorder.finish(command, self.telemetry, self.imu_samples, self.check())
         for name, run in self.heads.items():
             run.save(recorder.folder / name)
@@ -237,11 +241,13 @@ def run_of(flight: Flight, scores: Sequence[Sequence[Score]]) -> Run:
     """The result of a flight at its end, from the scores of each camera, the main one first."""
     telemetry = flight.telemetry()
     imu_samples = flight.imu_samples()
+    given = flight.parts.given
     heads = {
-        camera.name: Run(flight.lab, camera, tuple(own), telemetry, imu_samples)
+        camera.name: Run(flight.lab, camera, tuple(own), telemetry, imu_samples, {}, given)
         for camera, own in zip(flight.lab.cameras[1:], scores[1:], strict=True)
     }
-    return Run(flight.lab, flight.lab.camera, tuple(scores[0]), telemetry, imu_samples, heads)
+    own = tuple(scores[0])
+    return Run(flight.lab, flight.lab.camera, own, telemetry, imu_samples, heads, given)
 
 
 class FlightRecorder:

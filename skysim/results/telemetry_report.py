@@ -104,10 +104,6 @@ def table(log: Telemetry) -> Any:
         for component, column in zip(components, values.T, strict=True):
             columns[f"{name}_{component}_{unit}"] = column
 
-    def add_numbered(name: str, values: Floats, unit: str) -> None:
-        numbers = [str(n + 1) for n in range(values.shape[1])]
-        add(name, values, numbers, unit)
-
     attitudes = {
         "true": log.lab_from_body,
         "commanded": log.lab_from_ref,
@@ -124,8 +120,13 @@ def table(log: Telemetry) -> Any:
     add("torque", log.torque_nm, AXES, "nm")
     add("disturbance", log.disturbance_nm, AXES, "nm")
     add("momentum", log.momentum_nms, AXES, "nms")
-    add_numbered("wheel", log.wheel_rad_s / RPM_RAD_S, "rpm")
-    add_numbered("gimbal", np.degrees(log.gimbal_rad), "deg")
+    for names, joints, unit in (
+        (log.wheel_names, log.wheel_rad_s / RPM_RAD_S, "rpm"),
+        (log.gimbal_names, np.degrees(log.gimbal_rad), "deg"),
+    ):
+        columns |= {
+            f"{name}_{unit}": column for name, column in zip(names, joints.T, strict=True)
+        }
     columns |= {f"load_{name}": load for name, load in log.loads.items()}
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability

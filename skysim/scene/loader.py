@@ -322,6 +322,8 @@ def load(
     overrides = resolve_overrides(layers[0].path, overrides or {})
     # 2. to 4. Merging and validation.
     scene = validate(layers, overrides)
+    changes = f", {dict(overrides)!r}" if overrides else ""
+    scene._call = f"skysim.load_scene({str(name)!r}{changes})"
     # 5. Options without effect.
     if refuses_unused:
         unused.check(

@@ -37,7 +37,7 @@ from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
 from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
-from skysim.scene.sections.tracker import FilterConfig, SurveyErrorsConfig, TrackerConfig
+from skysim.scene.sections.tracker import OWN, FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
 NAME_ALIAS = "(the file's name)"  # alias of Scene.name, not a valid key in a file
@@ -215,6 +215,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
     _inherited: tuple[str, ...] = ()
     # Keys as loaded, see `loader.keys_of`.
     _source: RawKeys = RawKeys()
+    # How the loader got it, in Python.
+    _call: str = ""
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
@@ -490,6 +492,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self.light if isinstance(self.light, StarsConfig) else None
 
     @property
+    def call(self) -> str:
+        """The Python call that loads this scene; empty if it was not loaded."""
+        return self._call
+
+    @property
     def inherited(self) -> tuple[str, ...]:
         """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
         return self._inherited
@@ -531,6 +538,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         stages = [
             getattr(tracker, stage)
             for stage in ("detector", "centroider", "identifier", "solver")
+            if tracker.name == OWN
         ]
         focus = "infinity" if math.isinf(camera.focus_m) else f"{camera.focus_m:.4g} m"
         return [

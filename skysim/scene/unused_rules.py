@@ -22,11 +22,11 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.scene.sections.leds import DirectConfig, PwmConfig
 from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
+from skysim.scene.sections.tracker import OWN
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
 FIXED_DETECTORS = ("thesis",)  # detectors with their own thresholds
 OWN_RULES = ("saa", "shefex", "master_star", "fialho")  # identifiers with their paper's rule
-OWN = "own"  # skysim's tracker
 
 
 class Rule(NamedTuple):

@@ -69,11 +69,14 @@ class UserParts:
         Star tracker of the main camera
     profile
         Table of attitudes that replaces the file of the first maneuver of kind profile
+    given
+        The arguments of `with_parts` in Python, by name, for reports
     """
 
     programs: Programs = field(default_factory=dict)
     tracker: factory.Estimator | None = None
     profile: Any = None
+    given: Mapping[str, str] = field(default_factory=dict)
 
 
 NO_PARTS = UserParts()
@@ -104,7 +107,15 @@ def with_parts(
     if tracker is not None:
         scene, estimator = with_tracker(scene, tracker)
     table = None if isinstance(profile, str | Path) else profile
-    return scene, UserParts(programs, estimator, table)
+    parts = {"controller": controller, "tracker": tracker, "profile": profile}
+    given = {
+        name: repr(str(part)) if isinstance(part, str | Path) else name_of(part)
+        for name, part in parts.items()
+        if part is not None
+    }
+    commands = {name: one for name, one in programs.items() if isinstance(one, str)}
+    given |= {"programs": repr(commands)} if commands else {}
+    return scene, UserParts(programs, estimator, table, given)
 
 
 def with_controller(

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
-from skysim.core.plugins import Programs
+from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
 from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
+from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import FlightComputer, controlling_actuator, usage
@@ -34,7 +36,7 @@ from skysim.dynamics.multibody.actuator_kind import ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators
 from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import ControlConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
@@ -136,7 +138,7 @@ def check_torque(
     """Raise InputError if the actuators cannot give a torque (K, 3); `used` (K,) is its ratio to their limit."""
     n = int(used.argmax())
     if used[n] > 1 + ROUNDING:
-        torque = ", ".join(f"{component:.3g}" for component in torque_nm[n])
+        torque = ", ".join(f"{component:.3g}" for component in significant(torque_nm[n], 3))
         raise InputError(
             key,
             f"needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
@@ -151,6 +153,7 @@ FORECAST_S = 0.02  # period of the forecast, at least
 FORECAST_PERIODS = 2000  # greatest number of periods
 MISSING = 0.01  # share of the greatest torque that may be missing
 LEAST_SHORT_S = 0.2  # shorter shortfalls give no warning
+FLOWN_S = 300.0  # longest flight that shows how long actuators are saturated
 AT_LIMIT = 0.999  # load from which an actuator is saturated: friction keeps a wheel just below its limit
 
 
@@ -183,7 +186,6 @@ def shortfall(lab: Lab) -> str:
     disturbances = build_disturbances(lab, (), period_s)
     needed = np.zeros((len(t_s), 3))
     given = np.zeros((len(t_s), 3))
-    loads = np.zeros((len(t_s), len(computer.names)))
     following = reference.state_at(0.0)
     for k, t in enumerate(t_s.tolist()):
         # 1. Torque.
@@ -201,7 +203,6 @@ def shortfall(lab: Lab) -> str:
         owed = (needed - given).sum(axis=0)
         controls = computer.compute_controls(inputs, attitude, momentum, owed)
         given[k] = computer.achieved_nm
-        loads[k] = computer.loads
         angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
         for spun in (vehicle.wheels, vehicle.rotors):
             torque = np.where(spun.motor < 0, 0.0, controls[spun.motor])
@@ -209,16 +210,42 @@ def shortfall(lab: Lab) -> str:
     missing = np.linalg.norm(needed - given, axis=1)
     if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
-    n = int(missing.argmax())
+    # Later the actuators give more than is needed: what they owe.
+    n = int(((needed - given) * needed).sum(axis=1).argmax())
     wanted, possible = (
-        ", ".join(f"{component:.2g}" for component in torque[n]) for torque in (needed, given)
+        ", ".join(f"{component:.2g}" for component in significant(torque[n], 2))
+        for torque in (needed, given)
     )
-    text = saturation_text(t_s, dict(zip(computer.names, loads.T, strict=True)))
+    text = flown_saturation(lab)
     return (
         f"motion.maneuver: needs a torque of ({wanted}) N m at {t_s[n]:.1f} s, of which the actuators"
         f" {control.actuators} give ({possible}){text and ': '}{text}; change it to a slower or smaller one, balance"
         " the vehicle, or take stronger actuators"
     )
+
+
+def flown_saturation(lab: Lab) -> str:
+    """The actuators at their limits in a flight without cameras, as `saturation_text`.
+
+    The controller gets the truth; `pid` replaces an external one. Of a long flight only the first FLOWN_S are flown.
+    """
+    scene = lab.scene
+    control = scene.motion.control
+    assert control is not None
+    law = control.law if control.law in BUILT_IN_LAWS else "pid"
+    control = control.model_copy(update={"law": law, "feedback": "truth"})
+    sections = {
+        "motion": scene.motion.model_copy(update={"control": control}),
+        "vehicle": scene.vehicle.model_copy(update={"imu": None}),
+        "filter": None,
+    }
+    lab = replace(lab, scene=scene.model_copy(update=sections))
+    motion = Motion(lab, NO_PROGRAMS, min(lab.duration_s, FLOWN_S))
+    assert motion.recorder is not None
+    while motion.simulation.steps_left:
+        motion.advance(motion.period_steps)
+    log = motion.recorder.telemetry(None, lab.cameras)
+    return saturation_text(log.t_s, log.loads)
 
 
 def at_limit(loads: Mapping[str, Floats]) -> dict[str, Bools]:
@@ -353,6 +380,8 @@ class TelemetryRecorder:
             self.filter_estimates[rows, 2] if has_filter else None,
             self.mountings_by_camera(t_s, cameras),
             dict(zip(self.flight_computer.names, self.loads[rows].T, strict=True)),
+            vehicle.wheels.names,
+            vehicle.gimbals.names,
         )
 
     def mountings_by_camera(

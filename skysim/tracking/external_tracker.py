@@ -25,10 +25,10 @@ from skysim.core.plugins import ProgramError, describe_error, host_command
 from skysim.core.types import Floats, Frame
 from skysim.scene import scene as scenes
 from skysim.scene.sections.light import StarsConfig
+from skysim.scene.sections.tracker import OWN
 from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (
     FAILED,
-    OWN,
     SOLVED,
     TRACKERS,
     Answer,

@@ -37,6 +37,7 @@ from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
+from skysim.scene.sections.tracker import OWN
 from skysim.tracking import external_tracker
 from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
 from skysim.tracking.onboard_model import (
@@ -50,7 +51,6 @@ from skysim.tracking.onboard_model import (
     with_brightness,
     zero_point_mag,
 )
-from skysim.tracking.tracker_interface import OWN
 
 # Settings of the tracker from a scene.
 

@@ -33,8 +33,8 @@ from skysim.core.plugins import (
 )
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.controllers import CONTROLLERS
+from skysim.scene.sections.tracker import OWN
 
-OWN = "own"  # the name of skysim's own estimator
 TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer

@@ -51,6 +51,8 @@ def full() -> Telemetry:
         momentum_nms=np.column_stack([3 * T_S, 4 * T_S, 0 * T_S]),
         wheel_rad_s=np.column_stack([T_S * 100, -T_S * 200]),
         gimbal_rad=np.column_stack([T_S]),
+        wheel_names=("wheel_a", "wheel_b"),
+        gimbal_names=("gimbal_1",),
         manipulability=1 - T_S,
         lab_from_imu=log.lab_from_body * turned("x", T_S / T_S[-1] * 0.5),
         saturated=T_S < 0.095,
@@ -90,12 +92,12 @@ def test_the_table_has_the_telemetry_in_degrees() -> None:
     np.testing.assert_allclose(table["commanded_yaw_deg"], 10 * T_S + 2, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["imu_roll_deg"][-1], 0.5, rtol=0, atol=1e-12)
     np.testing.assert_allclose(table["rate_z_deg_s"], 10, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(table["wheel_2_rpm"], -200 * T_S * 30 / np.pi, rtol=1e-12)
+    np.testing.assert_allclose(table["wheel_b_rpm"], -200 * T_S * 30 / np.pi, rtol=1e-12)
     np.testing.assert_allclose(table["gimbal_1_deg"], T_S / DEG, rtol=1e-12)
     np.testing.assert_allclose(
         table["assumed_bias_z_deg_h"] - table["bias_z_deg_h"], 1, rtol=1e-9
     )
-    assert {"commanded_roll_deg", "imu_roll_deg", "wheel_1_rpm"}.isdisjoint(
+    assert {"commanded_roll_deg", "imu_roll_deg", "wheel_a_rpm"}.isdisjoint(
         telemetry_report.table(bare()).colnames
     )
 

@@ -111,6 +111,11 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
         if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
             problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
             raise InputError(path, problem)
+        if actuator.target.startswith(PREFIXES):
+            problem = (
+                f"actuator of {actuator.target} is set by the scene; remove it from the file"
+            )
+            raise InputError(path, problem)
     return locked
 
 
@@ -162,6 +167,7 @@ def check_bare(joint: Any, path: Path) -> None:
     attributes = {
         "range": joint.range,
         "stiffness": joint.stiffness,
+        "springref": joint.springref,
         "damping": joint.damping,
         "frictionloss": joint.frictionloss,
         "armature": joint.armature,

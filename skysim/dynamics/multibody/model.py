@@ -16,6 +16,7 @@ angular rate in body axes.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,10 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Ints, Mount
-from skysim.dynamics.multibody.actuator_kind import Hinges, joints
+from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, joints
 from skysim.dynamics.multibody.actuators import (
     KINDS,
+    PREFIXES,
     TORQUES,
     add_actuators,
     lock_unused,
@@ -53,6 +55,7 @@ from skysim.scene.sections.vehicle import VehicleConfig
 
 STEP_S = 1e-3
 CENTERED_M = 1e-9  # offset of a file's center of mass by rounding
+GIVEN_TOLERANCE = 1e-3  # relative difference of a file's gravity, such as 9.81
 IMU = "imu"
 REQUIRED = f"body bus and camera {CAMERA}"
 
@@ -100,6 +103,25 @@ class VehicleModel:
     def inertia_kg_m2(self) -> Floats:
         """(3, 3) inertia tensor about the bearing's center, in body axes, with every joint locked."""
         return self.mass.inertia_kg_m2
+
+    @property
+    def free_joints(self) -> list[str]:
+        """Names of the joints that belong to no actuator, without the bearing and those without a name."""
+        members = (self.wheels, self.gimbals, self.rotors, self.trims)
+        known = {"", "bearing", *itertools.chain.from_iterable(one.names for one in members)}
+        return [
+            name for name in all_names(self.model.joint, self.model.njnt) if name not in known
+        ]
+
+    @property
+    def ignored(self) -> list[str]:
+        """The file's own actuators, which get no control, and its sensors, which are not read."""
+        own = (*TORQUES, *PREFIXES)
+        motors = all_names(self.model.actuator, self.model.nu)
+        sensors = all_names(self.model.sensor, self.model.nsensor)
+        return [f"actuator {name}" for name in motors if not name.startswith(own)] + [
+            f"sensor {name}" for name in sensors
+        ]
 
     @property
     def gravity_m_s2(self) -> float:
@@ -157,6 +179,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
             f"[0 m, 0 m, 0 m]; it is {np.round(mass.center_m, 6).tolist()} m",
         )
     # 5. Bearing.
+    check_options(spec, vehicle, path)
     try:
         add_bearing(spec, bus, vehicle)
     except ValueError as error:  # a name is taken
@@ -232,6 +255,35 @@ def turn_camera(spec: Any, rotation_deg: tuple[float, float, float]) -> None:
     camera.quat = (parent_from_file * mjcam_from_turned).as_quat(scalar_first=True)
 
 
+def gravity_lab_m_s2(vehicle: VehicleConfig) -> list[float]:
+    """Gravity on the vehicle in lab axes."""
+    on_bearing = vehicle.mount == "air_bearing"
+    return [0.0, 0.0, -STANDARD_GRAVITY_M_S2 if on_bearing else 0.0]
+
+
+def check_options(spec: Any, vehicle: VehicleConfig, path: Path) -> None:
+    """Raise InputError for an <option> of the file that `add_bearing` would replace by another value.
+
+    MuJoCo's defaults pass, since a spec does not tell them from a file's.
+    """
+    own: dict[str, Any] = {
+        "gravity": gravity_lab_m_s2(vehicle),
+        "timestep": STEP_S,
+        "integrator": int(mujoco.mjtIntegrator.mjINT_RK4),
+        "disableflags": 0,
+    }
+    default = mujoco.MjSpec().option
+    for name, value in own.items():
+        given = np.asarray(getattr(spec.option, name))
+        is_default = np.array_equal(given, getattr(default, name))
+        if not (is_default or np.allclose(given, value, rtol=GIVEN_TOLERANCE, atol=0)):
+            raise InputError(
+                path,
+                f"<option> {name} {given.tolist()} is not used: with mount {vehicle.mount} it is {value}; remove it"
+                " from the file",
+            )
+
+
 def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
     """Add a ball joint with air drag and cable spring; for an air bearing also gravity and a tilt stop.
 
@@ -249,7 +301,7 @@ def add_bearing(spec: Any, bus: Any, vehicle: VehicleConfig) -> None:
         stiffness=[cable.stiffness_nm_rad if cable else 0.0, 0.0, 0.0],
     )
     on_bearing = vehicle.mount == "air_bearing"
-    spec.option.gravity = [0.0, 0.0, -STANDARD_GRAVITY_M_S2 if on_bearing else 0.0]
+    spec.option.gravity = gravity_lab_m_s2(vehicle)
     spec.option.timestep = STEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     # The solver's tolerance is in units of the mean inertia: MuJoCo's default of 1e-8 would hide the friction of a

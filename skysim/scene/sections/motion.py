@@ -117,11 +117,30 @@ class StepConfig(AttitudeConfig):
 
 
 class SlewConfig(AttitudeConfig):
-    """Rest-to-rest eigenaxis rotation to a 3-2-1 attitude, with greatest rate and acceleration."""
+    """Rest-to-rest eigenaxis rotation to a 3-2-1 attitude: the rate rises and falls along smoothsteps 3x^2 - 2x^3.
+
+    The acceleration peaks in the middle of a ramp. An angle A takes A / rate + 1.5 rate / acceleration.
+
+    Attributes
+    ----------
+    rate_deg_s
+        Greatest rate; 2 deg/s if neither it nor a duration is given. A short slew does not reach it
+    acceleration_deg_s2
+        Greatest acceleration
+    duration
+        Duration, in place of the rate
+    """
 
     kind: Literal["slew"]
-    rate_deg_s: Positive = 2.0
+    rate_deg_s: Positive | None = None
     acceleration_deg_s2: Positive = 0.5
+    duration_s: Duration | None = None
+
+    @model_validator(mode="after")
+    def check_rate(self) -> SlewConfig:
+        if self.rate_deg_s is not None and self.duration_s is not None:
+            raise InputError("duration", "given beside rate_deg_s", "one of the two")
+        return self
 
 
 class RateConfig(ConfigModel):

@@ -25,6 +25,8 @@ from skysim.core.units import (
 )
 from skysim.core.yaml_reader import existing_file
 
+OWN = "own"  # skysim's tracker
+
 
 class TotalStationConfig(ConfigModel):
     """A total station that measures every LED by a horizontal direction, a zenith angle and a distance from one point.
@@ -228,7 +230,7 @@ class TrackerConfig(ConfigModel):
         File that `skysim survey` wrote: measured LEDs, lever, focal length and distortion
     """
 
-    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = "own"
+    name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = OWN
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
     time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
     detector: str | None = None

@@ -9,7 +9,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +19,11 @@ from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
-from skysim.simulation.checks import attitudes, beliefs
+from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import CheckedSamples, Sampled
+from skysim.simulation.checks.vehicle_facts import Fact, short
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
 from skysim.sources.dome.surface import Radial
@@ -38,19 +38,6 @@ REQUIREMENTS = "requirements"
 UNTESTED = (
     "matches accepted by the thesis's rule, not tested against chance (tracker.acceptance)"
 )
-
-
-def short(value: float, digits: int = 3) -> str:
-    """A number as text with this number of significant digits and without an exponent."""
-    return f"{float(f'{value:.{digits}g}'):.10g}"
-
-
-class Fact(NamedTuple):
-    """One fact: its name, its text in lines, and its numbers by name."""
-
-    name: str
-    lines: list[str]
-    values: dict[str, Any]
 
 
 def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
@@ -78,7 +65,14 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     ):
         counts = sampled.counts()
         seen = np.array([len(view) for view in sampled.seen])
-        where = attitudes.describe(sampled.attitudes, int(counts.argmin()), lab)
+        least_of = sampled
+        of = ""
+        if sampled is samples.reach:
+            # The frames are in reach too.
+            least_of = min(samples, key=lambda one: one.counts().min())
+            of = f"of {len(counts)} attitudes and the frames "
+        least = int(least_of.counts().min())
+        where = attitudes.describe(least_of.attitudes, int(least_of.counts().argmin()), lab)
         limit = context.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = (
@@ -95,11 +89,11 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
         )
         rates = attitudes.rates_text(sampled.attitudes)
         lines.append(
-            f"{what}, {rates}: mean {counts.mean():.1f}{missed}, least {counts.min()} at {where}{behind}"
+            f"{what}, {rates}: mean {counts.mean():.1f}{missed}, least {of}{least} at {where}{behind}"
         )
         values[key] = {
             "mean": counts.mean(),
-            "least": counts.min(),
+            "least": least,
             "least_at": where,
             "on_chip": seen.mean(),
         }
@@ -223,7 +217,7 @@ class CapMargin(NamedTuple):
     tilt_deg
         The tilt
     needed_deg
-        Reach of the middle of the field's longer side
+        Reach of the middle of the field's shorter sides, its farther edges; infinite if it passes the surface's rim
     corner_deg
         Reach of the field's corner
     limit_deg
@@ -239,13 +233,13 @@ class CapMargin(NamedTuple):
     @property
     def text(self) -> str:
         """The reach of the field and the margins in words."""
-        edge, corner = (
-            self.cap_deg - needed for needed in (self.needed_deg, self.corner_deg)
-        )
-        return (
-            f"the field's edge reaches {self.needed_deg:.1f}°, its corner {self.corner_deg:.1f}°: margin {edge:+.1f}°"
-            f" and {corner:+.1f}°"
-        )
+        if math.isinf(self.needed_deg):
+            return "the field's edge passes the rim of the surface: no cap covers it"
+        edge = f"{self.cap_deg - self.needed_deg:+.1f}°"
+        text = f"the field's edge reaches {self.needed_deg:.1f}°, its corner"
+        if math.isinf(self.corner_deg):
+            return f"{text} passes the rim of the surface: margin {edge}"
+        return f"{text} {self.corner_deg:.1f}°: margin {edge} and {self.cap_deg - self.corner_deg:+.1f}°"
 
 
 def cap_margin(
@@ -254,8 +248,8 @@ def cap_margin(
     """The cap of the LEDs and the reach of the field at a tilt; None without a layout that fills a cap.
 
     Any side or corner of the field may point outward. `field_reach_deg` traces rays at their angles from the boresight
-    to the surface, at the tilt to all sides. `light.layout.cap_deg` is compared with their angle from the zenith as
-    seen from the bearing.
+    to the surface, at the tilt to all sides. `light.layout.cap_deg` is compared with the angle from the zenith of
+    these points as seen from the bearing.
 
     Parameters
     ----------
@@ -285,9 +279,10 @@ def cap_margin(
 
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
-    """Greatest angle from the zenith, seen from the bearing, at which a circle of the field meets the tilted dome.
+    """Greatest angle from the zenith, seen from the bearing, at which a circle of the tilted field meets the dome.
 
-    The circle has the radius radius_px about the boresight. The tilt is tried to SIDES azimuths.
+    Infinite if a ray passes below the rim. The circle has the radius radius_px about the boresight. The tilt is tried
+    to SIDES azimuths.
     """
     mount = context.lab.camera.mount
     surface = context.surface
@@ -302,8 +297,8 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     for lab_from_body in Rotation.from_euler("ZYZ", tilts):
         rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
-        # A ray that misses the surface passes below its rim: its own direction is the least angle that it needs.
-        met = np.where(np.isnan(met), rays, met)
+        if np.isnan(met).any():
+            return math.inf
         zenith_rad = np.arctan2(np.hypot(*met.T[:2]), met[:, 2])
         needed_deg = max(needed_deg, float(np.degrees(zenith_rad).max()))
     return needed_deg
@@ -378,26 +373,6 @@ def wall(context: Context, samples: CheckedSamples) -> Fact | None:
         values["mass_kg"] = config.density_kg_m3 * size.volume_m3
         text += f", mass {values['mass_kg']:.2f} kg"
     return Fact("dome's wall", [text + ", without ribs and flange"], values)
-
-
-def mass_properties(context: Context, samples: CheckedSamples) -> Fact:
-    """Mass, inertia about the bearing's center and center of mass, each with its origin: the scene or the model."""
-    vehicle = context.lab.vehicle
-    config = vehicle.config
-    mass = vehicle.mass
-    numbers = (
-        ("mass_kg", mass.mass_kg, "{} kg", 1.0),
-        ("inertia_kg_m2", mass.inertia_kg_m2.diagonal(), "inertia {} kg m²", 1.0),
-        ("center_of_mass_m", mass.center_m, "center of mass {} mm", 1e3),
-    )
-    texts = []
-    values: dict[str, Any] = {}
-    for key, number, text, scale in numbers:
-        origin = Path(config.model).name if getattr(config, key) is None else "scene"
-        shown = ", ".join(short(scale * one, 4) for one in np.atleast_1d(number))
-        texts.append(f"{text.format(shown)} ({origin})")
-        values |= {key: np.asarray(number).tolist(), f"{key}_of": origin}
-    return Fact("vehicle", [", ".join(texts)], values)
 
 
 def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
@@ -594,7 +569,7 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     cap,
     room,
     wall,
-    mass_properties,
+    *vehicle_facts.FACTS,
     depth_of_focus,
     tracker_beliefs,
     expected_error,

@@ -22,7 +22,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.checks import attitudes
+from skysim.simulation.checks import attitudes, vehicle_facts
 from skysim.simulation.checks.detection import (
     Context,
     detected_area_px,
@@ -38,6 +38,7 @@ from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, sho
 from skysim.simulation.checks.sampling import CheckedSamples
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
+from skysim.sources.dome.layouts.placing import largest_cap_deg
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning
 # Recommended peak over full well of the light that a fraction MAX_SATURATED exceeds
@@ -377,10 +378,18 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
         if found.tilt_deg > found.cap_deg
         else "its edge has no LED"
     )
+    assert context.surface is not None
+    largest_deg = largest_cap_deg(context.surface)
+    reach = f"reaches {found.needed_deg:.1f} deg: {uncovered}; change it to"
+    if found.needed_deg > largest_deg:
+        reach = f"passes the rim of the surface: no cap covers it ({largest_deg:.1f} at most); tilt less"
+    elif found.corner_deg > largest_deg:
+        reach += f" {math.ceil(found.needed_deg)}; no cap covers its corners, which pass the rim of the surface"
+    else:
+        reach += f" {math.ceil(found.needed_deg)}, or {math.ceil(found.corner_deg)} for its corners"
     return (
         f"{key}: LEDs end at {found.cap_deg:.3g} deg from the zenith, but at a tilt of {found.tilt_deg:.1f} deg the"
-        f" field reaches {found.needed_deg:.1f} deg: {uncovered}; change it to {math.ceil(found.needed_deg)}, or"
-        f" {math.ceil(found.corner_deg)} for its corners"
+        f" field {reach}"
     )
 
 
@@ -464,14 +473,6 @@ def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def inherited_vehicle(context: Context, samples: CheckedSamples) -> str:
-    """Warn if keys about the vehicle's body are those of a base scene with another vehicle."""
-    inherited = ", ".join(context.lab.scene.inherited)
-    if not inherited:
-        return ""
-    return f"vehicle.model: not that of the base, whose {inherited} the vehicle keeps; give its own"
-
-
 def thermal_drift(context: Context, samples: CheckedSamples) -> str:
     """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
     thermal_config = context.lab.scene.thermal
@@ -538,5 +539,5 @@ FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     not_where_expected,
     unknown_tag_error,
     thermal_drift,
-    inherited_vehicle,
+    *vehicle_facts.FINDINGS,
 )

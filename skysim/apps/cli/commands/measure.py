@@ -39,6 +39,9 @@ EstimateOnly = Annotated[
 Tilt = Annotated[
     float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
 ]
+Longer = Annotated[
+    float, typer.Option(min=0.1, max=100, help="Length of a flight, times the usual one.")
+]
 Torque = Annotated[
     str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
 ]
@@ -84,6 +87,7 @@ def balance(
     excite: ExcitedBy = "wheels",
     estimate_only: EstimateOnly = False,
     tilt: Tilt = 8.0,
+    longer: Longer = 1.0,
     torque: Torque = "5e-5 N m",
     flights: Flights = None,
     inertia_bar: InertiaBar = 1.0,
@@ -113,24 +117,26 @@ def balance(
     bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
     loaded = load(scene, None, seed, set_)
     plan = balance_procedure.BalancePlan(
-        excite, tilt, bars.torque_nm, flights or 6, not estimate_only
+        excite, tilt, bars.torque_nm, flights or 6, not estimate_only, longer
     )
     assumed = balance_procedure.assumed(loaded, uncertainty)
     flown = fly(loaded, plan, uncertainty, json)
     statistics = balance_report.statistics(loaded.name, plan, flown)
     if in_flight:
         statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
-    folder = output_folder(out, loaded.name)
-    command = command_line()
-    print_report(
-        statistics, balance_report.write_all(folder, statistics, flown, command), json
-    )
-    balance_flight.check_observed(
+    stop_deg = loaded.vehicle.tilt_stop_deg - balance_flight.STOP_MARGIN_DEG
+    statistics["uncertain"] = balance_flight.uncertain(
         flown[-1].estimate,
         assumed.prior,
         [one.flight.record for one in flown],
         bars.inertia,
         bars.moment_kg_m(flown[-1].flight.vehicle),
+        balance_flight.Excitation(tilt, stop_deg, longer),
+    )
+    folder = output_folder(out, loaded.name)
+    command = command_line()
+    print_report(
+        statistics, balance_report.write_all(folder, statistics, flown, command), json
     )
 
 

@@ -185,9 +185,19 @@ def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
         raise InputError(
             "light.layout",
             "exceeds the surface",
-            "a smaller cap_deg, a larger surface or rim, or kind listed",
+            f"cap_deg up to {largest_cap_deg(surface):.1f}, a larger surface or rim, or kind listed",
         )
     return place_m
+
+
+def largest_cap_deg(surface: Surface) -> float:
+    """Greatest angle from the zenith, seen from the bearing, to which the surface extends at every azimuth, to 0.1."""
+    tilt_deg = np.arange(0, 1800) / 10
+    azimuth_rad = np.arange(72) * (2 * np.pi / 72)
+    rays = directions(*np.meshgrid(np.radians(tilt_deg), azimuth_rad, indexing="ij"))
+    missed = np.isnan(surface.meet(np.zeros(3), rays.reshape(-1, 3))).reshape(rays.shape)
+    met = np.logical_and.accumulate(~missed.any(axis=(1, 2)))
+    return float(tilt_deg[met].max(initial=0.0))
 
 
 def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> Ints:

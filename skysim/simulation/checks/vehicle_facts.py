@@ -1,0 +1,172 @@
+"""Facts and warnings about the vehicle of a plan: mass properties, actuators, and the maneuver beside the exposures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from difflib import SequenceMatcher
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from skysim.core.constants import RPM_RAD_S
+from skysim.core.types import Floats
+from skysim.core.units import significant
+from skysim.dynamics import guidance
+from skysim.dynamics.multibody.actuators import PREFIXES
+from skysim.simulation.checks.detection import Context
+from skysim.simulation.checks.sampling import CheckedSamples
+
+MAX_MANEUVERS = 12  # number of maneuvers that are printed
+CLOSE_NAME = 0.6  # likeness from which a joint's name was meant for an actuator
+
+
+def short(value: float, digits: int = 3) -> str:
+    """A number as text with this number of significant digits and without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):.10g}"
+
+
+class Fact(NamedTuple):
+    """One fact: its name, its text in lines, and its numbers by name."""
+
+    name: str
+    lines: list[str]
+    values: dict[str, Any]
+
+
+def numbers(values: Any, digits: int) -> str:
+    """Components of a vector with commas; 0 for those below the last digit of the largest one."""
+    return ", ".join(short(one, digits) for one in significant(np.atleast_1d(values), digits))
+
+
+def mass_properties(context: Context, samples: CheckedSamples) -> Fact:
+    """Mass, inertia about the bearing's center and center of mass, each with its origin: the scene or the model."""
+    vehicle = context.lab.vehicle
+    config = vehicle.config
+    mass = vehicle.mass
+    quantities = (
+        ("mass_kg", mass.mass_kg, "{} kg", 1.0),
+        ("inertia_kg_m2", mass.inertia_kg_m2.diagonal(), "inertia {} kg m²", 1.0),
+        ("center_of_mass_m", mass.center_m, "center of mass {} mm", 1e3),
+    )
+    texts = []
+    values: dict[str, Any] = {}
+    for key, number, text, scale in quantities:
+        origin = Path(config.model).name if getattr(config, key) is None else "scene"
+        texts.append(f"{text.format(numbers(scale * number, 4))} ({origin})")
+        values |= {key: np.asarray(number).tolist(), f"{key}_of": origin}
+    return Fact("vehicle", [", ".join(texts)], values)
+
+
+def actuators(context: Context, samples: CheckedSamples) -> Fact | None:
+    """The actuators that are switched on: names, axes in body axes, limits, and greatest momentum."""
+    vehicle = context.lab.vehicle
+    config = vehicle.config
+    momentum: Floats | None
+    rows: list[tuple[str, str, Any, Floats | None]] = []
+    if config.wheels is not None:
+        momentum = vehicle.wheels.inertia_kg_m2 * config.wheels.speed_limit_rpm * RPM_RAD_S
+        limit = f"{short(config.wheels.torque_limit_nm)} N m"
+        rows.append(("wheels", limit, vehicle.wheels, momentum))
+    if config.cmgs is not None:
+        momentum = vehicle.rotors.inertia_kg_m2 * config.cmgs.rotor_rpm * RPM_RAD_S
+        limit = f"{short(config.cmgs.gimbal_rate_limit_deg_s)} deg/s"
+        rows.append(("cmgs", limit, vehicle.gimbals, momentum))
+    if config.fans is not None:
+        rows.append(("fans", f"{short(config.fans.thrust_limit_n)} N", vehicle.fans, None))
+    if config.trim is not None:
+        rows.append(("trim", f"{short(1e3 * config.trim.travel_m)} mm", vehicle.trims, None))
+    lines = []
+    values: dict[str, Any] = {}
+    for key, limit, members, momentum in rows:
+        parts = []
+        for n, name in enumerate(members.names):
+            axis = f"({numbers(members.axes[:, n], 3)})"
+            stored = (
+                f"about {axis}, {short(momentum[n])} N m s" if momentum is not None else ""
+            )
+            parts.append(f"{name} {stored or f'along {axis}'}")
+        lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
+        values[key] = {"names": list(members.names), "axes": members.axes.T.tolist()}
+        values[key] |= {} if momentum is None else {"momentum_nms": momentum.tolist()}
+    control = context.lab.scene.motion.control
+    if control is not None and control.actuators == "ideal":
+        lines.append(f"ideal torques to {short(config.torque_limit_nm)} N m about each axis")
+        values["ideal"] = {"torque_limit_nm": config.torque_limit_nm}
+    return Fact("actuators", lines, values) if lines else None
+
+
+def maneuver(context: Context, samples: CheckedSamples) -> Fact | None:
+    """Start and end of each maneuver, and of the exposures; None without a maneuver."""
+    lab = context.lab
+    maneuvers = lab.scene.motion.maneuver
+    if not maneuvers:
+        return None
+    exposure = lab.scene.exposure
+    start_s = guidance.plan(lab.scene.motion, lab.start, lab.profiles).start_s
+    rows = [
+        {"kind": element.kind, "begin_s": begin_s, "end_s": end_s}
+        for element, begin_s, end_s in zip(maneuvers, start_s, start_s[1:], strict=False)
+    ]
+    parts = [f"{row['kind']} {row['begin_s']:.4g} to {row['end_s']:.4g} s" for row in rows]
+    more = f", {len(parts) - MAX_MANEUVERS} more" if len(parts) > MAX_MANEUVERS else ""
+    lines = [
+        f"{', '.join(parts[:MAX_MANEUVERS])}{more}; exposures from {exposure.first_s:.4g} to {lab.duration_s:.4g} s"
+    ]
+    if start_s[-1] > lab.duration_s + 1 / exposure.rate_hz:
+        frames = math.ceil((start_s[-1] - exposure.first_s) * exposure.rate_hz) + 1
+        lines.append(
+            f"the exposures end at {lab.duration_s:.1f} s; the maneuver lasts {start_s[-1]:.1f} s:"
+            f" exposure.frames {frames} would show it all"
+        )
+    values = {"maneuvers": rows, "exposures_s": [exposure.first_s, lab.duration_s]}
+    return Fact("maneuver", lines, values)
+
+
+def inherited_vehicle(context: Context, samples: CheckedSamples) -> str:
+    """Warn if keys about the vehicle's body are those of a base scene with another vehicle."""
+    inherited = ", ".join(context.lab.scene.inherited)
+    if not inherited:
+        return ""
+    return f"vehicle.model: not that of the base, whose {inherited} the vehicle keeps; give its own"
+
+
+def free_joints(context: Context, samples: CheckedSamples) -> str:
+    """Warn of joints of the vehicle's file that no actuator drives, with the nearest name that would be one."""
+    free = context.lab.vehicle.free_joints
+    if not free:
+        return ""
+    name = free[0]
+    likeness = {
+        prefix: SequenceMatcher(None, name[: len(prefix)].lower(), prefix).ratio()
+        for prefix in PREFIXES
+    }
+    nearest = max(likeness, key=likeness.__getitem__)
+    change = ""
+    if likeness[nearest] > CLOSE_NAME:
+        change = f"; change {name} to {nearest}{name[len(nearest) :]}"
+    return (
+        f"vehicle.model: joint{'s' * (len(free) > 1)} {', '.join(free)}: not the name of an actuator"
+        f" ({', '.join(PREFIXES)}), so nothing drives it{change}"
+    )
+
+
+def ignored_parts(context: Context, samples: CheckedSamples) -> str:
+    """Warn of actuators and sensors of the vehicle's file, which have no effect."""
+    ignored = ", ".join(context.lab.vehicle.ignored)
+    if not ignored:
+        return ""
+    return f"vehicle.model: {ignored}: not used; the scene's vehicle.wheels, cmgs, fans and imu are; remove them"
+
+
+FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
+    mass_properties,
+    actuators,
+    maneuver,
+)
+FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
+    inherited_vehicle,
+    free_joints,
+    ignored_parts,
+)
