@@ -94,7 +94,7 @@ class PluginKind(NamedTuple):
             raise InputError(
                 self.key,
                 problem,
-                f"{names}, or a program: --program {name}=COMMAND on the command line",
+                f"{names}, or a program: {name}=COMMAND by the option program (Python: programs)",
             )
 
 

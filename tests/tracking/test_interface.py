@@ -394,7 +394,7 @@ def test_a_scene_names_a_tracker_and_never_a_command() -> None:
     )
     with pytest.raises(
         InputError,
-        match=r"tracker\.name: unknown tracker 'mine'; .*a program: --program mine=COMMAND",
+        match=r"tracker\.name: unknown tracker 'mine'; .*a program: mine=COMMAND by the option program",
     ):
         build_lab(scene)
     for key in ("tracker.command", "tracker.program"):
