@@ -158,7 +158,9 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     lines = table(store, names)
     columns = pooled(plan, store)
     answered = [pooled_row(plan, columns, names)] if columns else lines
-    headline = answer.headline(study, answered, about.may_be_ambiguous, command("worst"))
+    headline = answer.headline(
+        study, answered, about.may_be_ambiguous, command("worst"), about.survey_share
+    )
     headline += answer.one_unit(about.fixed) if headline else []
     sobol = study.design.kind == "saltelli" and not study.optimize
     return Analysis(
