@@ -279,16 +279,16 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
 def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[Record]:
     """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
-    rows = (
-        ("LED place mm", accuracy["led_mm"], 1e6 * np.array([one.led_m2 for one in errors])),
-        ("lever mm", accuracy["lever_mm"], 1e6 * np.array([one.lever_m2 for one in errors])),
-        (
-            "focal length px",
-            accuracy["focal_px"],
-            np.array([one.focal_px2 for one in errors]),
-        ),
-    )
-    return [compared(*row) for row in rows]
+    return [
+        compared(
+            what, accuracy[key], scale * np.array([getattr(one, name) for one in errors])
+        )
+        for what, key, name, scale in (
+            ("LED place mm", "led_mm", "led_m2", 1e6),
+            ("lever mm", "lever_mm", "lever_m2", 1e6),
+            ("focal length px", "focal_px", "focal_px2", 1),
+        )
+    ]
 
 
 def compared(what: str, sigma: float | None, squares: Floats) -> Record:

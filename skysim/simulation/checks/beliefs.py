@@ -156,27 +156,24 @@ def map_faults(mapped: DomeMap, lab: Lab, place_m: Floats) -> tuple[str, ...]:
     A parameter that the survey held fixed has no deviation: any difference counts. LEDs are at place_m (N, 3).
     """
     true = calibration(lab.scene.camera)
-    axes = math.sqrt(3)  # from the standard deviation along one axis to that of a distance
+    limit = FAULT_SIGMAS * math.sqrt(3)  # from one axis to the length of a vector
     led_m = np.linalg.norm(mapped.position_m - place_m, axis=1)
-    beyond = led_m > FAULT_SIGMAS * axes * mapped.sigma_m
-    found = []
-    if beyond.any():
-        found.append(
-            f"{beyond.sum()} of {len(beyond)} LEDs are up to {1e3 * led_m[beyond].max():.3g} mm from the scene's"
-        )
+    moved = led_m > limit * mapped.sigma_m
     lever_m = math.dist(mapped.camera_body_m, lab.camera.mount.camera_body_m)
-    if lever_m > FAULT_SIGMAS * axes * mapped.lever_sigma_m:
-        found.append(f"its lever is {1e3 * lever_m:.3g} mm from the scene's")
-    focal_px = mapped.focal_px - true.focal_px
-    if abs(focal_px) > max(FAULT_SIGMAS * mapped.focal_sigma_px, 1e-6):
-        found.append(f"its focal length differs by {100 * focal_px / true.focal_px:+.2g} %")
-    for name, one, other, sigma in (
-        ("principal point", mapped.center_px, true.center_px, mapped.center_sigma_px),
-        ("distortion", mapped.distortion, true.distortion, mapped.distortion_sigma),
-    ):
-        if np.any(np.abs(np.subtract(one, other)) > FAULT_SIGMAS * np.array(sigma) + 1e-9):
-            found.append(f"its {name} is not the scene's")
-    return tuple(found)
+    zoom = mapped.focal_px / true.focal_px - 1
+    lens = [*mapped.center_px, *mapped.distortion]
+    lens_sigma = np.array([*mapped.center_sigma_px, *mapped.distortion_sigma])
+    others = np.abs(lens - true.lens[1:]) > FAULT_SIGMAS * lens_sigma + 1e-9
+    found = {
+        f"{moved.sum()} of {len(moved)} LEDs are up to {1e3 * led_m.max():.3g} mm from the scene's": moved.any(),
+        f"its lever is {1e3 * lever_m:.3g} mm from the scene's": lever_m
+        > limit * mapped.lever_sigma_m,
+        f"its focal length differs by {100 * zoom:+.2g} %": abs(zoom) * mapped.focal_px
+        > FAULT_SIGMAS * mapped.focal_sigma_px + 1e-6,
+        "its principal point is not the scene's": others[:2].any(),
+        "its distortion is not the scene's": others[2:].any(),
+    }
+    return tuple(text for text, differs in found.items() if differs)
 
 
 def known_lights(
