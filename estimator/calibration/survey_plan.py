@@ -145,6 +145,21 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyA
     return SurveyAccuracy(measured, led_sigma_m, shared[:3], shared[3:])
 
 
+def measurable(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> Bools:
+    """Return (N,) whether each LED will be surveyed: the `measured` of `predict`, without its errors.
+
+    `body_from_lab` and `seen` are those of `predict`; all False where the attitudes do not determine the unknowns.
+    """
+    bundle, sightings = _bundle(model, body_from_lab, seen)
+    measured = np.zeros(len(bundle.position_m), dtype=bool)
+    try:
+        subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
+        measured[subset.led] = True
+    except ValueError:
+        pass
+    return measured
+
+
 def _bundle(
     model: SurveyModel, body_from_lab: Rotation, seen: Bools
 ) -> tuple[Bundle, Sightings]:

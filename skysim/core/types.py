@@ -533,6 +533,10 @@ class FrameRow:
         Standard deviation that the tracker claims for the rate
     magnitude_error_mag, magnitude_sigma_mag
         Mean and standard deviation of measured minus catalog magnitude of its stars; NaN of LEDs
+    nees
+        Squared error over the claimed covariance; 3 on average if the claim is true
+    survey_share
+        Share of the claimed variance by errors of the survey, which all frames have in common
     """
 
     frame: int
@@ -557,3 +561,5 @@ class FrameRow:
     rate_sigma_deg_s: float = float("nan")
     magnitude_error_mag: float = float("nan")
     magnitude_sigma_mag: float = float("nan")
+    nees: float = float("nan")
+    survey_share: float = float("nan")

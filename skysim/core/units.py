@@ -11,10 +11,18 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
 
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
@@ -54,10 +62,15 @@ def si_unit(name: str) -> str:
 
 
 def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
-    """A validator that converts a quantity such as "48 in" to a float in `si_unit`. It raises InputError."""
+    """A validator that converts a quantity such as "48 in" to a float in `si_unit`. It raises InputError.
+
+    0 needs no unit, as it is the same in all.
+    """
 
     def parse(value: Any) -> float:
         """The quantity in SI units."""
+        if value in (0, "0") and not isinstance(value, bool):
+            return 0.0
         if not isinstance(value, str):
             raise InputError("", f"{value!r} has no unit", f"a {what} such as {examples}")
         try:
@@ -210,7 +223,10 @@ def quantities_within(
 
 
 class ConfigModel(BaseModel):
-    """Base of every section: frozen, unknown keys are errors, YAML keys lack the SI suffix."""
+    """Base of every section: frozen, unknown keys are errors, YAML keys lack the SI suffix.
+
+    `null` removes a key that a base has, so that its default holds, unless it is a value of the key itself.
+    """
 
     model_config = ConfigDict(
         extra="forbid",
@@ -218,6 +234,28 @@ class ConfigModel(BaseModel):
         validate_by_alias=True,
         validate_by_name=False,
         alias_generator=lambda name: SI_SUFFIX.sub("", name),
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def without_removed(cls, tree: Any) -> Any:
+        """The section without keys of the value null, where null is not allowed and the key has a default."""
+        if not isinstance(tree, Mapping):
+            return tree
+        fields = {field.alias: field for field in cls.model_fields.values()}
+        return {
+            key: value
+            for key, value in tree.items()
+            if value is not None or key not in fields or keeps_null(fields[key])
+        }
+
+
+def keeps_null(field: FieldInfo) -> bool:
+    """Whether null is a value of a field, or the field is required."""
+    return (
+        field.is_required()
+        or field.annotation is Any
+        or type(None) in get_args(field.annotation)
     )
 
 

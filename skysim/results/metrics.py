@@ -410,6 +410,11 @@ MORE_IS_BETTER = ("stars", "detected", "lights_detected", "matched", "availabili
 DEFAULT_STATISTICS = {"nees": "mean", "centroid_px": "rms", "streak_px": "median"}
 
 
+# Share of the variance by one survey from which trials that share it cannot tell whether claims are true: its three
+# angles are one draw, so that a mean NEES errs by about this share.
+ONE_SURVEY = 0.1
+
+
 def mean_nees(c: Columns) -> Summary:
     """The mean NEES with an interval that covers it for few trials too: f mean / E is chi-square with f degrees.
 

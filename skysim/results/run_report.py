@@ -14,6 +14,7 @@ import numpy as np
 
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.core.types import FrameRow
+from skysim.results import metrics
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -107,6 +108,7 @@ def run_report(
     blocks = [
         verdict(rows),
         required(judged, rows),
+        Text(claims_text(rows)),
         Text(warned, "bad", on_terminal=False),
         Section("The last solved frame", [frame]),
         Section("The laboratory", laboratory),
@@ -129,6 +131,10 @@ MAGNITUDES = (
     "Magnitudes of {magnitude_stars} stars, measured (-2.5 log10 DN/s) minus catalog: mean"
     " {magnitude_error_mag_mean:+.3f}, standard deviation {magnitude_error_mag_sigma:.3f}"
 )
+CLAIMS = (
+    "claimed {cross_sigma_arcsec_rms:.3g}″ cross, {roll_sigma_arcsec_rms:.3g}″ roll (1σ); real"
+    " {cross_arcsec_rms:.3g}″ and {roll_arcsec_rms:.3g}″ (rms); NEES {nees_mean:.3g} (3 if true)"
+)
 ERROR_CAPTION = (
     "Errors, lights and rate against time. Red lines mark frames that were not solved."
 )
@@ -139,7 +145,7 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
     Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
-    `magnitude_errors`; for `scatter_arcsec` see there.
+    `magnitude_errors`; for `scatter_arcsec` see there. Where the tracker claims errors, also `claims`.
     """
     solved = [row for row in rows if row.status == "solved"]
     cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
@@ -153,9 +159,40 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
         "roll_arcsec_median": float(np.median(roll)),
         "roll_arcsec_worst": float(np.max(roll)),
         "scatter_arcsec": scatter_arcsec(solved),
+        **claims(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
         **magnitude_errors(rows),
     }
+
+
+def claims(solved: Sequence[FrameRow]) -> dict[str, float]:
+    """Rms errors and claimed ones in arcsec, mean NEES, and the mean share of the survey; empty without a claim."""
+    known = [row for row in solved if math.isfinite(row.nees)]
+    if not known:
+        return {}
+    sizes = {
+        f"{name}_rms": math.sqrt(np.mean([getattr(row, name) ** 2 for row in known]))
+        for name in ("cross_sigma_arcsec", "roll_sigma_arcsec", "cross_arcsec", "roll_arcsec")
+    }
+    shares = np.nan_to_num([row.survey_share for row in known])
+    return sizes | {
+        "nees_mean": float(np.mean([row.nees for row in known])),
+        "survey_share": float(np.mean(shares)),
+    }
+
+
+def claims_text(rows: Sequence[FrameRow]) -> str:
+    """The claimed and the real errors in words; empty without a claim."""
+    run = summary(rows)
+    if "nees_mean" not in run:
+        return ""
+    survey = (
+        f"; {100 * run['survey_share']:.0f} % of the claim is of one survey, whose error all frames share: they cannot"
+        " tell whether it is true"
+        if run["survey_share"] > metrics.ONE_SURVEY
+        else ""
+    )
+    return CLAIMS.format(**run) + survey
 
 
 def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:

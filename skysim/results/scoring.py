@@ -65,21 +65,23 @@ def row(
     mount = camera.mount
     attitude = report.attitude
     cam_from_lab = scored_attitude(camera, truth)
-    cross = roll = cross_sigma = roll_sigma = chance = math.nan
+    cross = roll = cross_sigma = roll_sigma = chance = nees = survey_share = math.nan
     estimate = None
     wrong = False
     if attitude.cam_from_ref is not None:
         cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, cam_from_lab)
         estimate = angles_deg(attitude.cam_from_ref, scene, mount)
         covariance = np.full((3, 3), np.nan)
-        nees = np.inf
         if attitude.covariance_rad2 is not None:
             covariance = attitude.covariance_rad2
             nees = metrics.normalized_error_squared(
                 attitude.cam_from_ref, cam_from_lab, covariance
             )
-        wrong = metrics.is_wrong(np.hypot(cross, roll), nees)
+        unclaimed = math.isnan(nees)
+        wrong = metrics.is_wrong(np.hypot(cross, roll), np.inf if unclaimed else nees)
         variance = np.diag(covariance)
+        if attitude.systematic_rad2 is not None:
+            survey_share = float(np.trace(attitude.systematic_rad2) / variance.sum())
         cross_sigma = math.sqrt(variance[:2].sum())
         roll_sigma = math.sqrt(variance[2])
         chance = attitude.match.log10_chance if attitude.match else chance
@@ -108,6 +110,8 @@ def row(
         rate_sigma_deg_s=rate_sigma,
         magnitude_error_mag=magnitude_error,
         magnitude_sigma_mag=magnitude_sigma,
+        nees=nees,
+        survey_share=survey_share,
     )
 
 

@@ -186,7 +186,8 @@ def over_base(
     """The keys of a scene merged over the keys of its base.
 
     A camera preset in `own` also removes the keys of the base that it defines, another `vehicle.model` the mass
-    properties of the base's model. `motion.start: profile` removes the rate of the base, which the profile defines.
+    properties of the base's model. `motion.start: profile` removes the rate of the base, which the profile defines,
+    `tracker.map` the sizes of the survey's errors and the assumed camera, which the map contains.
 
     Parameters
     ----------
@@ -206,12 +207,18 @@ def over_base(
         base = without_keys(base, "motion", ("rate_deg_s",))
     if has_other_model(own, base):
         base = without_keys(base, "vehicle", MASS_KEYS)
+    if plain_at(own, "tracker", "map") is not None:
+        base = without_keys(base, "tracker", ASSUMED_KEYS)
+        if isinstance(tracker := base.get("tracker"), dict):
+            base = base | {"tracker": without_keys(tracker, "survey", SURVEYED_KEYS)}
     return merge(base, own)
 
 
 # Keys that remove others of the base, see `over_base`.
-REPLACING = ("camera.preset", "motion.start", "vehicle.model")
+REPLACING = ("camera.preset", "motion.start", "vehicle.model", "tracker.map")
 MASS_KEYS = ("mass", "inertia", "center_of_mass")
+ASSUMED_KEYS = ("assumed_focal_length", "assumed_camera_body", "assumed_distortion")
+SURVEYED_KEYS = ("led_sigma", "lever_sigma", "focal_length_sigma", "instrument")
 # Further keys about the vehicle's body, which those of a base may not suit.
 BODY_KEYS = (
     "camera",

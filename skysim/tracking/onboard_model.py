@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -175,6 +176,14 @@ def surveyed_dome(
             "tracker.map",
             f"{path}: unknown LED {unknown[0]}",
             f"the {len(order)} LEDs of this dome",
+        )
+    nearest = cKDTree(leds.position_m).query(dome_map.position_m)[1]
+    others = int(np.sum(nearest != row))
+    if others > len(row) / 2:
+        raise InputError(
+            "tracker.map",
+            f"{path}: of another dome: {others} of its {len(row)} LEDs are nearer to the places of others",
+            "a map of this dome",
         )
     # 2. The surveyed values.
     board = None if leds.board is None else leds.board[row]

@@ -34,6 +34,7 @@ from skysim.scene.scene import Scene
 # A survey after its last round: frames, correspondences, light of each LED, stray lights.
 
 
+EXACT_M = 1e-9  # error of the list below which it agrees with the frames
 STRAY_SIGMA_PX = 0.3  # error of a ray to a stray light, from the attitude and from blends
 # Greatest distance on the dome between stray lights of two frames that may be one.
 STRAY_REACH_M = 0.005
@@ -377,10 +378,15 @@ def fault_lines(faults: Record) -> Iterator[str]:
     tested = f" of {faults['tested']} tested"
     if faults["tested"]:
         tested += f" (half of them show {1e3 * faults['tested_m']:.2g} mm or more)"
+    list_m = faults["list_sigma_m"]
+    others = (
+        f"err by {1e3 * list_m:.2g} mm about each axis"
+        if list_m > EXACT_M
+        else "agree with the frames exactly"
+    )
     yield (
         f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced{tested}, {len(faults['exchanged'])}"
-        f" exchanged; the other places of the list err by {1e3 * faults['list_sigma_m']:.2g} mm about each axis;"
-        f" {observable}"
+        f" exchanged; the other places of the list {others}; {observable}"
     )
 
 

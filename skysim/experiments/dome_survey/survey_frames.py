@@ -33,7 +33,14 @@ from skysim.tracking import factory, onboard_model
 
 CANDIDATES = 1000  # number of random attitudes among which a plan chooses
 # Distinct from those in core/random_streams.py.
-STREAM_KEYS = {"attitudes": 101, "imu": 102, "checks": 103, "candidates": 104, "noise": 105}
+STREAM_KEYS = {
+    "attitudes": 101,
+    "imu": 102,
+    "checks": 103,
+    "candidates": 104,
+    "noise": 105,
+    "domes": 106,
+}
 
 
 def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) -> Rotation:

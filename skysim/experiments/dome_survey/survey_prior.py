@@ -135,6 +135,22 @@ def survey_uncertainty(
     return SurveyUncertainty(imu_rad, led_m, lever_m, focal, fit_distortion)
 
 
+def before_text(scene: Scene, uncertainty: SurveyUncertainty) -> str:
+    """The uncertainty before a survey in words, and that of the scene's tracker, which has no part in it."""
+    text = (
+        f"before the survey: LEDs to {1e3 * uncertainty.led_sigma_m:.3g} mm (--led-sigma), the lever to"
+        f" {1e3 * uncertainty.lever_sigma_m:.3g} mm (--lever-sigma), the focal length to"
+        f" {100 * uncertainty.focal_error:.3g} % (--focal-error)"
+    )
+    own = scene.tracker.survey
+    if own == SurveyErrorsConfig(seed=own.seed):
+        return text
+    return (
+        f"{text}; not the scene's tracker.survey (LEDs {1e3 * own.led_sigma_m:.3g} mm, lever"
+        f" {1e3 * own.lever_sigma_m:.3g} mm), which is what its tracker flies with"
+    )
+
+
 def calibration_prior(lab: Lab) -> CalibrationPrior:
     """The onboard model of the tracker of a lab. Raises InputError for a scene without a dome."""
     light = require_dome(lab.scene)

@@ -11,10 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.calibration import survey_plan
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
@@ -25,6 +27,7 @@ from skysim.experiments.dome_survey.survey_findings import (
     predicted,
 )
 from skysim.experiments.dome_survey.survey_frames import (
+    CANDIDATES,
     SurveyFrame,
     centroid_noise_px,
     imu_attitudes,
@@ -54,6 +57,7 @@ from skysim.simulation.lab import Lab, build_lab
 
 PLANNED = "plan"
 RANDOM = "random"
+DRAWS = 100  # number of domes in which the LEDs that a plan measures are counted
 
 
 class HeldAttitudes(NamedTuple):
@@ -65,16 +69,51 @@ class HeldAttitudes(NamedTuple):
         (F, N) mask of the LEDs that each shows
     margin_px
         Margin of the chip in which an image would be incomplete
+    in_reach
+        (N,) whether any attitude within the tilt shows each LED
     """
 
     lab_from_body: Rotation
     shown: Bools
     model: SurveyModel
     margin_px: float
+    in_reach: Bools
 
     def first(self, count: int) -> SurveyAccuracy | None:
         """The accuracy predicted after the first `count` frames; None if they do not determine the unknowns."""
         return predicted(self.model, self.lab_from_body[:count].inv(), self.shown[:count])
+
+    def counts(self, count: int) -> Record:
+        """The number of LEDs that the first `count` frames measure if the dome differs from the model by its sigmas.
+
+        Mean and 95 % interval over DRAWS domes. The attitudes show more of the model's LEDs than of theirs, because
+        they were chosen for it.
+        """
+        model = self.model
+        held = self.lab_from_body[:count].inv()
+        rng = random_stream(0, survey_frames.STREAM_KEYS["domes"])
+        found = []
+        for _ in range(DRAWS):
+            focal, *lever = rng.standard_normal(4)
+            own_m = rng.standard_normal(model.leds.position_m.shape) * model.leds_sigma_m
+            other = replace(
+                model,
+                camera=model.camera.zoomed(
+                    1 + focal * model.focal_sigma_px / model.camera.focal_px
+                ),
+                leds=replace(model.leds, position_m=model.leds.position_m + own_m),
+                lever=replace(
+                    model.lever,
+                    camera_body_m=model.lever.camera_body_m
+                    + np.array(lever) * model.lever_sigma_m,
+                ),
+            )
+            shown = other.visible(held, self.margin_px)
+            found.append(int(survey_plan.measurable(other, held, shown).sum()))
+        return {
+            "measured": round(np.mean(found)),
+            "measured_range": [round(end) for end in np.quantile(found, [0.025, 0.975])],
+        }
 
     def steps(self) -> list[tuple[int, SurveyAccuracy | None]]:
         """The accuracy predicted after a quarter, a half, three quarters and all of the frames."""
@@ -108,7 +147,9 @@ def plan_survey(
         else survey_frames.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
     )
     shown = model.visible(held.inv(), margin_px)
-    return lab, prior, HeldAttitudes(held, shown, model, margin_px)
+    anywhere = survey_frames.stop_attitudes(lab.scene, "candidates", CANDIDATES, tilt_deg)
+    in_reach = np.asarray(model.visible(anywhere.inv(), margin_px).any(axis=0))
+    return lab, prior, HeldAttitudes(held, shown, model, margin_px, in_reach)
 
 
 def write_plan(path: Path, plan: HeldAttitudes) -> None:
@@ -239,16 +280,16 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
 def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[Record]:
     """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
-    rows = (
-        ("LED place mm", accuracy["led_mm"], 1e6 * np.array([one.led_m2 for one in errors])),
-        ("lever mm", accuracy["lever_mm"], 1e6 * np.array([one.lever_m2 for one in errors])),
-        (
-            "focal length px",
-            accuracy["focal_px"],
-            np.array([one.focal_px2 for one in errors]),
-        ),
-    )
-    return [compared(*row) for row in rows]
+    return [
+        compared(
+            what, accuracy[key], scale * np.array([getattr(one, name) for one in errors])
+        )
+        for what, key, name, scale in (
+            ("LED place mm", "led_mm", "led_m2", 1e6),
+            ("lever mm", "lever_mm", "lever_m2", 1e6),
+            ("focal length px", "focal_px", "focal_px2", 1),
+        )
+    ]
 
 
 def compared(what: str, sigma: float | None, squares: Floats) -> Record:

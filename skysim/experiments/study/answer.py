@@ -38,8 +38,12 @@ TRUE_NEES = (2.5, 3.5)
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: PointRows, place: Place) -> list[str]:
-    """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES."""
+def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) -> list[str]:
+    """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES.
+
+    Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES
+    is beyond what one draw of three angles can have (probability OVERCONFIDENCE_PROBABILITY).
+    """
     known = [(line.responses.get("nees", metrics.NO_VALUE), line) for line in lines]
     known = [(one, line) for one, line in known if one.trials]
     if not known:
@@ -48,6 +52,17 @@ def claimed_errors(lines: PointRows, place: Place) -> list[str]:
     found = [(one, line) for one, line in found if np.isfinite(one.low)]
     low, high = TRUE_NEES
     question = "Are the claimed errors true?"
+    means = [one.value for one, _ in known]
+    shared = survey_share > metrics.ONE_SURVEY
+    if shared and max(means) < metrics.OVERCONFIDENT_NEES:
+        spread = (
+            f"{min(means):.3g} to {max(means):.3g}" if len(means) > 1 else f"{means[0]:.3g}"
+        )
+        return [
+            f"{question} One survey cannot decide it: {100 * survey_share:.0f} % of the expected variance is of the"
+            f" survey that all trials share (NEES {spread}; over many surveys 3 if true). `hardware:"
+            " [tracker.survey.seed]` draws one in every replicate; with tracker.map it takes maps of many surveys."
+        ]
     if not found:
         most = max(one.trials for one, _ in known)
         return [
@@ -175,6 +190,7 @@ def headline(
     may_be_ambiguous: bool,
     worst: str = "skysim study worst STUDY",
     judged: Sequence[Sequence[Judgment]] = (),
+    survey_share: float = 0.0,
 ) -> list[str]:
     """Thresholds, refusals, ambiguity and wrong answers, in one or two sentences each; none if all trials failed.
 
@@ -188,6 +204,8 @@ def headline(
         The command that lists the worst trials
     judged
         Judgments of each requirement at all points
+    survey_share
+        Share of a survey that all trials share in the expected variance
     """
     done = answered(lines)
     if not done:
@@ -202,7 +220,11 @@ def headline(
     for name, text in EVENTS.items():
         found.append(event(text, [line.responses[name] for line in done], done, place))
         found += effect_of_wrong_matches(done, place) if name == "misidentified" else []
-    return [*found, *runs_needed(done, list(EVENTS)), *claimed_errors(done, place)]
+    return [
+        *found,
+        *runs_needed(done, list(EVENTS)),
+        *claimed_errors(done, place, survey_share),
+    ]
 
 
 def answered(lines: PointRows) -> list[PointRow]:

@@ -263,6 +263,11 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
             "tracker.survey.seed has no effect without errors of the survey",
             "with tracker.survey.led_sigma, lever_sigma or light.surface.error",
         )
+    others = [key for key in plan.spec.hardware if key.startswith("light.layout.")]
+    if scene.tracker.map and others:
+        raise InputError(
+            "hardware", f"{others[0]} draws other domes than that of tracker.map", "no map"
+        )
     if isinstance(trial, FlightTrial) and trial.start:
         check_random_start(scene, trial.start)
     near = getattr(trial.start if isinstance(trial, FlightTrial) else trial, "near", None)
@@ -285,9 +290,9 @@ def check_trial(plan: Plan, scene: Scene, trial: Trial, to_run: bool) -> None:
 
 
 def dome_seeds(scene: Scene) -> list[str]:
-    """Keys of the seeds of the survey and of the LEDs that have an effect in a scene."""
+    """Keys of the seeds of the survey and of the LEDs that can be others in a scene; a map is of these LEDs."""
     seeds = [] if unused.reason(SURVEY_SEED, scene) else [SURVEY_SEED]
-    if scene.dome and hasattr(scene.dome.points, "hardware_seed"):
+    if scene.dome and not scene.tracker.map and hasattr(scene.dome.points, "hardware_seed"):
         nested = scene.dome.points is not scene.dome.layout
         seeds.append(f"light.layout{'.points' * nested}.hardware_seed")
     return seeds

@@ -24,15 +24,18 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
 from skysim.tracking import dome_map_file
+from skysim.tracking.dome_map_file import DomeMap
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import (
     assumed_camera,
     assumed_orbit,
     assumed_stars,
+    calibration,
     onboard_dome,
 )
 
 REACH_PX = 7.0  # greatest distance of a neighbor that displaces a centroid
+FAULT_SIGMAS = 5.0  # difference of a map from its scene that its survey cannot explain
 WINDOW_PX = 3  # half side of the fit's window
 
 
@@ -65,6 +68,8 @@ class Beliefs:
         Epoch of its star catalog; NaN under a dome
     dome
         Camera, map and lever of the tracker, with the LEDs in the order of `lights`; None under other lights
+    faults
+        Differences of `tracker.map` from the scene beyond what its survey can explain, in words
     """
 
     lights: Sources
@@ -80,6 +85,7 @@ class Beliefs:
     faintest_mag: float
     epoch_jyear: float
     dome: tuple[Camera, LedMap, Lever] | None = None
+    faults: tuple[str, ...] = ()
 
     @property
     def has_common_camera(self) -> bool:
@@ -105,7 +111,8 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         if assumed_m is None
         else np.array(assumed_m) - lab.camera.mount.camera_body_m
     )
-    # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average.
+    # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average, unless it was
+    # made of other hardware.
     rest = (config, faintest_mag, epoch_jyear, dome)
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
@@ -120,6 +127,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
             0.0,
             mapped.focal_sigma_px / mapped.focal_px,
             *rest,
+            map_faults(mapped, lab, lights.place[:, :3]),
         )
     # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
@@ -140,6 +148,32 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         survey.focal_length_sigma_m / scene.camera.focal_length_m,
         *rest,
     )
+
+
+def map_faults(mapped: DomeMap, lab: Lab, place_m: Floats) -> tuple[str, ...]:
+    """Where a map differs from the scene by more than FAULT_SIGMAS of its own standard deviations, in words.
+
+    A parameter that the survey held fixed has no deviation: any difference counts. LEDs are at place_m (N, 3).
+    """
+    true = calibration(lab.scene.camera)
+    limit = FAULT_SIGMAS * math.sqrt(3)  # from one axis to the length of a vector
+    led_m = np.linalg.norm(mapped.position_m - place_m, axis=1)
+    moved = led_m > limit * mapped.sigma_m
+    lever_m = math.dist(mapped.camera_body_m, lab.camera.mount.camera_body_m)
+    zoom = mapped.focal_px / true.focal_px - 1
+    lens = [*mapped.center_px, *mapped.distortion]
+    lens_sigma = np.array([*mapped.center_sigma_px, *mapped.distortion_sigma])
+    others = np.abs(lens - true.lens[1:]) > FAULT_SIGMAS * lens_sigma + 1e-9
+    found = {
+        f"{moved.sum()} of {len(moved)} LEDs are up to {1e3 * led_m.max():.3g} mm from the scene's": moved.any(),
+        f"its lever is {1e3 * lever_m:.3g} mm from the scene's": lever_m
+        > limit * mapped.lever_sigma_m,
+        f"its focal length differs by {100 * zoom:+.2g} %": abs(zoom) * mapped.focal_px
+        > FAULT_SIGMAS * mapped.focal_sigma_px + 1e-6,
+        "its principal point is not the scene's": others[:2].any(),
+        "its distortion is not the scene's": others[2:].any(),
+    }
+    return tuple(text for text, differs in found.items() if differs)
 
 
 def known_lights(
@@ -294,6 +328,7 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
         )
     elif not known and isinstance(scene.light, DomeConfig):
         lines.append("every LED and the lever exactly (tracker.survey)")
+    lines += [f"{fault} ({source})" for fault in beliefs.faults]
     if beliefs.rotation_rad.any():
         lines.append(
             f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″"

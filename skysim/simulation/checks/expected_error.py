@@ -42,7 +42,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, common_images_px, common_shifts_m
+from estimator.attitude.dome_map import (
+    LedMap,
+    Lever,
+    common_images_px,
+    common_shifts_m,
+    project,
+)
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.star_search import WRONG_FOCAL
@@ -141,6 +147,17 @@ def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Commo
     return Common(moved_px + np.moveaxis(by_lens_px, 0, 2))
 
 
+def other_map(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+    """Images by the map minus the true ones, if the map was made of other hardware than the scene's."""
+    dome = context.beliefs.dome
+    if dome is None or not context.beliefs.faults:
+        return None
+    camera, leds, lever = dome
+    body_from_lab = (lab_from_cam * lever.cam_from_body).inv()
+    mapped_px = project(body_from_lab, leds.position_m[view.row], lever, camera)
+    return Common(np.nan_to_num(mapped_px - view.xy_px)[:, :, None])
+
+
 def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
     """Error of the surveyed lever (camera's position), E_i = -sigma G_i."""
     sigma_m = context.beliefs.lever_sigma_m
@@ -237,8 +254,15 @@ CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | Non
     "distortion": distortion,
     "star places": star_places,
     "rolling shutter": rolling_shutter,
+    "other map": other_map,
 }
-UNKNOWN_TO_TRACKER = ("focal length", "distortion", "assumed lever", "rolling shutter")
+UNKNOWN_TO_TRACKER = (
+    "focal length",
+    "distortion",
+    "assumed lever",
+    "rolling shutter",
+    "other map",
+)
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
 # Two more causes, which are no displacements of all images.

@@ -20,7 +20,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
-from skysim.simulation.checks.detection import Context, full_scale_e
+from skysim.simulation.checks.detection import Context, centroid_variance, full_scale_e
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import CheckedSamples, Sampled
 from skysim.simulation.checks.vehicle_facts import Fact, short
@@ -411,6 +411,7 @@ def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
         "focal_sigma": believed.focal_sigma,
         "distortion": list(believed.camera.distortion),
         "catalog_epoch_jyear": believed.epoch_jyear,
+        "map_faults": list(believed.faults),
     }
     lines = beliefs.describe(believed, context.lab.scene)
     if context.settings.acceptance == "thesis":
@@ -446,6 +447,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             "cross_arcsec": cross,
             "roll_arcsec": roll,
             "without_solution": failing,
+            "centroid_px": centroid_px(context, sampled),
         }
         values[key] |= {
             f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
@@ -465,6 +467,15 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
         )
     return Fact("expected error", lines, values)
+
+
+def centroid_px(context: Context, sampled: Sampled) -> float:
+    """Rms noise of the centroids along each axis at some attitudes; NaN without lights."""
+    variances = [centroid_variance(view, context) for view in sampled.used if len(view)]
+    if not variances:
+        return math.nan
+    traces = np.trace(np.concatenate(variances), axis1=1, axis2=2)
+    return math.sqrt(traces.mean() / 2)
 
 
 def errors_text(cross: float, roll: float) -> str:

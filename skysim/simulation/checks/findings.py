@@ -327,6 +327,14 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
 
 
+def map_of_other_hardware(context: Context, samples: CheckedSamples) -> str:
+    """Warn if the map of a survey differs from the scene by more than the survey's errors."""
+    faults = "; ".join(context.beliefs.faults)
+    return faults and (
+        f"tracker.map: made of other hardware: {faults}; survey the dome again, or undo the change"
+    )
+
+
 MISMATCH_KEYS = {
     "focal length": "tracker.assumed_focal_length",
     "distortion": "tracker.assumed_distortion",
@@ -334,6 +342,8 @@ MISMATCH_KEYS = {
     "rolling shutter": "tracker.assumed_row_time",
     "survey set-up": "tracker.survey.instrument",
     "surface survey": "light.surface.error",
+    "common survey": "tracker.map",
+    "other map": "tracker.map",
 }
 # The recommended change, as a function of the scene and of the ratio of the displacement to the allowed one.
 CHANGES: dict[str, Callable[[Any, float], str]] = {
@@ -356,6 +366,8 @@ CHANGES: dict[str, Callable[[Any, float], str]] = {
     "surface survey": lambda scene, excess: (
         f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
     ),
+    "common survey": lambda scene, excess: "survey the dome with more frames",
+    "other map": lambda scene, excess: "survey the dome again",
 }
 
 
@@ -536,6 +548,7 @@ FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
     out_of_focus,
     long_smear,
     uneven_motion,
+    map_of_other_hardware,
     not_where_expected,
     unknown_tag_error,
     thermal_drift,

@@ -29,6 +29,7 @@ from tests.helpers.surveyed_dome import attitudes, model, pixels
 @law(
     *(
         survey_plan.predict,
+        survey_plan.measurable,
         SurveyAccuracy.led_rms_m,
         SurveyModel.visible,
         bundle_covariance.covariance,
@@ -54,6 +55,9 @@ def test_predicted_errors_grow_with_noise_and_list_errors_and_shrink_with_frames
     if first is None or every is None or scaled is None:
         return
     np.testing.assert_array_equal(first.measured, scaled.measured)
+    countable = survey_plan.measurable(larger, held[:25], seen[:25])
+    np.testing.assert_array_equal(countable, first.measured)
+    assert not survey_plan.measurable(larger, held[:1], seen[:1]).any()
     np.testing.assert_allclose(scaled.led_sigma_m, factor * first.led_sigma_m, rtol=1e-6)
     np.testing.assert_allclose(scaled.lens_sigma, factor * first.lens_sigma, rtol=1e-6)
     assert (every.led_sigma_m <= first.led_sigma_m * (1 + 1e-9)).all()

@@ -25,6 +25,7 @@ from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.experiments.dome_survey import (
     adjust,
+    survey_findings,
     survey_frames,
     survey_prior,
     survey_procedure,
@@ -500,6 +501,33 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
         np.testing.assert_allclose(run.accuracy.lens_sigma, predicted.lens_sigma, rtol=0.1)
         lever_z_m.append(predicted.lever_sigma_m[2])
     assert lever_z_m[1] > 1.5 * lever_z_m[0]
+
+
+def test_a_plan_counts_the_leds_of_domes_that_are_not_its_model() -> None:
+    """Without uncertainty all domes measure the model's LEDs; a lever of 5 mm loses some that cross."""
+    rng = np.random.default_rng(9)
+    dome = model(120)
+    held = attitudes(rng, 12).inv()
+    shown = dome.visible(held.inv())
+    known = survey_plan.measurable(dome, held.inv(), shown)
+    for sigma, spread in ((0.0, False), (0.005, True)):
+        assumed = replace(
+            dome, leds_sigma_m=1e-9 + sigma, lever_sigma_m=sigma, focal_sigma_px=0.0
+        )
+        plan = survey_procedure.HeldAttitudes(held, shown, assumed, 0.0, known)
+        counts = plan.counts(12)
+        low, high = counts["measured_range"]
+        assert low <= counts["measured"] <= high
+        assert (low < high) == spread
+        assert spread or counts["measured"] == known.sum()
+
+
+def test_a_list_that_made_the_frames_agrees_exactly() -> None:
+    faults = {name: () for name in ("dark", "displaced", "exchanged", "unlisted", "found_m")}
+    faults |= {"displaced": {}, "tested": 0, "tested_m": None, "exchange_share": 0.0}
+    for size_m, says in ((3.6e-22, "agree with the frames exactly"), (1e-3, "err by 1 mm")):
+        (line,) = survey_findings.fault_lines(faults | {"list_sigma_m": size_m})
+        assert f"the other places of the list {says}" in line
 
 
 @pytest.mark.slow

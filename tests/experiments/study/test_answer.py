@@ -267,7 +267,7 @@ def test_understated_errors_are_reported(
     assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
 
 
-def verdicts(nees: NDArray[np.float64]) -> list[str]:
+def verdicts(nees: NDArray[np.float64], survey_share: float = 0.0) -> list[str]:
     """The sentence on claimed errors of each of S studies, from the NEES of T trials at P points, (S, P, T)."""
     texts = []
     for one in nees:
@@ -277,7 +277,9 @@ def verdicts(nees: NDArray[np.float64]) -> list[str]:
                 {"nees": values, "solved": np.ones(len(values))}
             )
             lines.append(PointRow(n, {"leds": n}, {"nees": nees_of}, len(values)))
-        texts += answer.claimed_errors(lines, lambda line: f"leds = {line.levels['leds']}")
+        texts += answer.claimed_errors(
+            lines, lambda line: f"leds = {line.levels['leds']}", survey_share
+        )
     return texts
 
 
@@ -290,6 +292,19 @@ def test_true_claims_are_called_false_in_at_most_one_study_of_twenty(
     found = verdicts(3.5 / 3 * rng.chisquare(3, (100, points, trials)))
     assert np.mean([" No: " in one for one in found]) <= 0.05 + 4 * math.sqrt(0.0475 / 100)
     assert (trials < 30) == all("Too few to say" in one for one in found)
+
+
+def test_trials_of_one_survey_do_not_decide_whether_claims_are_true() -> None:
+    """One draw of three angles is the error of all 300 trials, and the claim is true: without its share all say no."""
+    rng = np.random.default_rng(14)
+    nees = rng.chisquare(3, (100, 1, 1)) * np.ones((1, 1, 300))
+    assert np.mean([" No: " in one for one in verdicts(nees)]) > 0.5
+    told = verdicts(nees, 0.99)
+    assert all(
+        "One survey cannot decide it: 99 % of the expected variance" in one for one in told
+    )
+    assert verdicts(nees, 0.05) == verdicts(nees)
+    assert " No: too small" in verdicts(np.full((1, 1, 300), 100.0), 0.99)[0]
 
 
 def test_attitudes_that_differ_widen_the_interval() -> None:
@@ -386,7 +401,9 @@ def test_the_tracker_s_knowledge_is_stated_as_in_the_check(tmp_path: Path) -> No
 def test_intervals_of_one_dome_name_the_fixed_hardware(tmp_path: Path) -> None:
     survey = "tracker.survey.seed"
     layout = "light.layout.hardware_seed"
-    (said_,) = answer.one_unit(overview.overview(loaded(tmp_path)).fixed)
+    about = overview.overview(loaded(tmp_path))
+    assert 0.1 < about.survey_share < 1
+    (said_,) = answer.one_unit(about.fixed)
     assert said_ == (
         "Intervals cover other attitudes, with one survey and one draw of the LEDs:"
         f" `hardware: [{survey}, {layout}]` in the study draws the hardware anew in every replicate, and they cover it"
@@ -398,6 +415,8 @@ def test_intervals_of_one_dome_name_the_fixed_hardware(tmp_path: Path) -> None:
         answer.one_unit(overview.overview(loaded(tmp_path, hardware=[survey, layout])).fixed)
         == []
     )
+    drawn = overview.overview(loaded(tmp_path, hardware=[survey]))
+    assert drawn.survey_share == 0
     units = {"unit": {"levels": {"a": {survey: 1}, "b": {survey: 2}}}}
     assert overview.overview(loaded(tmp_path, factors=units)).fixed == (layout,)
 

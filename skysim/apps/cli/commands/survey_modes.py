@@ -48,8 +48,10 @@ class Request:
 
 
 def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.HeldAttitudes]:
-    """The lab whose onboard model has errors as before a survey, that model, and a plan."""
+    """The lab whose onboard model has errors as before a survey, that model, and a plan; print these errors."""
 
+    if not request.quiet:
+        print_wrapped(survey_prior.before_text(request.scene, request.uncertainty))
     return survey_procedure.plan_survey(
         request.scene,
         request.uncertainty,
@@ -71,9 +73,11 @@ def plan_only(request: Request) -> dict[str, Any]:
         "leds": plan.shown.shape[1],
         "noise_px": plan.model.sigma_px,
         "predicted": [
-            {"frames": n, **survey_findings.accuracy_statistics(one)}
+            {"frames": n, **survey_findings.accuracy_statistics(one)} | plan.counts(n)
             for n, one in plan.steps()
         ],
+        "out_of_reach": int((~plan.in_reach).sum()),
+        "tilt_deg": request.tilt_deg,
         "plan": str(path),
     }
     if not request.quiet:
@@ -288,7 +292,10 @@ def write_report(
     files.write_text(request.folder / "survey.json", files.to_json(statistics))
     if not request.quiet:
         report.print()
-        print_wrapped(f"{statistics['map']}: for tracker.map; report: {path}")
+        print(
+            f"report: {path}\nthe map in a scene, in place of any tracker.survey of its base:"
+        )
+        print(f"tracker: {{map: {statistics['map']}}}")
     return statistics
 
 
@@ -306,14 +313,25 @@ def print_plan(plan: dict[str, Any]) -> None:
     heads = ("LED place mm", "lever mm", "focal length px")
     columns = [
         Column("frames"),
-        Column("LEDs measured"),
+        Column("LEDs measured", kind="text"),
         *(Column(head, format=".3g") for head in heads),
     ]
-    keys = ("frames", "measured", "led_mm", "lever_mm", "focal_px")
-    table = Table(columns, [[row[key] for key in keys] for row in plan["predicted"]])
+    keys = ("led_mm", "lever_mm", "focal_px")
+    rows = [
+        [
+            row["frames"],
+            "{} ({} to {})".format(row["measured"], *row["measured_range"]),
+            *(row[key] for key in keys),
+        ]
+        for row in plan["predicted"]
+    ]
+    table = Table(columns, rows)
     print_table(
         table,
         f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px",
+    )
+    print_wrapped(
+        f"{plan['out_of_reach']} of {plan['leds']} LEDs are out of reach of a tilt of {plan['tilt_deg']:g}°"
     )
 
 

@@ -23,13 +23,25 @@ from skysim.experiments.study.factors import (
     Range,
     make_point,
 )
-from skysim.experiments.study.plan import FlightTrial, FrameTrial, Plan, Trial, resolve_point
-from skysim.experiments.study.study_file import fixed_seeds, may_report_ambiguity
+from skysim.experiments.study.plan import (
+    CentroidTrial,
+    FlightTrial,
+    FrameTrial,
+    Plan,
+    Trial,
+    resolve_point,
+)
+from skysim.experiments.study.study_file import (
+    SURVEY_SEED,
+    fixed_seeds,
+    may_report_ambiguity,
+)
 from skysim.experiments.study.table import format_level
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation import checks
-from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
+from skysim.simulation.checks.expected_error import CENTROIDS
+from skysim.simulation.checks.facts import SURVEYED, TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
 NUMBER = re.compile(r"\d[\d.]*")
@@ -54,6 +66,8 @@ class Overview(NamedTuple):
         Seeds of hardware that all trials share, see `study_file.fixed_seeds`
     require
         Requirements of the study, or else of its scene
+    survey_share
+        Largest share of a survey that all trials share in the expected variance
     """
 
     rows: list[tuple[str, str]]
@@ -61,10 +75,11 @@ class Overview(NamedTuple):
     may_be_ambiguous: bool
     fixed: tuple[str, ...] = ()
     require: Mapping[str, float] = MappingProxyType({})
+    survey_share: float = 0.0
 
 
 def overview(plan: Plan) -> Overview:
-    """The overview of a study. Scenes that cannot be built are left out: the rows of their trials have the reason."""
+    """The overview of a study. The finding of a scene that cannot be built is the reason."""
     rows: list[tuple[str, str]] = []
     found: dict[str, list[tuple[str, str]]] = {}
     leds: dict[str, int] = {}
@@ -72,6 +87,7 @@ def overview(plan: Plan) -> Overview:
     may_be_ambiguous = False
     fixed = dict[str, None]()
     require = plan.study.require
+    share = 0.0
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
             break
@@ -86,15 +102,20 @@ def overview(plan: Plan) -> Overview:
                 trial_rate_rad_s(trial, lab),
                 not isinstance(trial, FlightTrial) or trial.start is not None,
             )
-        except InputError:
+        except InputError as error:
+            found.setdefault(NUMBER.sub("#", str(error)), []).append((str(error), levels))
             continue
-        checked += 1
+        finally:
+            checked += 1
         if scene.dome:
             leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
-        fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
         if not plan.study.optimize:  # candidates need not meet them
             require = require or scene.require
+        seeds = fixed_seeds(plan.study, scene)
+        fixed |= dict.fromkeys(seeds)
+        if SURVEY_SEED in seeds or scene.tracker.map:
+            share = max(share, survey_share(found_here, trial))
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
@@ -102,7 +123,23 @@ def overview(plan: Plan) -> Overview:
         finding_text([(line, with_leds(at, leds)) for line, at in one], checked)
         for one in found.values()
     ]
-    return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require)
+    return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require, share)
+
+
+def survey_share(found: checks.Check, trial: Trial) -> float:
+    """The larger share of the survey in the expected variance of cross and roll at the attitudes in reach.
+
+    Trials of centroids have their own noise instead of that of the images.
+    """
+    (reach,) = (one.values["reach"] for one in found.facts if one.name == "expected error")
+    scale = trial.noise_px / reach["centroid_px"] if isinstance(trial, CentroidTrial) else 1.0
+    shares = [0.0]
+    for angle in ("cross", "roll"):
+        sizes = reach[f"{angle}_causes_arcsec"]
+        sizes |= {CENTROIDS: scale * sizes.get(CENTROIDS, 0.0)}
+        total = math.fsum(size**2 for size in sizes.values())
+        shares.append(math.fsum(sizes.get(name, 0.0) ** 2 for name in SURVEYED) / total)
+    return max(shares)
 
 
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
@@ -119,7 +156,11 @@ def with_leds(levels: str, leds: Mapping[str, int]) -> str:
     leds
         Number of LEDs of each checked point under a dome
     """
-    return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
+    return (
+        f"{levels}, {leds[levels]} LEDs"
+        if levels in leds and len(set(leds.values())) > 1
+        else levels
+    )
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:

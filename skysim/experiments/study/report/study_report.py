@@ -174,7 +174,7 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     answered = [pooled_row(plan, columns, names)] if columns else lines
     judged = thresholds.judged(about.require, answer.answered(answered))
     headline = answer.headline(
-        study, answered, about.may_be_ambiguous, command("worst"), judged
+        study, answered, about.may_be_ambiguous, command("worst"), judged, about.survey_share
     )
     headline += answer.one_unit(about.fixed) if headline else []
     sobol = study.design.kind == "saltelli" and not study.optimize
