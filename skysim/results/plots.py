@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -47,7 +48,26 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
     with matplotlib.rc_context(LOOK):
         fig = Figure(figsize=size_in, layout="constrained")
         draw(fig)
+        plain_labels(fig)
         return figure_png(fig, dpi=DPI, metadata={"Software": None})
+
+
+def plain_labels(fig: Any) -> None:
+    """Label the ticks of logarithmic axes as numbers: the style has no mathematical text."""
+    from matplotlib.ticker import LogFormatterMathtext
+
+    for axis in (one for axes in fig.axes for one in (axes.xaxis, axes.yaxis)):
+        for kind in ("major", "minor"):
+            powers = getattr(axis, f"get_{kind}_formatter")()
+            if isinstance(powers, LogFormatterMathtext):
+                getattr(axis, f"set_{kind}_formatter")(partial(plain_label, powers))
+
+
+def plain_label(
+    powers: Callable[[float, int | None], str], value: float, place: int | None
+) -> str:
+    """A number where a formatter of powers has a label, else nothing."""
+    return f"{value:g}" if powers(value, place) else ""
 
 
 def figure_png(fig: Any, **options: Any) -> bytes:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, special
 
 from skysim.camera import detector
 from skysim.camera.detector import Detector
@@ -375,11 +375,12 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
-    if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
+    allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians.size)
+    if (extent := float(np.ptp(medians))) > allowed_dn:
         raise InputError(
             folder,
             f"{which} are not dark: {extent:.3g} DN brighter at {extremes(medians)}",
-            f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
+            f"{allowed_dn:.2g} DN: cap the lens, cover the window",
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
@@ -451,25 +452,42 @@ def check_flat(folder: Path, which: str, medians: Floats) -> None:
         )
 
 
+def block_side(image: Floats) -> int:
+    """Side of the blocks of `block_medians`."""
+    return max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
+
+
 def block_medians(image: Floats) -> Floats:
     """Medians of square blocks, at most BLOCK pixels wide, and small enough that there are at least nine."""
-    side = max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
+    side = block_side(image)
     rows, columns = (size // side for size in image.shape)
     blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
     return np.median(blocks, axis=(1, 3))
 
 
+def chance_range(image: Floats, blocks: int) -> float:
+    """Expected range of the medians of equal blocks of a dark, from its pixels' own scatter and its columns'.
+
+    Differences of pixels one above the other have the pixels' scatter s, those side by side the columns' scatter c too.
+    The median of n pixels has the standard error 1.25 s / sqrt(n) (of a normal law), c / sqrt(columns) is added. The
+    range of N normal numbers is 2 Phi^-1((N - 3/8) / (N + 1/4)) standard deviations (Blom 1958).
+    """
+    pixels, both = (
+        median_and_spread(np.diff(image, axis=axis))[1] ** 2 / 2 for axis in (0, 1)
+    )
+    side = block_side(image)
+    variance = np.pi / 2 * pixels / side**2 + max(both - pixels, 0.0) / side
+    return float(2 * special.ndtri((blocks - 0.375) / (blocks + 0.25)) * np.sqrt(variance))
+
+
 def extremes(medians: Floats) -> str:
-    """The places of the greatest and of the least block, in words."""
+    """The places of the brightest and of the darkest ninth of the blocks, in words."""
+    rows = [np.array_split(part, 3, axis=1) for part in np.array_split(medians, 3)]
+    means = [part.mean() for row in rows for part in row]
 
     def word(index: int) -> str:
-        row, column = np.unravel_index(index, medians.shape)
-        vertical = ("top", "middle", "bottom")[int(3 * row / medians.shape[0])]
-        horizontal = ("left", "center", "right")[int(3 * column / medians.shape[1])]
-        return (
-            "center"
-            if (vertical, horizontal) == ("middle", "center")
-            else f"{vertical} {horizontal}"
-        )
+        row, column = divmod(index, 3)
+        text = f"{('top', 'middle', 'bottom')[row]} {('left', 'center', 'right')[column]}"
+        return text.removeprefix("middle ") if index == 4 else text
 
-    return f"the {word(int(np.argmax(medians)))} than at the {word(int(np.argmin(medians)))}"
+    return f"the {word(int(np.argmax(means)))} than at the {word(int(np.argmin(means)))}"

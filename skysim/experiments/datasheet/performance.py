@@ -14,9 +14,12 @@ from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     Bounded,
+    bounded,
+    causes,
     mean_known,
     mean_square_ratio,
     rms,
+    squares_by_field,
 )
 from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
@@ -124,6 +127,11 @@ def noise_equivalent_angle(first: Floats, second: Floats) -> float:
 def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
+    intervals = {}
+    for name, axes in GROUPS.items():
+        noise = mean_known((first[axes] - second[axes]) ** 2, (0, 1)) / 2
+        intervals[f"nea_{name}"] = root_interval(noise)
+        intervals[f"rms_{name}"] = root_interval(squares_by_field(sheet, rows, axes))
     return {
         "counts": counts_of_fields(sheet, rows),
         **{
@@ -132,7 +140,13 @@ def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
         },
         **rms_by_group(sheet, rows),
         "nees": mean_nees(sheet, rows),
+        "intervals": intervals,
     }
+
+
+def root_interval(squares: Floats) -> list[float]:
+    """Ends of the interval of the root of the mean of (fields,) mean squares; NaN for few fields."""
+    return np.sqrt(np.maximum(bounded(squares[np.isfinite(squares)])[1:], 0.0)).tolist()
 
 
 def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
@@ -147,13 +161,18 @@ def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
     return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
 
 
-def by_rate(sheet: MeasuredFrames) -> list[Record]:
-    """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude."""
+def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
+    """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude.
+
+    Parameters
+    ----------
+    experiment
+        One of `cells.RATES`
+    """
     rest = sheet.rows("terms", unit=0, state=0, attitude=0)
-    rates = sheet.levels("rate", "rate_deg_s")
     found = [{"rate_deg_s": 0.0, "streak_px": 0.0, **pair_row(sheet, rest)}]
-    for rate in rates:
-        rows = sheet.rows("rate", rate_deg_s=rate)
+    for rate in sheet.levels(experiment, "rate_deg_s"):
+        rows = sheet.rows(experiment, rate_deg_s=rate)
         streak_px = float(mean_known(sheet.column("streak_px", rows)))
         found.append({"rate_deg_s": rate, "streak_px": streak_px, **pair_row(sheet, rows)})
     return found
@@ -242,7 +261,48 @@ def disturbances(sheet: MeasuredFrames) -> list[Record]:
         name: sheet.rows("disturbance", disturbance=name)
         for name in sheet.levels("disturbance", "disturbance")
     }
+    return [{"disturbance": name} | outcome(sheet, rows) for name, rows in cases.items()]
+
+
+def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
+    """Counts and rms errors of some cells, each frame on its own."""
+    return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
+
+
+def end_of_life(sheet: MeasuredFrames) -> list[Record]:
+    """Outcomes, errors and the ratio of their mean squares for each damage at the end of life; all together last."""
+    found = causes(sheet, "end of life")
     return [
-        {"disturbance": name, "counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
-        for name, rows in cases.items()
+        one | outcome(sheet, sheet.rows("end of life", cause=one["cause"])) for one in found
     ]
+
+
+def exclusions(sheet: MeasuredFrames) -> list[Record]:
+    """Outcomes and errors by the angle of the boresight from bright bodies, the farthest first."""
+    angles = sorted(sheet.levels("exclusion", "off_deg"), reverse=True)
+    return [
+        {"body": body, "off_deg": off_deg}
+        | outcome(sheet, sheet.rows("exclusion", body=body, off_deg=off_deg))
+        for body in sheet.levels("exclusion", "body")
+        for off_deg in angles
+    ]
+
+
+def timing(sheet: MeasuredFrames, times_s: list[float]) -> Record:
+    """Update rate, and the age of an attitude when it is known: half the exposure, reading out, solving.
+
+    The age is that of the middle of the exposure. Rows that are read one after the other delay it.
+    """
+    scene = sheet.scene
+    row_s = getattr(scene.camera.shutter, "row_time_s", 0.0)
+    parts_s = {
+        "half_exposure_s": scene.exposure.time_s / 2,
+        "readout_s": row_s * scene.camera.height_px,
+        "solution_s": float(np.median(times_s)),
+    }
+    return {
+        "rate_hz": scene.exposure.rate_hz,
+        "greatest_rate_hz": 1 / float(np.quantile(times_s, 0.95)),
+        **parts_s,
+        "latency_s": sum(parts_s.values()),
+    }

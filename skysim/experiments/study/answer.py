@@ -34,6 +34,7 @@ from skysim.results.metrics import Summary
 
 # Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
 TRUE_NEES = (2.5, 3.5)
+CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
@@ -46,11 +47,10 @@ def claimed_errors(lines: PointRows, place: Place) -> list[str]:
     found = [(jointly(one, len(known)), line) for one, line in known]
     found = [(one, line) for one, line in found if np.isfinite(one.low)]
     low, high = TRUE_NEES
-    question = "Are the claimed errors true?"
     if not found:
         most = max(one.trials for one, _ in known)
         return [
-            f"{question} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
+            f"{CLAIMED} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
         ]
     together = f", 95 % for all {len(known)} points together" if len(known) > 1 else ""
     false = [(one, line) for one, line in found if one.low > high or one.high < low]
@@ -62,13 +62,13 @@ def claimed_errors(lines: PointRows, place: Place) -> list[str]:
             else everywhere(len(found))
         )
         if all(one.low >= low and one.high <= high for one, _ in found):
-            return [f"{question} Yes: NEES is {low:g} to {high:g}{at}{together}."]
+            return [f"{CLAIMED} Yes: NEES is {low:g} to {high:g}{at}{together}."]
         widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
         named = f" at {place(line)}{together}" if len(known) > 1 else ""
         between = f"{widest.low:.3g} to {widest.high:.3g}"
         factor = noticed(widest, len(known))
         return [
-            f"{question} Nothing says otherwise{at if few else ''}, but NEES is known to {between} only{named}."
+            f"{CLAIMED} Nothing says otherwise{at if few else ''}, but NEES is known to {between} only{named}."
             f" Errors too small by a factor of {factor:.2g} would be noticed with a probability of {100 * POWER:g} %."
         ]
     worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
@@ -81,7 +81,7 @@ def claimed_errors(lines: PointRows, place: Place) -> list[str]:
     cause = ", wrong attitudes included" if wrong > 0 else ""
     interval = f"{worst.low:.3g} to {worst.high:.3g}{together}"
     return [
-        f"{question} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
+        f"{CLAIMED} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
         f" true){count}."
     ]
 
@@ -209,9 +209,10 @@ def answered(lines: PointRows) -> list[PointRow]:
 
 
 def verdict(study: Study, lines: PointRows) -> str:
-    """The answer of the study in three or four short sentences; "" if no trial has an answer.
+    """The answer of the study in three to five short sentences; "" if no trial has an answer.
 
-    1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
+    1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong. 4. Whether the claimed errors
+    are false.
     """
     done = answered(lines)
     if not done:
@@ -231,6 +232,9 @@ def verdict(study: Study, lines: PointRows) -> str:
             place,
         ),
     ]
+    sentences += [
+        one for one in claimed_errors(done, place) if one.startswith(f"{CLAIMED} No:")
+    ]
     return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
 
 
@@ -239,7 +243,14 @@ def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
     if not share.value > 0:
-        return f"{never} (in {sum(line.responses[name].trials for line in lines):,})."
+        trials = sum(line.responses[name].trials for line in lines)
+        refused = sum(
+            round(line.responses["refused"].value * line.responses["refused"].trials)
+            for line in lines
+        )
+        # A frame without an attitude has no wrong one.
+        count = f"{trials - refused:,} of {trials:,} frames" if refused else f"{trials:,}"
+        return f"{never} (in {count})."
     if len(lines) == 1:
         return f"{percent(share.value)} {text} ({interval(share)})."
     return f"Up to {percent(share.value)} {text}, most at {place(worst)}."

@@ -218,19 +218,27 @@ def prepare_store(
     if done:
         check_scene(plan, store)
     if stored != plan.digest or not done:
-        text = plan.path.read_text(encoding="utf-8")
-        file = str(plan.path.resolve())
-        store.begin(
-            plan.points,
-            grown=(kept, plan.study.replicates) if done else None,
-            study=text,
-            file=file,
-            title=plan.study.title,
-            code=code_version(),
-            digest=plan.digest,
-            replicates=str(plan.study.replicates),
-            overrides=json.dumps(dict(overrides or {})),
-        )
+        begin_store(plan, store, (kept, plan.study.replicates) if done else None, overrides)
+
+
+def begin_store(
+    plan: Plan,
+    store: Store,
+    grown: tuple[int, int] | None = None,
+    overrides: OverrideTexts | None = None,
+) -> None:
+    """Set the points and the metadata of a plan; its first points may be those that the store has (`Store.begin`)."""
+    store.begin(
+        plan.points,
+        grown=grown,
+        study=plan.path.read_text(encoding="utf-8"),
+        file=str(plan.path.resolve()),
+        title=plan.study.title,
+        code=code_version(),
+        digest=plan.digest,
+        replicates=str(plan.study.replicates),
+        overrides=json.dumps(dict(overrides or {})),
+    )
 
 
 def stored_replicates(plan: Plan, store: Store) -> int:
