@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -54,20 +53,18 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
 
 def plain_labels(fig: Any) -> None:
     """Label the ticks of logarithmic axes as numbers: the style has no mathematical text."""
-    from matplotlib.ticker import LogFormatterMathtext
+    from matplotlib.ticker import LogFormatter, LogFormatterMathtext
+
+    class Plain(LogFormatter):
+        """A number wherever powers would have a label."""
+
+        def __call__(self, x: float, pos: Any = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
 
     for axis in (one for axes in fig.axes for one in (axes.xaxis, axes.yaxis)):
-        for kind in ("major", "minor"):
-            powers = getattr(axis, f"get_{kind}_formatter")()
-            if isinstance(powers, LogFormatterMathtext):
-                getattr(axis, f"set_{kind}_formatter")(partial(plain_label, powers))
-
-
-def plain_label(
-    powers: Callable[[float, int | None], str], value: float, place: int | None
-) -> str:
-    """A number where a formatter of powers has a label, else nothing."""
-    return f"{value:g}" if powers(value, place) else ""
+        if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(Plain())
 
 
 def figure_png(fig: Any, **options: Any) -> bytes:

@@ -375,7 +375,7 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
-    allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians.size)
+    allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians)
     if (extent := float(np.ptp(medians))) > allowed_dn:
         raise InputError(
             folder,
@@ -465,19 +465,22 @@ def block_medians(image: Floats) -> Floats:
     return np.median(blocks, axis=(1, 3))
 
 
-def chance_range(image: Floats, blocks: int) -> float:
-    """Expected range of the medians of equal blocks of a dark, from its pixels' own scatter and its columns'.
+def chance_range(image: Floats, medians: Floats) -> float:
+    """Expected range of the medians of a dark's blocks, from its pixels' own scatter and its columns'.
 
     Differences of pixels one above the other have the pixels' scatter s, those side by side the columns' scatter c too.
-    The median of n pixels has the standard error 1.25 s / sqrt(n) (of a normal law), c / sqrt(columns) is added. The
-    range of N normal numbers is 2 Phi^-1((N - 3/8) / (N + 1/4)) standard deviations (Blom 1958).
+    The median of n normal numbers has the standard error sqrt(pi / 2 n) of their scatter; a block has as many columns
+    as pixels on a side, and blocks above each other have the same. The range of N normal numbers is
+    2 Phi^-1((N - 3/8) / (N + 1/4)) standard deviations (Blom 1958). The two are independent.
     """
     pixels, both = (
         median_and_spread(np.diff(image, axis=axis))[1] ** 2 / 2 for axis in (0, 1)
     )
     side = block_side(image)
-    variance = np.pi / 2 * pixels / side**2 + max(both - pixels, 0.0) / side
-    return float(2 * special.ndtri((blocks - 0.375) / (blocks + 0.25)) * np.sqrt(variance))
+    variance = np.pi / 2 * np.array([pixels / side**2, max(both - pixels, 0.0) / side])
+    count = np.array([medians.size, medians.shape[1]])
+    quantile = special.ndtri((count - 0.375) / (count + 0.25))
+    return float(2 * np.sqrt(quantile**2 @ variance))
 
 
 def extremes(medians: Floats) -> str:

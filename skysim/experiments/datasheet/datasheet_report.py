@@ -121,7 +121,9 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
             ends = np.array([row["intervals"][name] for row in rows]).T
             values = np.array([row[name] for row in rows])
             draw_bars(errors, x, values, ends, style, color=INK[n], label=f"{kind} {group}")
-    errors.set_yscale("log")
+    # The intervals of few fields may go on beyond the axis.
+    known = np.array([row[name] for row in rows for name in row["intervals"]])
+    errors.set(yscale="log", ylim=(np.nanmin(known) / 3, np.nanmax(known) * 3))
     errors.set_ylabel("one axis [″]")
     errors.legend()
     draw_right(share, x, rows)

@@ -430,7 +430,7 @@ RATE_HEADERS = ["rate °/s", "streak px", *PAIR_HEADERS]
 def rate_rows(rows: list[Record]) -> list[list[str]]:
     """The cells of rows by rate."""
     return [
-        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row)]
+        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.3g}", *pair_cells(row)]
         for row in rows
     ]
 
@@ -480,7 +480,8 @@ def exclusion_section(statement: Statement) -> StatementSection:
     """Outcomes and errors beside the Sun and the Moon."""
     texts = [
         "Lost in space at rest with the boresight at an angle from the center of a body, whose light the scene's"
-        f" baffle lets through (`camera.baffle`). One frame in each field ({ONE_UNIT}). For the Earth's limb and the"
+        f" baffle lets through (`camera.baffle`). One frame in each field ({ONE_UNIT});"
+        " the other bodies shine too. For the Earth's limb and the"
         " share of an orbit in which all angles are kept see `skysim availability`.",
     ]
     for body in ("sun", "moon"):
