@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import shlex
 from collections.abc import Callable
@@ -12,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from skysim.core.files import make_folder, to_json, write_bytes, write_text
+from skysim.core.paths import DATA
 from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts
+from skysim.experiments.datasheet.performance import UNITS, Counts
 from skysim.experiments.datasheet.statement import (
     NAMES,
-    UNITS,
     Statement,
     StatementSection,
     bounded,
@@ -41,6 +42,10 @@ from skysim.results.report_blocks import (
     figure_files,
     text_column,
 )
+
+ECSS_TERMS = (
+    DATA / "ecss_terms.csv"
+)  # terms of the standard, their sections, how they are measured
 
 # Figures of a datasheet.
 
@@ -67,19 +72,18 @@ def draw_terms(statement: Statement, fig: Any) -> None:
 def draw_causes(statement: Statement, fig: Any) -> None:
     """Ratio of the mean square after each change to that before it."""
     axes = fig.subplots()
+    places = np.arange(len(statement.causes))
     for n, group in enumerate(GROUPS):
-        for k, one in enumerate(statement.causes):
-            value, low, high = (100 * part for part in one[group])
-            axes.plot([low, high], [k + 0.2 * n] * 2, color=INK[n])
-            axes.plot(
-                value,
-                k + 0.2 * n,
-                "o",
-                color=INK[n],
-                label=f"{group} the boresight" if k == 0 else None,
-            )
+        value, *ends = 100 * np.array([one[group] for one in statement.causes]).T
+        bars = np.abs(ends - value)
+        style: dict[str, Any] = {
+            "fmt": "o",
+            "color": INK[n],
+            "label": f"{group} the boresight",
+        }
+        axes.errorbar(value, places + 0.2 * n, xerr=bars, **style)
     axes.axvline(100, color="#888888")
-    axes.set_yticks(range(len(statement.causes)), [one["cause"] for one in statement.causes])
+    axes.set_yticks(places, [one["cause"] for one in statement.causes])
     axes.invert_yaxis()
     axes.set_xlabel("what is left of the mean square [%]")
     axes.legend()
@@ -252,7 +256,7 @@ def left_out(statement: Statement) -> list[str]:
 
 
 def as_numbers(value: Any) -> Any:
-    """A value for JSON: named tuples as mappings, numbers that are not finite as None."""
+    """A value for JSON: named tuples as mappings."""
     if isinstance(value, Counts):
         shares = {kind: value.share(kind)._asdict() for kind in ("right", "refused", "false")}
         return value._asdict() | {"shares": shares}
@@ -260,9 +264,7 @@ def as_numbers(value: Any) -> Any:
         return as_numbers(value._asdict())
     if isinstance(value, dict):
         return {key: as_numbers(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_numbers(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return [as_numbers(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def numbers(statement: Statement) -> Record:
@@ -385,121 +387,19 @@ def section_blocks(section: StatementSection, statement: Statement) -> list[Bloc
     return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]
 
 
-# The second page: terms of the standard, the sections of this sheet that have them, and how they are measured.
-ASKED: tuple[tuple[str, str, str], ...] = (
-    (
-        "bias error",
-        "Error terms",
-        "mean over fields, attitudes and time, and its scatter among units",
-    ),
-    (
-        "thermo-elastic error",
-        "Error terms",
-        "steady temperatures of the scene's history (section thermal)",
-    ),
-    (
-        "low-frequency error: field-of-view spatial",
-        "Error terms",
-        "many fields, for one unit; its correlation angle: --model",
-    ),
-    (
-        "low-frequency error: pixel spatial",
-        "Error terms",
-        "attitudes of one field that are 3.37 px apart",
-    ),
-    (
-        "temporal noise, noise-equivalent angle",
-        "By rate",
-        "frames of one attitude that differ in their noise; at rest also in Error terms",
-    ),
-    (
-        "aberration of light",
-        "",
-        "tracker.aberration: whether it is corrected; the residual is in the bias, of one date",
-    ),
-    (
-        "statistics: ensemble, temporal",
-        "Performance at a confidence",
-        "quantiles with intervals between order statistics",
-    ),
-    (
-        "probability of correct attitude determination",
-        "Right, refused and false attitudes",
-        "frames lost in space, exact bounds, claims with the number of runs that they need",
-    ),
-    (
-        "probability of false attitude determination",
-        "Right, refused and false attitudes",
-        "off by more than ten arcminutes and by more than the covariance allows",
-    ),
-    (
-        "probability of invalid attitude determination",
-        "Right, refused and false attitudes",
-        "refused frames",
-    ),
-    (
-        "attitude acquisition time",
-        "Update rate and latency",
-        "one frame and its solution lost in space: latency; in a flight: skysim run",
-    ),
-    (
-        "sky coverage",
-        "Right, refused and false attitudes",
-        "share of the whole sky that is solved",
-    ),
-    (
-        "update rate",
-        "Update rate and latency",
-        "exposure.rate_hz, and what the solutions allow",
-    ),
-    ("latency", "Update rate and latency", "half of the exposure, read-out, solution"),
-    (
-        "maximum rate across the boresight",
-        "By rate",
-        "doubled until most fields fail, or --rates",
-    ),
-    (
-        "maximum rate about the boresight",
-        "By rate about the boresight",
-        "doubled until most fields fail, or --rates",
-    ),
-    ("maximum acceleration", "By acceleration", "none at mid-exposure, then constant"),
-    (
-        "maintenance of tracking",
-        "In tracking mode",
-        "rates and accelerations after two frames",
-    ),
-    (
-        "Sun and Moon exclusion angles",
-        "Exclusion angles",
-        "right attitudes by the angle, through the scene's baffle",
-    ),
-    ("Earth exclusion angle", "", "orbit.exclusion; share of an orbit: skysim availability"),
-    ("availability over an orbit", "", "skysim availability"),
-    (
-        "robustness to protons, hot pixels, stray light, false stars, the Moon",
-        "Under disturbances",
-        "one frame in each field, beside the undisturbed ones",
-    ),
-    (
-        "end of life",
-        "At the end of life",
-        "dose as dark current, hot pixels and transmission",
-    ),
-    ("mass, power, life, electromagnetic compatibility", "", ""),
-)
-PAGE_2 = "What ECSS practice asks and where it is here"
+# The second page.
 
 
 def standard_section(statement: Statement) -> Section:
-    """The terms that a specification by the standard has, and where this sheet has them."""
+    """The terms that a specification by the standard has, where this sheet has them, and how it measures them."""
     stated = {one.title for one in sections(statement)}
     rows = []
-    for term, title, how in ASKED:
+    for term, title, how in list(csv.reader(ECSS_TERMS.read_text().splitlines()))[1:]:
         where = title if title in stated else "not on this sheet" if how else "not here"
         rows.append([term, where, how])
-    columns = [text_column("term"), text_column("section"), text_column("how")]
-    return Section(PAGE_2, [Table(columns, rows)], on_terminal=False)
+    columns = [text_column(name) for name in ("term", "section", "how")]
+    title = "What ECSS practice asks and where it is here"
+    return Section(title, [Table(columns, rows)], on_terminal=False)
 
 
 def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, Path]:

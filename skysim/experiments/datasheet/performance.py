@@ -21,6 +21,7 @@ from skysim.experiments.datasheet.variance_components import (
     rms,
     squares_by_field,
 )
+from skysim.experiments.study import answer
 from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -235,6 +236,47 @@ def bracket(rows: list[Record], key: str) -> Limit:
             break
         below = row[key]
     return Limit(share, above, below, fewest)
+
+
+UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²", "off_deg": "°"}
+
+
+def bracket_text(what: str, rows: list[Record], key: str) -> str:
+    """A sentence on a limit, for fields that are right in both of their frames."""
+    limit = bracket(rows, key)
+    unit = UNITS[key]
+    needed = metrics.trials_needed(1 - limit.share)
+    if limit.fields < needed:
+        return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
+    above = (
+        "at no level tested"
+        if math.isnan(limit.above)
+        else f"{'down' if key == 'off_deg' else 'up'} to {limit.above:g} {unit}"
+    )
+    below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
+    share = f"{100 * limit.share:g} %"
+    text = f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
+    return f"{text}{false_claims_text(rows, key)}" if "nees" in rows[0] else text
+
+
+def false_claims_text(rows: list[Record], key: str) -> str:
+    """A sentence on the levels at which the errors are not as the tracker claims; empty without any.
+
+    All levels together at CONFIDENCE, as a study judges its points (`answer.jointly`).
+    """
+    false = {}
+    for row in rows:
+        value, low, high = row["nees"]
+        nees = Summary(value, low, high, row["counts"].frames)
+        if answer.jointly(nees, len(rows)).low > answer.TRUE_NEES[1]:
+            false[row[key]] = value
+    if not false:
+        return ""
+    worst = max(false, key=lambda level: false[level])
+    return (
+        f" But the errors are not as claimed at {', '.join(f'{level:g}' for level in false)} {UNITS[key]}: greater by a"
+        f" factor of {math.sqrt(false[worst] / 3):.2g} at {worst:g} (NEES {false[worst]:.3g}, 3 if true)."
+    )
 
 
 def solution_times_s(sheet: MeasuredFrames) -> Floats:

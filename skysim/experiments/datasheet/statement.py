@@ -12,9 +12,8 @@ from skysim.core.errors import InputError
 from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts
+from skysim.experiments.datasheet.performance import Counts, bracket_text
 from skysim.experiments.datasheet.variance_components import Bounded, Components
-from skysim.experiments.study import answer
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 
@@ -26,6 +25,7 @@ NAMES = {
     "temporal": "temporal noise",
     "total": "sum",
 }
+Rows = list[Record]
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
@@ -52,20 +52,20 @@ class Statement(NamedTuple):
     terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
-    causes: list[Record]
+    causes: Rows
     counts: Counts
-    claims: list[Record]
-    quantiles: list[Record]
+    claims: Rows
+    quantiles: Rows
     consistency: Record
-    rates: list[Record]
-    boresight_rates: list[Record]
-    accelerations: list[Record]
-    tracked_rates: list[Record]
-    tracked_accelerations: list[Record]
-    magnitudes: list[Record]
-    disturbances: list[Record]
-    exclusions: list[Record]
-    end_of_life: list[Record]
+    rates: Rows
+    boresight_rates: Rows
+    accelerations: Rows
+    tracked_rates: Rows
+    tracked_accelerations: Rows
+    magnitudes: Rows
+    disturbances: Rows
+    exclusions: Rows
+    end_of_life: Rows
     times_s: list[float]
     timing: Record
 
@@ -142,21 +142,22 @@ def arcsec(value: float) -> str:
 
 def sections(statement: Statement) -> list[StatementSection]:
     """All sections, in order."""
-    made = [] if statement.refusal else [term_section(statement)]
-    made += [
-        lowering_section(statement),
-        probability_section(statement),
-        quantile_section(statement),
-        timing_section(statement),
-        rate_section(statement),
-        boresight_section(statement),
-        acceleration_section(statement),
-    ]
-    made += [tracking_section(statement)] if statement.tracked_rates else []
-    made += [magnitude_section(statement)] if statement.magnitudes else []
-    made.append(disturbance_section(statement))
-    made += [exclusion_section(statement)] if statement.exclusions else []
-    return made + ([life_section(statement)] if statement.end_of_life else [])
+    stated = {
+        term_section: not statement.refusal,
+        lowering_section: True,
+        probability_section: True,
+        quantile_section: True,
+        timing_section: True,
+        rate_section: True,
+        boresight_section: True,
+        acceleration_section: True,
+        tracking_section: statement.tracked_rates,
+        magnitude_section: statement.magnitudes,
+        disturbance_section: True,
+        exclusion_section: statement.exclusions,
+        life_section: statement.end_of_life,
+    }
+    return [section(statement) for section, holds in stated.items() if holds]
 
 
 def term_section(statement: Statement) -> StatementSection:
@@ -362,43 +363,6 @@ RIGHT_HEADERS = ["rms of the right: across ″", "about ″"]
 FIELD_HEADERS = ["both right %", "one refused", "one false"]
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
 PAIR_HEADERS += FIELD_HEADERS
-UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²"}
-
-
-def bracket_text(what: str, rows: list[Record], key: str) -> str:
-    """A sentence on a limit, for fields that are right in both of their frames."""
-    limit = performance.bracket(rows, key)
-    unit = UNITS[key]
-    needed = metrics.trials_needed(1 - limit.share)
-    if limit.fields < needed:
-        return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
-    above = (
-        "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
-    )
-    below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
-    share = f"{100 * limit.share:g} %"
-    text = f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
-    return f"{text}{false_claims_text(rows, key)}"
-
-
-def false_claims_text(rows: list[Record], key: str) -> str:
-    """A sentence on the levels at which the errors are not as the tracker claims; empty without any.
-
-    All levels together at CONFIDENCE, as a study judges its points (`answer.jointly`).
-    """
-    false = {}
-    for row in rows:
-        value, low, high = row["nees"]
-        nees = Summary(value, low, high, row["counts"].frames)
-        if answer.jointly(nees, len(rows)).low > answer.TRUE_NEES[1]:
-            false[row[key]] = value
-    if not false:
-        return ""
-    worst = max(false, key=lambda level: false[level])
-    return (
-        f" But the errors are not as claimed at {', '.join(f'{level:g}' for level in false)} {UNITS[key]}: greater by a"
-        f" factor of {math.sqrt(false[worst] / 3):.2g} at {worst:g} (NEES {false[worst]:.3g}, 3 if true)."
-    )
 
 
 def rate_section(statement: Statement) -> StatementSection:
@@ -462,17 +426,19 @@ def timing_section(statement: Statement) -> StatementSection:
             "Not every frame can be solved before the next one on this machine: the solution of one in twenty takes"
             " longer than a period."
         )
-    rows = [["update rate, Hz", f"{found['rate_hz']:g}"]]
-    rows.append(
-        ["Hz at which 95 % of the solutions are in time", f"{found['greatest_rate_hz']:.3g}"]
-    )
-    parts = {
-        "half_exposure_s": "half of the exposure, ms",
-        "readout_s": "read-out of the rows, ms",
-        "solution_s": "solution (median), ms",
-        "latency_s": "latency, ms",
+    milliseconds = {
+        "half of the exposure": "half_exposure_s",
+        "read-out of the rows": "readout_s",
+        "solution (median)": "solution_s",
+        "latency": "latency_s",
     }
-    rows += [[text, f"{1000 * found[name]:.3g}"] for name, text in parts.items()]
+    rows = [
+        ["update rate, Hz", f"{found['rate_hz']:g}"],
+        ["Hz at which 95 % of the solutions are in time", f"{found['greatest_rate_hz']:.3g}"],
+    ]
+    rows += [
+        [f"{text}, ms", f"{1000 * found[key]:.3g}"] for text, key in milliseconds.items()
+    ]
     return StatementSection("Update rate and latency", texts, ["what", "value"], rows)
 
 
@@ -486,16 +452,9 @@ def exclusion_section(statement: Statement) -> StatementSection:
     ]
     for body in ("sun", "moon"):
         beside = [row for row in statement.exclusions if row["body"] == body]
-        limit = performance.bracket(beside, "off_deg")
-        share = f"{100 * limit.share:g} %"
-        kept = (
-            "at no angle tested" if math.isnan(limit.above) else f"down to {limit.above:g}°"
+        texts.append(
+            bracket_text(f"the angle from the {body.capitalize()}", beside, "off_deg")
         )
-        lost = (
-            "" if math.isinf(limit.below) else f"; fewer are shown from {limit.below:g}° on"
-        )
-        name = body.capitalize()
-        texts.append(f"{name}: {share} of right attitudes are shown {kept}{lost}.")
     rows = [
         [row["body"].capitalize(), f"{row['off_deg']:g}", *outcome_row(row)]
         for row in statement.exclusions
@@ -508,17 +467,13 @@ def life_section(statement: Statement) -> StatementSection:
     """Outcomes and errors of the aged camera."""
     life = statement.sheet.designer.end_of_life
     assert life is not None
-    own = ", ".join(
-        f"{name} {value:g}" for name, value in life if name in life.model_fields_set
-    )
-    assumed = ", ".join(
-        f"{name} {value:g}"
+    keys = ", ".join(
+        f"{name} {value:g}{'' if name in life.model_fields_set else ' (assumed)'}"
         for name, value in life
-        if name not in life.model_fields_set and value is not None
+        if value is not None
     )
     texts = [
-        f"The camera after its dose, at rest, on the same fields, units and noise as before. Given: {own}.",
-        f"Assumed: {assumed}." if assumed else "",
+        f"The camera after its dose, at rest, on the same fields, units and noise as before: {keys}.",
         ""
         if life.dark_e_s_krad is not None
         else "Dark current: protons of 60 MeV, displacement damage by Srour & Lo (2000, IEEE Trans. Nucl. Sci. 47,"

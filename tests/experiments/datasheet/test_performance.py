@@ -17,10 +17,10 @@ from skysim.experiments.datasheet.cells import DatasheetCell
 from skysim.experiments.datasheet.performance import (
     Counts,
     bracket,
+    bracket_text,
     claims,
     noise_equivalent_angle,
 )
-from skysim.experiments.datasheet.statement import bracket_text
 from skysim.results.metrics import trials_needed
 
 
