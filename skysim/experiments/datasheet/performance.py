@@ -120,29 +120,23 @@ def consistency(sheet: MeasuredFrames) -> Record:
     }
 
 
-def noise_equivalent_angle(first: Floats, second: Floats) -> float:
-    """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from pairs of frames that differ in noise."""
-    return math.sqrt(mean_known((first - second) ** 2) / 2)
+def noise_equivalent_angle(apart: Floats) -> float:
+    """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from differences of frames with other noise."""
+    return math.sqrt(mean_known(apart**2) / 2)
 
 
 def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
-    intervals = {}
+    found: Record = {"counts": counts_of_fields(sheet, rows), **rms_by_group(sheet, rows)}
+    found |= {"nees": mean_nees(sheet, rows), "intervals": {}}
     for name, axes in GROUPS.items():
-        noise = mean_known((first[axes] - second[axes]) ** 2, (0, 1)) / 2
-        intervals[f"nea_{name}"] = root_interval(noise)
-        intervals[f"rms_{name}"] = root_interval(squares_by_field(sheet, rows, axes))
-    return {
-        "counts": counts_of_fields(sheet, rows),
-        **{
-            f"nea_{name}": noise_equivalent_angle(first[axes], second[axes])
-            for name, axes in GROUPS.items()
-        },
-        **rms_by_group(sheet, rows),
-        "nees": mean_nees(sheet, rows),
-        "intervals": intervals,
-    }
+        apart = first[axes] - second[axes]
+        squares = mean_known(apart**2, (0, 1)) / 2
+        found[f"nea_{name}"] = noise_equivalent_angle(apart)
+        found["intervals"][f"nea_{name}"] = root_interval(squares)
+        found["intervals"][f"rms_{name}"] = root_interval(squares_by_field(sheet, rows, axes))
+    return found
 
 
 def root_interval(squares: Floats) -> list[float]:
@@ -185,17 +179,6 @@ def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[Record]:
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
         for level in sorted(sheet.levels(experiment, key))
     ]
-
-
-def by_acceleration(sheet: MeasuredFrames) -> list[Record]:
-    """Error and outcomes by acceleration."""
-    found = []
-    for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
-        rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
-        row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
-        row |= {"nees": mean_nees(sheet, rows)}
-        found.append(row | rms_by_group(sheet, rows))
-    return found
 
 
 class Limit(NamedTuple):

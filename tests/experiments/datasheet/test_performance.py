@@ -63,8 +63,8 @@ def test_noise_is_separated_from_errors_that_two_frames_share():
     shared = 30 * rng.standard_normal(4000)
     first, second = (shared + 2.5 * rng.standard_normal(4000) for _ in range(2))
     first[:3] = np.nan
-    assert noise_equivalent_angle(first, second) == pytest.approx(2.5, rel=0.04)
-    assert math.isnan(noise_equivalent_angle(first[:3], second[:3]))
+    assert noise_equivalent_angle(first - second) == pytest.approx(2.5, rel=0.04)
+    assert math.isnan(noise_equivalent_angle((first - second)[:3]))
 
 
 def test_a_limit_is_between_the_nearest_levels_shown_above_and_below():

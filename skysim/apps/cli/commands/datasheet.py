@@ -173,24 +173,25 @@ def print_agreements(agreements: list[Agreement]) -> None:
     rows = [
         [
             one.fitted,
-            f"{one.rate_deg_s:g}",
-            str(one.frames),
-            *(f"{p:.2g}" for p in one.p_values),
-            f"{one.correlation:.3f}",
-            f"{one.expected_correlation:.3f}",
+            one.rate_deg_s,
+            one.frames,
+            *one.p_values,
+            one.correlation,
+            one.expected_correlation,
         ]
         for one in agreements
     ]
-    heads = [
-        "rate °/s",
-        "frames",
-        "p of x",
-        "p of y",
-        "p of roll",
-        "correlation",
-        "of the model",
-    ]
-    table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
+    heads = {
+        "rate °/s": "g",
+        "frames": "d",
+        "p of x": ".2g",
+        "p of y": ".2g",
+        "p of roll": ".2g",
+        "correlation": ".3f",
+        "of the model": ".3f",
+    }
+    columns = [Column(head, format=form) for head, form in heads.items()]
+    table = Table([Column("fitted to", kind="text"), *columns], rows)
     p_values = [p for one in agreements for p in one.p_values]
     if len(p_values) * min(p_values) < 0.05:
         print_wrapped(
