@@ -265,6 +265,7 @@ def agreements(sheet: MeasuredFrames) -> list[Agreement]:
         agreement(of_one_unit(fitted), other, rate, name)
         for name, fitted, other in (("even", even, odd), ("odd", odd, even))
         for rate in errors_by_rate(fitted)
+        if np.isfinite(sequences(other, rate)[1][:, 0]).any()
     ]
 
 
