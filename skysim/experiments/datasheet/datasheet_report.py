@@ -127,7 +127,10 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
             draw_bars(errors, x, values, ends, style, color=INK[n], label=f"{kind} {group}")
     # The intervals of few fields may go on beyond the axis.
     known = np.array([row[name] for row in rows for name in row["intervals"]])
-    errors.set(yscale="log", ylim=(np.nanmin(known) / 3, np.nanmax(known) * 3))
+    known = known[np.isfinite(known)]
+    errors.set_yscale("log")
+    if known.size:
+        errors.set_ylim(known.min() / 3, known.max() * 3)
     errors.set_ylabel("one axis [″]")
     errors.legend()
     draw_right(share, x, rows)
