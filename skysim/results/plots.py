@@ -47,7 +47,24 @@ def png(draw: Callable[[Any], None], size_in: tuple[float, float]) -> bytes:
     with matplotlib.rc_context(LOOK):
         fig = Figure(figsize=size_in, layout="constrained")
         draw(fig)
+        plain_labels(fig)
         return figure_png(fig, dpi=DPI, metadata={"Software": None})
+
+
+def plain_labels(fig: Any) -> None:
+    """Label the ticks of logarithmic axes as numbers: the style has no mathematical text."""
+    from matplotlib.ticker import LogFormatter, LogFormatterMathtext
+
+    class Plain(LogFormatter):
+        """A number wherever powers would have a label."""
+
+        def __call__(self, x: float, pos: Any = None) -> str:
+            return f"{x:g}" if super().__call__(x, pos) else ""
+
+    for axis in (one for axes in fig.axes for one in (axes.xaxis, axes.yaxis)):
+        if isinstance(axis.get_major_formatter(), LogFormatterMathtext):
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(Plain())
 
 
 def figure_png(fig: Any, **options: Any) -> bytes:

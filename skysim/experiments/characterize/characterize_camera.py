@@ -25,12 +25,15 @@ from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     by_level,
     exposures_s,
+    interval_digits,
+    interval_text,
     model,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
+    Cell,
     Column,
     Facts,
     Figure,
@@ -117,16 +120,16 @@ def facts(statistics: Record) -> Facts:
 
 def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
-    columns = [text_column("what"), Column("measured", format=".5g"), Column("95 %")]
+    columns = [text_column("what"), Column("measured"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
     values = statistics["values"] + (
         statistics["night"]["values"] if statistics["night"] else []
     )
-    interval = "{low:.5g} to {high:.5g}"
-    rows = [
-        [row["what"], row["value"], interval.format(**row), row["file"], row["unit"]]
-        for row in values
-    ]
+    rows = []
+    for row in values:
+        low, high = row["low"], row["high"]
+        value = Cell(f"{row['value']:.{interval_digits(low, high)}g}", key=row["value"])
+        rows.append([row["what"], value, interval_text(low, high), row["file"], row["unit"]])
     return Table(columns, rows)
 
 
@@ -171,7 +174,6 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
         xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]"
     )
     curve.legend()
-    plain_labels(curve.xaxis, curve.yaxis)
     flats = [one for one in fitted if one.lit] + beyond
     time_s = exposures_s(flats)
     signal = by_level(flats, "mean_dn") - black
@@ -187,15 +189,6 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     )
 
 
-def plain_labels(*axis: Any) -> None:
-    """Label powers of ten as numbers: the style has no mathematical text."""
-    from matplotlib.ticker import NullFormatter
-
-    for one in axis:
-        one.set_major_formatter("{x:g}")
-        one.set_minor_formatter(NullFormatter())
-
-
 def draw_dark(axes: Any, dark: DarkCurrent) -> None:
     """Density of the dark rates of all pixels, hot ones included: measured and expected."""
     width = np.diff(dark.edges)
@@ -208,7 +201,6 @@ def draw_dark(axes: Any, dark: DarkCurrent) -> None:
     axes.set_xscale("symlog", linthresh=dark.mean.value)
     axes.set(yscale="log", xlabel="dark current [DN/s]", ylabel="pixels per DN/s")
     axes.legend()
-    plain_labels(axes.xaxis, axes.yaxis)
 
 
 def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
@@ -291,7 +283,7 @@ def measured_lens(config: CameraConfig, night: Night) -> Stated:
     lens = lens_estimates(config, night.lens)
     focal = lens["focal_length_mm"]
     x, y, *distortion = (lens[name] for name in LENS[1:])
-    points = f"{comment(x)}, {y.low:.5g} to {y.high:.5g}"
+    points = f"{comment(x)}, {interval_text(y.low, y.high)}"
     return found | {
         "focal_length": (
             f"{focal.value:.7g} mm",
@@ -311,7 +303,7 @@ def stated(one: Estimate) -> tuple[Any, str]:
 
 
 def comment(one: Estimate) -> str:
-    return f"[M] {one.low:.5g} to {one.high:.5g}"
+    return f"[M] {interval_text(one.low, one.high)}"
 
 
 def rounded(value: float) -> float:

@@ -46,7 +46,10 @@ STEPS = 60  # most scoring steps
 CONVERGED = 1e-3  # length of the last step, in standard deviations
 DIFFERENCE = 1e-4  # step of the numerical derivatives
 RESOLVED = 5.0  # standard errors by which a scatter must exceed the noise
-MEDIAN_COST = 1.65  # ratio of the standard errors of a variance from medians and from squares
+CORE = 4.0  # standard deviations within which pixels are no hot ones, and the variance there over that of the whole law
+CORE_VARIANCE = 0.998929
+# Ratio of the standard errors of that variance beyond the noise, whose gain is measured too, and of a plain one.
+CORE_COST = 1.1
 # Core widths above the median beyond which pixels are hot, at the start of the fit.
 HOT_SIGMAS = 8.0
 
@@ -77,10 +80,16 @@ class DarkCurrent(NamedTuple):
 
 
 def own_variance(rates: Floats, noise: RateNoise) -> tuple[float, float]:
-    """Variance of the rates over the pixels beyond their noise, and its standard error, from medians."""
+    """Variance of the rates over the pixels beyond their noise, and its standard error.
+
+    It is that of the pixels within CORE standard deviations c, where a normal law has the variance
+    1 - 2 c phi(c) / (2 Phi(c) - 1). The median of the deviations alone is wrong by a step of the digital numbers.
+    """
     median, spread = median_and_spread(rates)
     expected = noise.reading + noise.counting * max(median, 0.0)
-    return spread**2 - expected, MEDIAN_COST * expected * math.sqrt(2 / rates.size)
+    core = rates[np.abs(rates - median) <= CORE * spread]
+    variance = float(core.var(dtype=np.float64)) / CORE_VARIANCE
+    return variance - expected, CORE_COST * expected * math.sqrt(2 / rates.size)
 
 
 def is_resolved(rates: Floats, noise: RateNoise) -> bool:

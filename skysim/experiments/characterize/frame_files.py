@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import ndimage, special
 
 from skysim.camera import detector
 from skysim.camera.detector import Detector
@@ -376,11 +376,12 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
     noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
-    if (extent := float(np.ptp(medians))) > MAX_DARK_RANGE * noise_dn:
+    allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians)
+    if (extent := float(np.ptp(medians))) > allowed_dn:
         raise InputError(
             folder,
             f"{which} are not dark: {extent:.3g} DN brighter at {extremes(medians)}",
-            f"{MAX_DARK_RANGE * noise_dn:.2g} DN: cap the lens, cover the window",
+            f"{allowed_dn:.2g} DN: cap the lens, cover the window",
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
@@ -452,25 +453,45 @@ def check_flat(folder: Path, which: str, medians: Floats) -> None:
         )
 
 
+def block_side(image: Floats) -> int:
+    """Side of the blocks of `block_medians`."""
+    return max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
+
+
 def block_medians(image: Floats) -> Floats:
     """Medians of square blocks, at most BLOCK pixels wide, and small enough that there are at least nine."""
-    side = max(min(BLOCK, *(size // 3 for size in image.shape)), 1)
+    side = block_side(image)
     rows, columns = (size // side for size in image.shape)
     blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
     return np.median(blocks, axis=(1, 3))
 
 
+def chance_range(image: Floats, medians: Floats) -> float:
+    """Expected range of the medians of a dark's blocks, from its pixels' own scatter and its columns'.
+
+    Differences of pixels one above the other have the pixels' scatter s, those side by side the columns' scatter c too.
+    The median of n normal numbers has the standard error sqrt(pi / 2 n) of their scatter; a block has as many columns
+    as pixels on a side, and blocks above each other have the same. The range of N normal numbers is
+    2 Phi^-1((N - 3/8) / (N + 1/4)) standard deviations (Blom 1958). The two are independent.
+    """
+    pixels, both = (
+        median_and_spread(np.diff(image, axis=axis))[1] ** 2 / 2 for axis in (0, 1)
+    )
+    side = block_side(image)
+    variance = np.pi / 2 * np.array([pixels / side**2, max(both - pixels, 0.0) / side])
+    count = np.array([medians.size, medians.shape[1]])
+    quantile = special.ndtri((count - 0.375) / (count + 0.25))
+    return float(2 * np.sqrt(quantile**2 @ variance))
+
+
 def extremes(medians: Floats) -> str:
-    """The places of the greatest and of the least block, in words."""
+    """The places of the brightest and of the darkest ninth of the blocks, in words."""
+    rows = [np.array_split(part, 3, axis=1) for part in np.array_split(medians, 3)]
+    means = [part.mean() for row in rows for part in row]
 
     def word(index: int) -> str:
-        row, column = np.unravel_index(index, medians.shape)
-        vertical = ("top", "middle", "bottom")[int(3 * row / medians.shape[0])]
-        horizontal = ("left", "center", "right")[int(3 * column / medians.shape[1])]
-        return (
-            "center"
-            if (vertical, horizontal) == ("middle", "center")
-            else f"{vertical} {horizontal}"
-        )
+        row, column = divmod(index, 3)
+        text = f"{('top', 'middle', 'bottom')[row]} {('left', 'center', 'right')[column]}"
+        return text.removeprefix("middle ") if index == 4 else text
 
-    return f"the {word(int(np.argmax(medians)))} than at the {word(int(np.argmin(medians)))}"
+    return f"the {word(int(np.argmax(means)))} than at the {word(int(np.argmin(means)))}"

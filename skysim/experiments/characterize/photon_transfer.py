@@ -77,6 +77,25 @@ class Estimate(NamedTuple):
         return cls(value, sigma / (2 * value) if value else high / SIGMAS, low, high)
 
 
+DIGITS = 5  # significant digits of an interval, or so many that its width has two
+
+
+def interval_digits(low: float, high: float) -> int:
+    """Significant digits with which the ends of an interval show its width."""
+    if not high > low:
+        return DIGITS
+    size, width = (
+        math.floor(math.log10(one)) for one in (max(abs(low), abs(high)), high - low)
+    )
+    return max(DIGITS, size - width + 2)
+
+
+def interval_text(low: float, high: float) -> str:
+    """An interval in words."""
+    digits = interval_digits(low, high)
+    return f"{low:.{digits}g} to {high:.{digits}g}"
+
+
 def slopes(function: Callable[[Floats], Any], at: Floats, step: Floats) -> Floats:
     """(K, ...) derivatives by K parameters, by central differences; 0 for a parameter without a step."""
     moved = (np.diag(step)[n] for n in range(len(at)))

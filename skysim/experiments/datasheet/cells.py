@@ -23,22 +23,29 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.types import Bools, Floats, Record
 from skysim.core.yaml_reader import parse_yaml
+from skysim.experiments.datasheet import scene_changes
+from skysim.experiments.datasheet.scene_changes import (
+    FIXED_PATTERN,
+    OFF_DEG,
+    EndOfLife,
+    aged,
+    beside,
+    excluding_bodies,
+    side_px,
+)
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan, resolve_point
 from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
-from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
-from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
-from skysim.tracking.onboard_model import onboard_catalog
 
 MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 MODEL_FIELDS = 2 * MIN_FIELDS  # for an error model: each half of them tests that of the other
 
 # Step from one attitude of a field to the next: the same stars at other phases in the pixels.
 SCAN_PX = 3.37
-FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of `camera.detector`
 STREAKS_PX = (
     0.5,
     1.0,
@@ -48,6 +55,14 @@ STREAKS_PX = (
     16.0,
     32.0,
 )  # lengths of the streaks, which give the rates
+BORESIGHT_PX = (
+    2.0,
+    8.0,
+    32.0,
+)  # lengths of the streaks at the edge, in turns about the boresight
+# Experiments at a rate, with their further settings. They go on at twice the rate until most fields fail.
+RATES: dict[str, Settings] = {"rate": {}, "boresight": {"trial.rate_axis": "boresight"}}
+MOST_FAIL = 0.5  # share of the fields that must be right in both frames for a faster rate
 SEQUENCE = (0, 1, 2, 4, 8, 16)  # frames of a sequence at a constant rate
 SEQUENCE_RATES = 4  # number of the slowest rates that have sequences, as rest has
 FAINTER = (
@@ -55,9 +70,6 @@ FAINTER = (
     -0.5,
     0.5,
 )  # magnitudes by which the limit of the tracker's catalog is varied
-# Error and number of the true centroids in trials with false ones.
-FALSE_STARS_PX = 0.05
-TRUE_STARS = 20
 BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the square of the exposure time
 TRACKED = 2  # frames before one in tracking mode: the second one gives a rate
 TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # lengths of the streaks in tracking mode
@@ -174,19 +186,31 @@ def states_c(scene: Scene, count: int) -> list[float]:
 
 
 class Designer:
-    """Makes the cells of a scene."""
+    """Makes the cells of a scene.
 
-    def __init__(self, scene: Scene, size: Size) -> None:
+    Parameters
+    ----------
+    rates_deg_s
+        Rates in place of those that follow from the camera
+    end_of_life
+        What the camera has suffered at the end of its life
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        size: Size,
+        rates_deg_s: Sequence[float] = (),
+        end_of_life: EndOfLife | None = None,
+    ) -> None:
         self.scene = scene
         self.size = size
+        self.chosen_rates_deg_s = sorted({rate for rate in rates_deg_s if rate})
+        self.end_of_life = end_of_life
         self.seeds = unit_seeds(scene)
         self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
         self.under_stars = isinstance(scene.light, StarsConfig)
-        self.catalog_end_mag = math.inf
-        if self.under_stars:
-            stars = onboard_catalog("tracker.catalog", scene.tracker.catalog)
-            self.catalog_end_mag = float(stars.v_mag.max()) + CATALOG_MARGIN_MAG
         self.noise = 0
 
     @property
@@ -234,11 +258,17 @@ class Designer:
         yield from self.accelerations()
         yield from self.tracked()
         yield from self.magnitudes()
-        for name, change in self.causes().items():
-            pairs = max(self.size.pairs, self.states)
+        pairs = max(self.size.pairs, self.states)
+        for name, change in scene_changes.causes(self.scene).items():
             yield from self.draws("cause", pairs, change, cause=name)
-        for name, change in self.disturbances().items():
+        for name, change in scene_changes.disturbances(self.scene).items():
             yield from self.draws("disturbance", 1, change, disturbance=name)
+        for body, off_deg in itertools.product(excluding_bodies(self.scene), OFF_DEG):
+            change = beside(body, off_deg, off_deg)
+            yield from self.draws("exclusion", 1, change, body=body, off_deg=off_deg)
+        if self.end_of_life:
+            for name, change in aged(self.scene.camera, self.end_of_life).items():
+                yield from self.draws("end of life", pairs, change, cause=name)
 
     def terms(self) -> Iterator[DatasheetCell]:
         """The crossed and nested design of `components`."""
@@ -248,7 +278,7 @@ class Designer:
             yield DatasheetCell("terms", levels, self.settings(Draw(*numbers[:3])))
 
     def draws(
-        self, experiment: str, count: int, change: Settings | None = None, **levels: str
+        self, experiment: str, count: int, change: Settings | None = None, **levels: Any
     ) -> Iterator[DatasheetCell]:
         """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
         for number in range(count):
@@ -260,9 +290,14 @@ class Designer:
                 del settings["trial.turn_deg"]
             yield DatasheetCell(experiment, {**levels, "draw": number}, settings)
 
-    def rates_deg_s(self, streaks_px: Sequence[float]) -> list[float]:
-        """Rates with streaks of these lengths, to two digits."""
-        per_px = self.pixel_deg / self.scene.exposure.time_s
+    def rates_deg_s(
+        self, streaks_px: Sequence[float], experiment: str = "rate"
+    ) -> list[float]:
+        """Rates with streaks of these lengths, to two digits; about the boresight those at the edge of the field."""
+        pixel_deg = self.pixel_deg
+        if experiment == "boresight":
+            pixel_deg = math.degrees(2 / side_px(self.scene))
+        per_px = pixel_deg / self.scene.exposure.time_s
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
     def accelerations_deg_s2(self, bends_px: Sequence[float], time_s: float) -> list[float]:
@@ -278,9 +313,23 @@ class Designer:
             yield DatasheetCell(experiment, {name: level, "frame": frame}, settings)
 
     def rates(self) -> Iterator[DatasheetCell]:
-        """Pairs of frames at each rate."""
-        for rate in self.rates_deg_s(STREAKS_PX):
-            yield from self.pair("rate", "rate_deg_s", rate, {"trial.rate_deg_s": rate})
+        """Pairs of frames at each rate, across the boresight and about it."""
+        for experiment, streaks_px in (("rate", STREAKS_PX), ("boresight", BORESIGHT_PX)):
+            rates = self.chosen_rates_deg_s or self.rates_deg_s(streaks_px, experiment)
+            for rate in rates:
+                yield from self.at_rate(experiment, rate)
+
+    def at_rate(self, experiment: str, rate_deg_s: float) -> Iterator[DatasheetCell]:
+        """A pair of frames at a rate, of one of RATES."""
+        change = {"trial.rate_deg_s": rate_deg_s} | RATES[experiment]
+        return self.pair(experiment, "rate_deg_s", rate_deg_s, change)
+
+    def faster(
+        self, experiment: str, cells: Sequence[DatasheetCell]
+    ) -> Iterator[DatasheetCell]:
+        """A pair at twice the greatest rate of an experiment, one of RATES."""
+        rates = [one.levels["rate_deg_s"] for one in cells if one.experiment == experiment]
+        return self.at_rate(experiment, 2 * max(rates))
 
     def sequences(self) -> Iterator[DatasheetCell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
@@ -320,85 +369,10 @@ class Designer:
             return
         for step in (0.0, *FAINTER):
             limit = self.scene.tracker.limit_mag + step
-            if step > 0 and limit > self.catalog_end_mag:
+            if step > 0 and limit > scene_changes.catalog_end_mag(self.scene):
                 continue
             change: Settings = {"tracker.limit_mag": limit}
             yield from self.pair("magnitude", "limit_mag", limit, change)
-
-    def causes(self) -> dict[str, Settings]:
-        """Changes of the scene that would lower the error; those without effect on it are left out."""
-        camera = self.scene.camera
-        chip = camera.detector
-        survey = self.scene.tracker.survey
-        exposure = self.scene.exposure
-        changes: dict[str, Settings] = {
-            "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
-        }
-        if 2 * exposure.time_s + exposure.trigger_jitter_s <= 1 / exposure.rate_hz:
-            changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
-        if chip.read_noise_e:
-            changes["half the read noise"] = {
-                "camera.detector.read_noise_e": chip.read_noise_e / 2
-            }
-        if any(getattr(chip, key) for key in FIXED_PATTERN):
-            none = {f"camera.detector.{key}": 0 for key in FIXED_PATTERN}
-            changes["no fixed pattern"] = none
-        if chip.cti_parallel or chip.cti_serial:
-            changes["no transfer loss"] = {
-                "camera.detector.cti_parallel": 0,
-                "camera.detector.cti_serial": 0,
-            }
-        if survey.lever_sigma_m:
-            changes["the lever known"] = {"tracker.survey.lever_sigma": "0 mm"}
-        if survey.led_sigma_m or survey.instrument:
-            changes["the LEDs' map known"] = {
-                "tracker.survey.led_sigma": "0 mm",
-                "tracker.survey.instrument": None,
-            }
-        if survey.focal_length_sigma_m:
-            changes["the focal length known"] = {"tracker.survey.focal_length_sigma": "0 mm"}
-        if self.scene.thermal:
-            reference = {"kind": "steady", "temperature_c": self.scene.thermal.reference_c}
-            changes["the temperature held"] = {"thermal.temperature": reference}
-        fainter_mag = self.scene.tracker.limit_mag + 0.5
-        if self.under_stars and fainter_mag <= self.catalog_end_mag:
-            changes["half a magnitude more stars known"] = {"tracker.limit_mag": fainter_mag}
-        return changes
-
-    def disturbances(self) -> dict[str, Settings]:
-        """Disturbances that the scene supports, beyond its own."""
-        chip = self.scene.camera.detector
-        exposure_s = self.scene.exposure.time_s
-        hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
-        own = self.scene.model_dump(mode="json", by_alias=True)["background"]
-        found: dict[str, Settings] = {
-            "protons, 1e3 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e3}]},
-            "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
-            "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,
-            "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
-        }
-        for electrons in (100, 1000):
-            glow = {"kind": "uniform", "e_s": electrons / exposure_s}
-            found[f"stray light, {electrons} e- a pixel"] = {"background": [*own, glow]}
-        if not self.under_stars:
-            return found
-        for count in (5, 20):
-            found[f"false stars, {count} among {TRUE_STARS} true"] = {
-                "trial.kind": "centroids",
-                "trial.noise_px": FALSE_STARS_PX,
-                "trial.lights": TRUE_STARS,
-                "trial.false_lights": count,
-            }
-        if BODIES_YEARS[0] <= self.scene.start_time.year <= BODIES_YEARS[1]:
-            near = {"body": "moon", "off_deg": [0, float(f"{self.half_field_deg:.2g}")]}
-            found["Moon in the field"] = {"trial.near": near, "light.bodies": {}}
-        return found
-
-    @property
-    def half_field_deg(self) -> float:
-        """Half of the field's smaller side."""
-        side_px = min(self.scene.camera.width_px, self.scene.camera.height_px)
-        return math.degrees(math.atan(side_px / 2 / self.scene.camera.focal_px))
 
 
 # Run the experiments of a datasheet: write them as a study, run its missing trials, and read their results as arrays.
@@ -461,6 +435,17 @@ class MeasuredFrames:
         """(cells, fields) whether a frame has a false attitude."""
         return self.columns["wrong"][rows] > 0
 
+    def solved_at_all_rates(self) -> list[str]:
+        """Experiments of RATES in which enough fields are right at the fastest rate, whose streak is in the field."""
+        found = []
+        for experiment in RATES:
+            rate = max(self.levels(experiment, "rate_deg_s"))
+            right = self.right(self.rows(experiment, rate_deg_s=rate)).all(axis=0)
+            longest = self.designer.rates_deg_s([side_px(self.scene)], experiment)[0]
+            if right.mean() >= MOST_FAIL and 2 * rate <= longest:
+                found.append(experiment)
+        return found
+
     def errors(self, rows: list[int]) -> Floats:
         """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false attitudes."""
         errors = np.stack([self.columns[name][rows] for name in AXES])
@@ -512,6 +497,8 @@ def measure(
     quick: bool = False,
     fields: int | None = None,
     least: int = MIN_FIELDS,
+    rates_deg_s: Sequence[float] = (),
+    end_of_life: EndOfLife | None = None,
     workers: int | None = None,
     watch: Callable[[int], runner.Watch] | None = None,
 ) -> MeasuredFrames:
@@ -525,6 +512,8 @@ def measure(
         Number of fields; None for the usual one
     least
         Number of fields that must be solved: MIN_FIELDS, or MODEL_FIELDS for an error model
+    rates_deg_s, end_of_life
+        See `Designer`; without rates they are doubled until MOST_FAIL of the fields fail
     watch
         Called with the number of trials; returns the function that is called after every batch
 
@@ -539,33 +528,51 @@ def measure(
     size = replace(size, fields=size.fields if fields is None else fields)
     purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
     require_fields(size.fields, size.fields, least, f"too few {purpose}")
-    designer = Designer(scene, size)
+    designer = Designer(scene, size, rates_deg_s, end_of_life)
     cells = list(designer.cells())
-    tree = study_tree(scene_name, scene, overrides, size, cells)
     path = make_folder(folder) / STUDY
-    text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120)
-    write_text(path, text)
-    plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
-    for cell in cells:
-        try:
-            resolve_point(plan.spec, cell.settings)
-        except InputError as error:
-            raise error.within(cell.name) from None
+
+    def planned() -> Plan:
+        tree = study_tree(scene_name, scene, overrides, size, cells)
+        text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120)
+        write_text(path, text)
+        plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
+        for cell in cells:
+            try:
+                resolve_point(plan.spec, cell.settings)
+            except InputError as error:
+                raise error.within(cell.name) from None
+        return plan
+
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
     try:
         with store.writing(folder / store.STORE) as kept:
+            # The rates that an earlier call has added.
+            for point in kept.points()[len(cells) :: 2]:
+                experiment = point.levels.get("cell", "").partition(" ")[0]
+                if experiment in RATES:
+                    cells += designer.faster(experiment, cells)
+            plan = planned()
             runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
-            runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
-            return MeasuredFrames(
-                scene,
-                scene_name,
-                overrides,
-                size,
-                designer,
-                cells,
-                read(plan, kept),
-                plan.spec,
-            )
+            while True:
+                runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
+                sheet = MeasuredFrames(
+                    scene,
+                    scene_name,
+                    overrides,
+                    size,
+                    designer,
+                    cells,
+                    read(plan, kept),
+                    plan.spec,
+                )
+                solved = [] if rates_deg_s else sheet.solved_at_all_rates()
+                if not solved:
+                    return sheet
+                for experiment in solved:
+                    cells += designer.faster(experiment, cells)
+                plan = planned()
+                runner.begin_store(plan, kept)
     finally:
         engine.close()
 

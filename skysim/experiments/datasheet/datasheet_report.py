@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import shlex
 from collections.abc import Callable
@@ -12,13 +13,16 @@ from typing import Any
 import numpy as np
 
 from skysim.core.files import make_folder, to_json, write_bytes, write_text
+from skysim.core.paths import DATA
+from skysim.core.types import Floats, Record
+from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.performance import UNITS, Counts
 from skysim.experiments.datasheet.statement import (
     NAMES,
     Statement,
     StatementSection,
-    failed_checks,
-    numbers,
+    bounded,
     percent,
     sections,
     sizes,
@@ -30,12 +34,18 @@ from skysim.results.report_blocks import (
     Block,
     Column,
     Figure,
+    Items,
     Section,
     Table,
     Text,
     Verdict,
     figure_files,
+    text_column,
 )
+
+ECSS_TERMS = (
+    DATA / "ecss_terms.csv"
+)  # terms of the standard, their sections, how they are measured
 
 # Figures of a datasheet.
 
@@ -62,19 +72,18 @@ def draw_terms(statement: Statement, fig: Any) -> None:
 def draw_causes(statement: Statement, fig: Any) -> None:
     """Ratio of the mean square after each change to that before it."""
     axes = fig.subplots()
+    places = np.arange(len(statement.causes))
     for n, group in enumerate(GROUPS):
-        for k, one in enumerate(statement.causes):
-            value, low, high = (100 * part for part in one[group])
-            axes.plot([low, high], [k + 0.2 * n] * 2, color=INK[n])
-            axes.plot(
-                value,
-                k + 0.2 * n,
-                "o",
-                color=INK[n],
-                label=f"{group} the boresight" if k == 0 else None,
-            )
+        value, *ends = 100 * np.array([one[group] for one in statement.causes]).T
+        bars = np.abs(ends - value)
+        style: dict[str, Any] = {
+            "fmt": "o",
+            "color": INK[n],
+            "label": f"{group} the boresight",
+        }
+        axes.errorbar(value, places + 0.2 * n, xerr=bars, **style)
     axes.axvline(100, color="#888888")
-    axes.set_yticks(range(len(statement.causes)), [one["cause"] for one in statement.causes])
+    axes.set_yticks(places, [one["cause"] for one in statement.causes])
     axes.invert_yaxis()
     axes.set_xlabel("what is left of the mean square [%]")
     axes.legend()
@@ -112,19 +121,47 @@ def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
         for kind, style in (("NEA", "o-"), ("rms", "s--")):
-            values = [row[f"{kind.lower()}_{group}"] for row in rows]
-            errors.plot(x, values, style, color=INK[n], label=f"{kind} {group}")
+            name = f"{kind.lower()}_{group}"
+            ends = np.array([row["intervals"][name] for row in rows]).T
+            values = np.array([row[name] for row in rows])
+            draw_bars(errors, x, values, ends, style, color=INK[n], label=f"{kind} {group}")
+    # The intervals of few fields may go on beyond the axis.
+    known = np.array([row[name] for row in rows for name in row["intervals"]])
+    known = known[np.isfinite(known)]
     errors.set_yscale("log")
-    errors.yaxis.set_major_formatter("{x:g}")
+    if known.size:
+        errors.set_ylim(known.min() / 3, known.max() * 3)
     errors.set_ylabel("one axis [″]")
     errors.legend()
-    found = [row["counts"].share("right") for row in rows]
-    right = np.array([one.value for one in found])
-    ends = np.array([[one.value - one.low, one.high - one.value] for one in found]).T
-    share.errorbar(x, 100 * right, 100 * ends, fmt="o-", color=INK[2])
-    share.set_ylabel("right attitudes [%]")
+    draw_right(share, x, rows)
     for axes in (errors, share):
         axes.set_xlabel(label)
+
+
+def draw_right(axes: Any, x: list[float], rows: list[dict[str, Any]], **options: Any) -> None:
+    """Percentages of right attitudes with their exact bounds."""
+    found = 100 * np.array([row["counts"].share("right")[:3] for row in rows])
+    draw_bars(axes, x, found[:, 0], found[:, 1:].T, "o-", **{"color": INK[2]} | options)
+    axes.set_ylabel("right attitudes [%]")
+
+
+def draw_bars(
+    axes: Any, x: list[float], values: Floats, ends: Floats, style: str, **options: Any
+) -> None:
+    """A curve with the bars of its intervals, (2, N) ends; a value without an interval has none."""
+    bars = np.nan_to_num(np.abs(ends - values))
+    axes.errorbar(x, values, bars, fmt=style, elinewidth=0.8, capsize=1.5, **options)
+
+
+def draw_exclusions(statement: Statement, fig: Any) -> None:
+    """Fraction of right attitudes against the angle from a body."""
+    axes = fig.subplots()
+    for n, body in enumerate(("sun", "moon")):
+        rows = [row for row in statement.exclusions if row["body"] == body]
+        off_deg = [row["off_deg"] for row in rows]
+        draw_right(axes, off_deg, rows, color=INK[n], label=body.capitalize())
+    axes.set_xlabel("angle of the boresight from the body [°]")
+    axes.legend()
 
 
 # Drawing function, size in inches, and caption.
@@ -147,7 +184,19 @@ FIGURES: dict[str, tuple[Callable[[Statement, Any], None], tuple[float, float], 
     "rates": (
         lambda statement, fig: draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]"),
         (9, 3),
-        "By rate: NEA (temporal), rms (ensemble), and right attitudes with exact bounds.",
+        "By rate: NEA (temporal), rms (ensemble), 95 % intervals over the fields; right attitudes, exact bounds.",
+    ),
+    "boresight": (
+        lambda statement, fig: draw_by(
+            fig, statement.boresight_rates, "rate_deg_s", "rate about the boresight [°/s]"
+        ),
+        (9, 3),
+        "By rate about the boresight: NEA (temporal), rms (ensemble), right attitudes.",
+    ),
+    "exclusions": (
+        draw_exclusions,
+        (7, 3),
+        "Right attitudes by the angle from Sun and Moon, with exact bounds.",
     ),
     "magnitudes": (
         lambda statement, fig: draw_by(
@@ -159,6 +208,111 @@ FIGURES: dict[str, tuple[Callable[[Statement, Any], None], tuple[float, float], 
 }
 
 
+# Sentences on the whole sheet.
+
+
+def failed_checks(statement: Statement) -> list[str]:
+    """Sentences on what the sheet's own checks contradict: missing terms, a sum unlike the total, a negative term."""
+    found = []
+    if statement.refusal:
+        found.append(f"The error terms are not stated. Fields {statement.refusal.fault}.")
+    for name, table in statement.terms.items():
+        if variance_components.sign(table.ratio, 1.0):
+            found.append(
+                f"The terms {name} the boresight do not add up: their sum over the mean square of other frames is"
+                f" {bounded(table.ratio)}, which does not hold 1."
+            )
+        found += [
+            f"The variance of {NAMES[term]} {name} the boresight is negative."
+            for term, sign in table.signs.items()
+            if sign < 0
+        ]
+    return found
+
+
+def left_out(statement: Statement) -> list[str]:
+    """What the sheet does not state, each with the reason."""
+    sheet = statement.sheet
+    sky = sheet.designer.under_stars
+    reasons = {
+        "Exclusion angles": (
+            statement.exclusions,
+            "the scene has no camera.baffle, whose stray light limits the angle"
+            if sky
+            else "a dome has no Sun and no Moon",
+        ),
+        "Tracking mode": (
+            statement.tracked_rates,
+            "the tracker has none" if sky else "a dome's tracker has none",
+        ),
+        "Magnitude limits": (statement.magnitudes, "a dome's tracker has a map, no catalog"),
+        "Thermo-elastic error": (
+            sheet.designer.states > 1,
+            "the scene has no section thermal",
+        ),
+        "End of life": (statement.end_of_life, "no dose was given: `--end-of-life KRAD`"),
+    }
+    return [f"{name}: {reason}." for name, (stated, reason) in reasons.items() if not stated]
+
+
+# The statement as numbers for JSON.
+
+
+def as_numbers(value: Any) -> Any:
+    """A value for JSON: named tuples as mappings."""
+    if isinstance(value, Counts):
+        shares = {kind: value.share(kind)._asdict() for kind in ("right", "refused", "false")}
+        return value._asdict() | {"shares": shares}
+    if hasattr(value, "_asdict"):
+        return as_numbers(value._asdict())
+    if isinstance(value, dict):
+        return {key: as_numbers(one) for key, one in value.items()}
+    return [as_numbers(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def numbers(statement: Statement) -> Record:
+    """The statement for JSON; squares in arcsec^2 of one axis.
+
+    Numbers outside `rates`, `accelerations` and those of tracking mode hold at `rate_deg_s`.
+    """
+    sheet = statement.sheet
+    head = {
+        "scene": sheet.scene.name,
+        "title": sheet.scene.title,
+        "overrides": dict(sheet.overrides),
+        "failed_checks": failed_checks(statement),
+        "seed": sheet.scene.seed,
+        "rate_deg_s": 0.0,
+        "fields": sheet.size.fields,
+        "units": sheet.designer.units,
+        "states_c": sheet.designer.temperatures_c,
+        "frames": int(sheet.columns["trial"].size),
+        "fields_solved": statement.fields,
+        "limits": limits(statement),
+    }
+    parts = statement._asdict()
+    del parts["sheet"], parts["refusal"], parts["fields"]
+    return head | as_numbers(parts)
+
+
+def limits(statement: Statement) -> Record:
+    """The limits of acquisition and of tracking in rate and acceleration."""
+    measured = {
+        "acquisition": (statement.rates, statement.accelerations),
+        "tracking": (statement.tracked_rates, statement.tracked_accelerations),
+        "about the boresight": (statement.boresight_rates,),
+    }
+    found = {
+        mode: {
+            key: performance.bracket(rows, key)
+            for key, rows in zip(UNITS, tables, strict=False)
+        }
+        for mode, tables in measured.items()
+        if tables[0]
+    }
+    return as_numbers(found)
+
+
 STANDARD = (
     "Terms in the sense of ECSS-E-ST-60-20C (star sensors: terminology and performance specification). The numbers"
     " are of the simulated scene; compliance with the standard is not claimed."
@@ -166,9 +320,9 @@ STANDARD = (
 PRINTED = 3  # number of sections on a terminal: the terms, their causes and the probabilities
 
 
-def command(sheet: MeasuredFrames, quick: bool) -> str:
-    """The shell command that repeats the datasheet."""
-    options = ["--quick"] * quick
+def command(sheet: MeasuredFrames, options: list[str]) -> str:
+    """The shell command that repeats the datasheet; `options` without those of the scene and its fields."""
+    options = list(options)
     for key, value in sheet.overrides.items():
         options += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
     return shlex.join(
@@ -183,8 +337,8 @@ def command(sheet: MeasuredFrames, quick: bool) -> str:
     )
 
 
-def datasheet_report(statement: Statement, quick: bool) -> Report:
-    """The report of a statement."""
+def datasheet_report(statement: Statement, options: list[str]) -> Report:
+    """The report of a statement, measured with these options of the command (`command`)."""
     sheet = statement.sheet
     shown = [
         Section(one.title, section_blocks(one, statement), on_terminal=n < PRINTED)
@@ -194,8 +348,15 @@ def datasheet_report(statement: Statement, quick: bool) -> Report:
     text = Text(f"{STANDARD} {sheet.columns['trial'].size} frames.", on_terminal=False)
     return Report(
         f"Datasheet: {sheet.scene.title}",
-        [*failed, verdict(statement), text, *shown],
-        command(sheet, quick),
+        [
+            *failed,
+            verdict(statement),
+            text,
+            *shown,
+            Section("Not on this sheet", [Items(left_out(statement))]),
+            standard_section(statement),
+        ],
+        command(sheet, options),
     )
 
 
@@ -227,6 +388,21 @@ def section_blocks(section: StatementSection, statement: Statement) -> list[Bloc
         Column(head, kind="aside" if head == "what it is" else "number") for head in others
     ]
     return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]
+
+
+# The second page.
+
+
+def standard_section(statement: Statement) -> Section:
+    """The terms that a specification by the standard has, where this sheet has them, and how it measures them."""
+    stated = {one.title for one in sections(statement)}
+    rows = []
+    for term, title, how in list(csv.reader(ECSS_TERMS.read_text().splitlines()))[1:]:
+        where = title if title in stated else "not on this sheet" if how else "not here"
+        rows.append([term, where, how])
+    columns = [text_column(name) for name in ("term", "section", "how")]
+    title = "What ECSS practice asks and where it is here"
+    return Section(title, [Table(columns, rows)], on_terminal=False)
 
 
 def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, Path]:

@@ -18,6 +18,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet.cells import MIN_FIELDS, MODEL_FIELDS, MeasuredFrames
 from skysim.experiments.datasheet.error_model import AXES, ErrorModel
+from skysim.experiments.datasheet.scene_changes import half_field_deg
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     common_square,
@@ -56,7 +57,7 @@ def constants(sheet: MeasuredFrames) -> Record:
         "scale": [across, across, about],
         "field_deg": field_angle_deg(sheet, field, pixel, mean),
         "pixel_deg": sheet.designer.pixel_deg,
-        "scale_deg": sheet.designer.half_field_deg,
+        "scale_deg": half_field_deg(sheet.scene),
         "rates_deg_s": list(by_rate),
         "noise": [rest.tolist(), *noise[1:].tolist()],
         "along": np.sqrt(along).tolist(),
@@ -102,10 +103,16 @@ def field_variances(sheet: MeasuredFrames, axes: slice) -> tuple[Floats, Floats]
     return terms[known], np.var(rest[:, :, known], axis=1, ddof=1).mean(axis=0)
 
 
+def rate_rows(sheet: MeasuredFrames, rate_deg_s: float) -> list[int]:
+    """Rows of the sequence at a rate, or of the pair of frames at a faster one."""
+    sequence = sheet.rows("sequence", rate_deg_s=rate_deg_s)
+    return sequence or sheet.rows("rate", rate_deg_s=rate_deg_s)
+
+
 def sequences(sheet: MeasuredFrames, rate_deg_s: float) -> tuple[list[int], Floats]:
-    """Steps and (3, steps, fields) errors of the sequences at one rate."""
-    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
-    return [sheet.cells[row].levels["step"] for row in rows], sheet.errors(rows)
+    """Steps and (3, steps, fields) errors of the frames at one rate; those of a pair have the same attitude."""
+    rows = rate_rows(sheet, rate_deg_s)
+    return [sheet.cells[row].levels.get("step", 0) for row in rows], sheet.errors(rows)
 
 
 def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
@@ -115,8 +122,7 @@ def errors_by_rate(sheet: MeasuredFrames) -> dict[float, Floats]:
     """
     sequenced = sheet.levels("sequence", "rate_deg_s")
     faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > max(sequenced)]
-    found = {rate: sequences(sheet, rate)[1] for rate in sequenced}
-    found |= {rate: sheet.errors(sheet.rows("rate", rate_deg_s=rate)) for rate in faster}
+    found = {rate: sequences(sheet, rate)[1] for rate in [*sequenced, *faster]}
     solved = takewhile(
         lambda rate: np.isfinite(found[rate][0]).any(axis=0).sum() >= MIN_FIELDS, found
     )
@@ -148,12 +154,10 @@ def along_square(
 
 def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
-    rows = sheet.rows("sequence", rate_deg_s=rate_deg_s)
-    if not rows:
-        rows = sheet.rows("rate", rate_deg_s=rate_deg_s)
-    setup = setups.prepared_setup(sheet.spec, sheet.cells[rows[0]].settings)
+    row = rate_rows(sheet, rate_deg_s)[0]
+    setup = setups.prepared_setup(sheet.spec, sheet.cells[row].settings)
     axes = []
-    for seed in sheet.column("seed", rows[:1])[0].tolist():
+    for seed in sheet.column("seed", [row])[0].tolist():
         rng = trials.streams(setup, seed)[0]
         axes.append(trials.attitude_and_axis(setup, rng)[1])
     x, y, _ = np.transpose(axes)
@@ -194,7 +198,7 @@ def field_angle_deg(
     pixel_deg = sheet.designer.pixel_deg
     weight = float(np.sum(field[:2] ** 2))
     total = weight + float(np.sum(pixel[:2] ** 2))
-    trials_deg = np.geomspace(pixel_deg, 8 * sheet.designer.half_field_deg, GRID)
+    trials_deg = np.geomspace(pixel_deg, 8 * half_field_deg(sheet.scene), GRID)
     if not total:
         return float(trials_deg[-1])
     found = products / squares
@@ -227,7 +231,8 @@ class Agreement(NamedTuple):
     p_values
         (3,) of the Kolmogorov-Smirnov tests of x, y and roll
     correlation, expected_correlation
-        Mean over the axes and over all pairs of frames of a sequence: measured, and of the model
+        Mean over the axes and over all pairs of frames of a sequence, or of the pair of one
+        attitude at a faster rate: measured, and of the model
     """
 
     fitted: str
@@ -245,7 +250,7 @@ def some_fields(sheet: MeasuredFrames, fields: Any) -> MeasuredFrames:
 
 
 def agreements(sheet: MeasuredFrames) -> list[Agreement]:
-    """The agreement of each half of the fields with the other, at the rates of the sequences, rest first.
+    """The agreement of each half of the fields with the other, at all rates of its model, rest first.
 
     Raises
     ------
@@ -259,8 +264,8 @@ def agreements(sheet: MeasuredFrames) -> list[Agreement]:
     return [
         agreement(of_one_unit(fitted), other, rate, name)
         for name, fitted, other in (("even", even, odd), ("odd", odd, even))
-        for rate in sheet.levels("sequence", "rate_deg_s")
-        if rate <= max(errors_by_rate(fitted))
+        for rate in errors_by_rate(fitted)
+        if np.isfinite(sequences(other, rate)[1][:, 0]).any()
     ]
 
 
@@ -274,7 +279,7 @@ def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
 def agreement(
     model: ErrorModel, sheet: MeasuredFrames, rate_deg_s: float, fitted: str
 ) -> Agreement:
-    """The agreement with the sequences at one rate."""
+    """The agreement with the frames at one rate."""
     steps, errors = sequences(sheet, rate_deg_s)
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
     drawn = turning(model, rate_deg_s) if rate_deg_s else at_rest(model)

@@ -14,10 +14,14 @@ from skysim.experiments.datasheet.cells import MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     Bounded,
+    bounded,
+    causes,
     mean_known,
     mean_square_ratio,
     rms,
+    squares_by_field,
 )
+from skysim.experiments.study import answer
 from skysim.experiments.study.execution import setups, trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -116,23 +120,28 @@ def consistency(sheet: MeasuredFrames) -> Record:
     }
 
 
-def noise_equivalent_angle(first: Floats, second: Floats) -> float:
-    """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from pairs of frames that differ in noise."""
-    return math.sqrt(mean_known((first - second) ** 2) / 2)
+def noise_equivalent_angle(apart: Floats) -> float:
+    """Standard deviation of the temporal noise, rms(a - b) / sqrt(2), from differences of frames with other noise."""
+    return math.sqrt(mean_known(apart**2) / 2)
 
 
 def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
-    return {
-        "counts": counts_of_fields(sheet, rows),
-        **{
-            f"nea_{name}": noise_equivalent_angle(first[axes], second[axes])
-            for name, axes in GROUPS.items()
-        },
-        **rms_by_group(sheet, rows),
-        "nees": mean_nees(sheet, rows),
-    }
+    found: Record = {"counts": counts_of_fields(sheet, rows), **rms_by_group(sheet, rows)}
+    found |= {"nees": mean_nees(sheet, rows), "intervals": {}}
+    for name, axes in GROUPS.items():
+        apart = first[axes] - second[axes]
+        squares = mean_known(apart**2, (0, 1)) / 2
+        found[f"nea_{name}"] = noise_equivalent_angle(apart)
+        found["intervals"][f"nea_{name}"] = root_interval(squares)
+        found["intervals"][f"rms_{name}"] = root_interval(squares_by_field(sheet, rows, axes))
+    return found
+
+
+def root_interval(squares: Floats) -> list[float]:
+    """Ends of the interval of the root of the mean of (fields,) mean squares; NaN for few fields."""
+    return np.sqrt(np.maximum(bounded(squares[np.isfinite(squares)])[1:], 0.0)).tolist()
 
 
 def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
@@ -147,13 +156,18 @@ def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
     return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
 
 
-def by_rate(sheet: MeasuredFrames) -> list[Record]:
-    """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude."""
+def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
+    """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude.
+
+    Parameters
+    ----------
+    experiment
+        One of `cells.RATES`
+    """
     rest = sheet.rows("terms", unit=0, state=0, attitude=0)
-    rates = sheet.levels("rate", "rate_deg_s")
     found = [{"rate_deg_s": 0.0, "streak_px": 0.0, **pair_row(sheet, rest)}]
-    for rate in rates:
-        rows = sheet.rows("rate", rate_deg_s=rate)
+    for rate in sheet.levels(experiment, "rate_deg_s"):
+        rows = sheet.rows(experiment, rate_deg_s=rate)
         streak_px = float(mean_known(sheet.column("streak_px", rows)))
         found.append({"rate_deg_s": rate, "streak_px": streak_px, **pair_row(sheet, rows)})
     return found
@@ -165,17 +179,6 @@ def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[Record]:
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
         for level in sorted(sheet.levels(experiment, key))
     ]
-
-
-def by_acceleration(sheet: MeasuredFrames) -> list[Record]:
-    """Error and outcomes by acceleration."""
-    found = []
-    for acceleration in sheet.levels("acceleration", "acceleration_deg_s2"):
-        rows = sheet.rows("acceleration", acceleration_deg_s2=acceleration)
-        row = {"acceleration_deg_s2": acceleration, "counts": counts_of_fields(sheet, rows)}
-        row |= {"nees": mean_nees(sheet, rows)}
-        found.append(row | rms_by_group(sheet, rows))
-    return found
 
 
 class Limit(NamedTuple):
@@ -218,6 +221,47 @@ def bracket(rows: list[Record], key: str) -> Limit:
     return Limit(share, above, below, fewest)
 
 
+UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²", "off_deg": "°"}
+
+
+def bracket_text(what: str, rows: list[Record], key: str) -> str:
+    """A sentence on a limit, for fields that are right in both of their frames."""
+    limit = bracket(rows, key)
+    unit = UNITS[key]
+    needed = metrics.trials_needed(1 - limit.share)
+    if limit.fields < needed:
+        return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
+    above = (
+        "at no level tested"
+        if math.isnan(limit.above)
+        else f"{'down' if key == 'off_deg' else 'up'} to {limit.above:g} {unit}"
+    )
+    below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
+    share = f"{100 * limit.share:g} %"
+    text = f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
+    return f"{text}{false_claims_text(rows, key)}" if "nees" in rows[0] else text
+
+
+def false_claims_text(rows: list[Record], key: str) -> str:
+    """A sentence on the levels at which the errors are not as the tracker claims; empty without any.
+
+    All levels together at CONFIDENCE, as a study judges its points (`answer.jointly`).
+    """
+    false = {}
+    for row in rows:
+        value, low, high = row["nees"]
+        nees = Summary(value, low, high, row["counts"].frames)
+        if answer.jointly(nees, len(rows)).low > answer.TRUE_NEES[1]:
+            false[row[key]] = value
+    if not false:
+        return ""
+    worst = max(false, key=lambda level: false[level])
+    return (
+        f" But the errors are not as claimed at {', '.join(f'{level:g}' for level in false)} {UNITS[key]}: greater by a"
+        f" factor of {math.sqrt(false[worst] / 3):.2g} at {worst:g} (NEES {false[worst]:.3g}, 3 if true)."
+    )
+
+
 def solution_times_s(sheet: MeasuredFrames) -> Floats:
     """(TIMED,) seconds that the tracker took for frames lost in space, from pixels to attitude, on this machine.
 
@@ -242,7 +286,48 @@ def disturbances(sheet: MeasuredFrames) -> list[Record]:
         name: sheet.rows("disturbance", disturbance=name)
         for name in sheet.levels("disturbance", "disturbance")
     }
+    return [{"disturbance": name} | outcome(sheet, rows) for name, rows in cases.items()]
+
+
+def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
+    """Counts and rms errors of some cells, each frame on its own."""
+    return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
+
+
+def end_of_life(sheet: MeasuredFrames) -> list[Record]:
+    """Outcomes, errors and the ratio of their mean squares for each damage at the end of life; all together last."""
+    found = causes(sheet, "end of life")
     return [
-        {"disturbance": name, "counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
-        for name, rows in cases.items()
+        one | outcome(sheet, sheet.rows("end of life", cause=one["cause"])) for one in found
     ]
+
+
+def exclusions(sheet: MeasuredFrames) -> list[Record]:
+    """Outcomes and errors by the angle of the boresight from bright bodies, the farthest first."""
+    angles = sorted(sheet.levels("exclusion", "off_deg"), reverse=True)
+    return [
+        {"body": body, "off_deg": off_deg}
+        | outcome(sheet, sheet.rows("exclusion", body=body, off_deg=off_deg))
+        for body in sheet.levels("exclusion", "body")
+        for off_deg in angles
+    ]
+
+
+def timing(sheet: MeasuredFrames, times_s: list[float]) -> Record:
+    """Update rate, and the age of an attitude when it is known: half the exposure, reading out, solving.
+
+    The age is that of the middle of the exposure. Rows that are read one after the other delay it.
+    """
+    scene = sheet.scene
+    row_s = getattr(scene.camera.shutter, "row_time_s", 0.0)
+    parts_s = {
+        "half_exposure_s": scene.exposure.time_s / 2,
+        "readout_s": row_s * scene.camera.height_px,
+        "solution_s": float(np.median(times_s)),
+    }
+    return {
+        "rate_hz": scene.exposure.rate_hz,
+        "greatest_rate_hz": 1 / float(np.quantile(times_s, 0.95)),
+        **parts_s,
+        "latency_s": sum(parts_s.values()),
+    }

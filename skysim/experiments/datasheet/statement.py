@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts
+from skysim.experiments.datasheet.performance import Counts, bracket_text
 from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -25,6 +25,7 @@ NAMES = {
     "temporal": "temporal noise",
     "total": "sum",
 }
+Rows = list[Record]
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
@@ -51,18 +52,22 @@ class Statement(NamedTuple):
     terms: dict[str, variance_components.TermTable]
     fields: int
     bias: list[Bounded]
-    causes: list[Record]
+    causes: Rows
     counts: Counts
-    claims: list[Record]
-    quantiles: list[Record]
+    claims: Rows
+    quantiles: Rows
     consistency: Record
-    rates: list[Record]
-    accelerations: list[Record]
-    tracked_rates: list[Record]
-    tracked_accelerations: list[Record]
-    magnitudes: list[Record]
-    disturbances: list[Record]
+    rates: Rows
+    boresight_rates: Rows
+    accelerations: Rows
+    tracked_rates: Rows
+    tracked_accelerations: Rows
+    magnitudes: Rows
+    disturbances: Rows
+    exclusions: Rows
+    end_of_life: Rows
     times_s: list[float]
+    timing: Record
 
 
 def state(sheet: MeasuredFrames) -> Statement:
@@ -77,6 +82,7 @@ def state(sheet: MeasuredFrames) -> Statement:
     except InputError as error:
         refusal = error
     found = performance.counts(sheet, sheet.rows("sky"))
+    times_s = performance.solution_times_s(sheet).tolist()
     return Statement(
         sheet,
         refusal,
@@ -88,92 +94,18 @@ def state(sheet: MeasuredFrames) -> Statement:
         performance.claims(found),
         performance.quantiles(sheet),
         performance.consistency(sheet),
-        performance.by_rate(sheet),
-        performance.by_acceleration(sheet),
+        performance.by_rate(sheet, "rate"),
+        performance.by_rate(sheet, "boresight"),
+        performance.by_level(sheet, "acceleration", "acceleration_deg_s2"),
         performance.by_level(sheet, "tracked rate_deg_s", "rate_deg_s"),
         performance.by_level(sheet, "tracked acceleration_deg_s2", "acceleration_deg_s2"),
         performance.by_level(sheet, "magnitude", "limit_mag"),
         performance.disturbances(sheet),
-        performance.solution_times_s(sheet).tolist(),
+        performance.exclusions(sheet),
+        performance.end_of_life(sheet),
+        times_s,
+        performance.timing(sheet, times_s),
     )
-
-
-def failed_checks(statement: Statement) -> list[str]:
-    """Sentences on what the sheet's own checks contradict: missing terms, a sum unlike the total, a negative term."""
-    found = []
-    if statement.refusal:
-        found.append(f"The error terms are not stated. Fields {statement.refusal.fault}.")
-    for name, table in statement.terms.items():
-        if variance_components.sign(table.ratio, 1.0):
-            found.append(
-                f"The terms {name} the boresight do not add up: their sum over the mean square of other frames is"
-                f" {bounded(table.ratio)}, which does not hold 1."
-            )
-        found += [
-            f"The variance of {NAMES[term]} {name} the boresight is negative."
-            for term, sign in table.signs.items()
-            if sign < 0
-        ]
-    return found
-
-
-# As numbers.
-
-
-def as_numbers(value: Any) -> Any:
-    """A value for JSON: named tuples as mappings, numbers that are not finite as None."""
-    if isinstance(value, Counts):
-        shares = {kind: value.share(kind)._asdict() for kind in ("right", "refused", "false")}
-        return value._asdict() | {"shares": shares}
-    if hasattr(value, "_asdict"):
-        return as_numbers(value._asdict())
-    if isinstance(value, dict):
-        return {key: as_numbers(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [as_numbers(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def numbers(statement: Statement) -> Record:
-    """The statement for JSON; squares in arcsec^2 of one axis.
-
-    Numbers outside `rates`, `accelerations` and those of tracking mode hold at `rate_deg_s`.
-    """
-    sheet = statement.sheet
-    head = {
-        "scene": sheet.scene.name,
-        "title": sheet.scene.title,
-        "overrides": dict(sheet.overrides),
-        "failed_checks": failed_checks(statement),
-        "seed": sheet.scene.seed,
-        "rate_deg_s": 0.0,
-        "fields": sheet.size.fields,
-        "units": sheet.designer.units,
-        "states_c": sheet.designer.temperatures_c,
-        "frames": int(sheet.columns["trial"].size),
-        "fields_solved": statement.fields,
-        "limits": limits(statement),
-    }
-    parts = statement._asdict()
-    del parts["sheet"], parts["refusal"], parts["fields"]
-    return head | as_numbers(parts)
-
-
-def limits(statement: Statement) -> Record:
-    """The limits of acquisition and of tracking in rate and acceleration."""
-    measured = {
-        "acquisition": (statement.rates, statement.accelerations),
-        "tracking": (statement.tracked_rates, statement.tracked_accelerations),
-    }
-    found = {
-        mode: {
-            key: performance.bracket(rows, key)
-            for key, rows in zip(UNITS, tables, strict=True)
-        }
-        for mode, tables in measured.items()
-        if tables[0]
-    }
-    return as_numbers(found)
 
 
 # As sections.
@@ -210,17 +142,22 @@ def arcsec(value: float) -> str:
 
 def sections(statement: Statement) -> list[StatementSection]:
     """All sections, in order."""
-    made = [] if statement.refusal else [term_section(statement)]
-    made += [
-        lowering_section(statement),
-        probability_section(statement),
-        quantile_section(statement),
-        rate_section(statement),
-        acceleration_section(statement),
-    ]
-    made += [tracking_section(statement)] if statement.tracked_rates else []
-    made += [magnitude_section(statement)] if statement.magnitudes else []
-    return [*made, disturbance_section(statement)]
+    stated = {
+        term_section: not statement.refusal,
+        lowering_section: True,
+        probability_section: True,
+        quantile_section: True,
+        timing_section: True,
+        rate_section: True,
+        boresight_section: True,
+        acceleration_section: True,
+        tracking_section: statement.tracked_rates,
+        magnitude_section: statement.magnitudes,
+        disturbance_section: True,
+        exclusion_section: statement.exclusions,
+        life_section: statement.end_of_life,
+    }
+    return [section(statement) for section, holds in stated.items() if holds]
 
 
 def term_section(statement: Statement) -> StatementSection:
@@ -292,16 +229,7 @@ def lowering_section(statement: Statement) -> StatementSection:
         "Each change alone, at rest, on the same fields, units and noise as before: what is left of the error's mean"
         " square, in percent, with 95 % intervals. Below 100 the change lowers the error."
     )
-    rows = [
-        [
-            one["cause"],
-            *(
-                bounded(Bounded(*(100 * part for part in one[name])))
-                for name in variance_components.GROUPS
-            ),
-        ]
-        for one in statement.causes
-    ]
+    rows = [[one["cause"], *ratio_cells(one)] for one in statement.causes]
     return StatementSection(
         "What dominates, and what would lower it",
         texts,
@@ -309,6 +237,14 @@ def lowering_section(statement: Statement) -> StatementSection:
         rows,
         ["causes"],
     )
+
+
+def ratio_cells(row: Record) -> list[str]:
+    """Cells of the ratios of mean squares, in percent."""
+    return [
+        bounded(Bounded(*(100 * part for part in row[name])))
+        for name in variance_components.GROUPS
+    ]
 
 
 def probability_section(statement: Statement) -> StatementSection:
@@ -395,16 +331,18 @@ def quantile_text(found: Summary) -> str:
     """A quantile with its interval, or the number of further frames that it needs to have one."""
     if math.isnan(found.low):
         return f"not established: {found.needs} more frames needed"
-    return f"{found.value:.3g} ({found.low:.3g} to {found.high:.3g})"
+    return bounded(found)
 
 
 def outcome_cells(row: Record) -> list[str]:
     """Cells of a row's outcomes."""
-    return [
-        percent(row["counts"].share("right")),
-        str(row["counts"].refused),
-        str(row["counts"].false),
-    ]
+    counts = row["counts"]
+    return [percent(counts.share("right")), str(counts.refused), str(counts.false)]
+
+
+def outcome_row(row: Record) -> list[str]:
+    """Cells of a row's outcomes, and of the rms errors of its right attitudes."""
+    return [*outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
 
 
 def pair_cells(row: Record) -> list[str]:
@@ -418,25 +356,9 @@ def pair_cells(row: Record) -> list[str]:
 
 
 OUTCOME_HEADERS = ["right %", "refused", "false"]
-FIELD_HEADERS = ["both right %", "one refused", "one false"]
+RIGHT_HEADERS = ["rms of the right: across ″", "about ″"]
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
-PAIR_HEADERS += FIELD_HEADERS
-UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²"}
-
-
-def bracket_text(what: str, rows: list[Record], key: str) -> str:
-    """A sentence on a limit, for fields that are right in both of their frames."""
-    limit = performance.bracket(rows, key)
-    unit = UNITS[key]
-    needed = metrics.trials_needed(1 - limit.share)
-    if limit.fields < needed:
-        return f"Limit of {what}: not established: {limit.fields} attitudes, {needed} needed."
-    above = (
-        "at no level tested" if math.isnan(limit.above) else f"up to {limit.above:g} {unit}"
-    )
-    below = "at none tested" if math.isinf(limit.below) else f"from {limit.below:g} {unit} on"
-    share = f"{100 * limit.share:g} %"
-    return f"Limit of {what}: {share} of right attitudes are shown {above}; fewer than {share} are shown {below}."
+PAIR_HEADERS += ["both right %", "one refused", "one false"]
 
 
 def rate_section(statement: Statement) -> StatementSection:
@@ -457,12 +379,110 @@ def rate_section(statement: Statement) -> StatementSection:
         f" {statement.rates[-1]['rate_deg_s']:g} °/s.",
         bracket_text("acquisition in rate", statement.rates, "rate_deg_s"),
     ]
-    rows = [
-        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.2g}", *pair_cells(row)]
-        for row in statement.rates
+    return StatementSection(
+        "By rate", texts, RATE_HEADERS, rate_rows(statement.rates), ["rates"]
+    )
+
+
+RATE_HEADERS = ["rate °/s", "streak px", *PAIR_HEADERS]
+
+
+def rate_rows(rows: list[Record]) -> list[list[str]]:
+    """The cells of rows by rate."""
+    return [
+        [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.3g}", *pair_cells(row)]
+        for row in rows
     ]
-    headers = ["rate °/s", "streak px", *PAIR_HEADERS]
-    return StatementSection("By rate", texts, headers, rows, ["rates"])
+
+
+def boresight_section(statement: Statement) -> StatementSection:
+    """Noise-equivalent angle, error and acquisition by the rate about the boresight."""
+    texts = [
+        "As above, for a constant rate about the boresight: streaks are longest at the edge of the field, none in its"
+        " center. The streak is the mean over the field.",
+        bracket_text(
+            "acquisition in rate about the boresight", statement.boresight_rates, "rate_deg_s"
+        ),
+    ]
+    rows = rate_rows(statement.boresight_rates)
+    return StatementSection(
+        "By rate about the boresight", texts, RATE_HEADERS, rows, ["boresight"]
+    )
+
+
+def timing_section(statement: Statement) -> StatementSection:
+    """Update rate and latency."""
+    found = statement.timing
+    texts = [
+        "The update rate is that of the scene's frames. The latency is the age of an attitude when it is known, from"
+        " mid-exposure on: its solution is lost in space, on the machine that wrote this.",
+    ]
+    if found["rate_hz"] > found["greatest_rate_hz"]:
+        texts.append(
+            "Not every frame can be solved before the next one on this machine: the solution of one in twenty takes"
+            " longer than a period."
+        )
+    milliseconds = {
+        "half of the exposure": "half_exposure_s",
+        "read-out of the rows": "readout_s",
+        "solution (median)": "solution_s",
+        "latency": "latency_s",
+    }
+    rows = [
+        ["update rate, Hz", f"{found['rate_hz']:g}"],
+        ["Hz at which 95 % of the solutions are in time", f"{found['greatest_rate_hz']:.3g}"],
+    ]
+    rows += [
+        [f"{text}, ms", f"{1000 * found[key]:.3g}"] for text, key in milliseconds.items()
+    ]
+    return StatementSection("Update rate and latency", texts, ["what", "value"], rows)
+
+
+def exclusion_section(statement: Statement) -> StatementSection:
+    """Outcomes and errors beside the Sun and the Moon."""
+    texts = [
+        "Lost in space at rest with the boresight at an angle from the center of a body, whose light the scene's"
+        f" baffle lets through (`camera.baffle`). One frame in each field ({ONE_UNIT});"
+        " the other bodies shine too. For the Earth's limb and the"
+        " share of an orbit in which all angles are kept see `skysim availability`.",
+    ]
+    for body in ("sun", "moon"):
+        beside = [row for row in statement.exclusions if row["body"] == body]
+        texts.append(
+            bracket_text(f"the angle from the {body.capitalize()}", beside, "off_deg")
+        )
+    rows = [
+        [row["body"].capitalize(), f"{row['off_deg']:g}", *outcome_row(row)]
+        for row in statement.exclusions
+    ]
+    headers = ["body", "angle °", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    return StatementSection("Exclusion angles", texts, headers, rows, ["exclusions"])
+
+
+def life_section(statement: Statement) -> StatementSection:
+    """Outcomes and errors of the aged camera."""
+    life = statement.sheet.designer.end_of_life
+    assert life is not None
+    keys = ", ".join(
+        f"{name} {value:g}{'' if name in life.model_fields_set else ' (assumed)'}"
+        for name, value in life
+        if value is not None
+    )
+    texts = [
+        f"The camera after its dose, at rest, on the same fields, units and noise as before: {keys}.",
+        ""
+        if life.dark_e_s_krad is not None
+        else "Dark current: protons of 60 MeV, displacement damage by Srour & Lo (2000, IEEE Trans. Nucl. Sci. 47,"
+        " 2451) in the depleted silicon. Ionization at interfaces depends on the process and is not in it: give"
+        " dark_e_s_krad.",
+        "What is left of the mean square is in percent of that of the new camera, with 95 % intervals.",
+    ]
+    rows = [
+        [row["cause"], *outcome_row(row), *ratio_cells(row)] for row in statement.end_of_life
+    ]
+    headers = ["damage", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    headers += ["mean square across %", "mean square about %"]
+    return StatementSection("At the end of life", texts, headers, rows)
 
 
 def acceleration_section(statement: Statement) -> StatementSection:
@@ -476,22 +496,10 @@ def acceleration_section(statement: Statement) -> StatementSection:
         ),
     ]
     rows = [
-        [
-            f"{row['acceleration_deg_s2']:g}",
-            arcsec(row["rms_across"]),
-            arcsec(row["rms_about"]),
-            bounded(row["nees"]),
-            *outcome_cells(row),
-        ]
+        [f"{row['acceleration_deg_s2']:g}", *pair_cells(row)]
         for row in statement.accelerations
     ]
-    headers = [
-        "acceleration °/s²",
-        "rms across ″",
-        "rms about ″",
-        "NEES",
-        *FIELD_HEADERS,
-    ]
+    headers = ["acceleration °/s²", *PAIR_HEADERS]
     return StatementSection("By acceleration", texts, headers, rows)
 
 
@@ -550,18 +558,6 @@ def disturbance_section(statement: Statement) -> StatementSection:
         " alone, which may be those of the fields with the brightest stars. False stars are added to centroids, not to"
         " frames."
     ]
-    rows = [
-        [
-            row["disturbance"],
-            *outcome_cells(row),
-            arcsec(row["rms_across"]),
-            arcsec(row["rms_about"]),
-        ]
-        for row in statement.disturbances
-    ]
-    return StatementSection(
-        "Under disturbances",
-        texts,
-        ["disturbance", *OUTCOME_HEADERS, "rms of the right: across ″", "about ″"],
-        rows,
-    )
+    rows = [[row["disturbance"], *outcome_row(row)] for row in statement.disturbances]
+    headers = ["disturbance", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    return StatementSection("Under disturbances", texts, headers, rows)

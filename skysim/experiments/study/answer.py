@@ -35,6 +35,7 @@ from skysim.results.requirements import Judgment, percent
 
 # Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
 TRUE_NEES = (2.5, 3.5)
+CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
@@ -51,7 +52,6 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
     found = [(jointly(one, len(known)), line) for one, line in known]
     found = [(one, line) for one, line in found if np.isfinite(one.low)]
     low, high = TRUE_NEES
-    question = "Are the claimed errors true?"
     means = [one.value for one, _ in known]
     shared = survey_share > metrics.ONE_SURVEY
     if shared and max(means) < metrics.OVERCONFIDENT_NEES:
@@ -59,14 +59,14 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
             f"{min(means):.3g} to {max(means):.3g}" if len(means) > 1 else f"{means[0]:.3g}"
         )
         return [
-            f"{question} One survey cannot decide it: {100 * survey_share:.0f} % of the expected variance is of the"
+            f"{CLAIMED} One survey cannot decide it: {100 * survey_share:.0f} % of the expected variance is of the"
             f" survey that all trials share (NEES {spread}; over many surveys 3 if true). `hardware:"
             " [tracker.survey.seed]` draws one in every replicate; with tracker.map it takes maps of many surveys."
         ]
     if not found:
         most = max(one.trials for one, _ in known)
         return [
-            f"{question} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
+            f"{CLAIMED} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
         ]
     together = f", 95 % for all {len(known)} points together" if len(known) > 1 else ""
     false = [(one, line) for one, line in found if one.low > high or one.high < low]
@@ -78,13 +78,13 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
             else everywhere(len(found))
         )
         if all(one.low >= low and one.high <= high for one, _ in found):
-            return [f"{question} Yes: NEES is {low:g} to {high:g}{at}{together}."]
+            return [f"{CLAIMED} Yes: NEES is {low:g} to {high:g}{at}{together}."]
         widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
         named = f" at {place(line)}{together}" if len(known) > 1 else ""
         between = f"{widest.low:.3g} to {widest.high:.3g}"
         factor = noticed(widest, len(known))
         return [
-            f"{question} Nothing says otherwise{at if few else ''}, but NEES is known to {between} only{named}."
+            f"{CLAIMED} Nothing says otherwise{at if few else ''}, but NEES is known to {between} only{named}."
             f" Errors too small by a factor of {factor:.2g} would be noticed with a probability of {100 * POWER:g} %."
         ]
     worst, line = max(false, key=lambda pair: abs(math.log(max(pair[0].value, 1e-9) / 3)))
@@ -97,7 +97,7 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
     cause = ", wrong attitudes included" if wrong > 0 else ""
     interval = f"{worst.low:.3g} to {worst.high:.3g}{together}"
     return [
-        f"{question} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
+        f"{CLAIMED} No: too {size} by a factor of {factor:.2g}{at} (NEES {worst.value:.3g}, {interval}{cause}; 3 if"
         f" true){count}."
     ]
 
@@ -234,10 +234,16 @@ def answered(lines: PointRows) -> list[PointRow]:
     ]
 
 
-def verdict(study: Study, lines: PointRows, judged: Sequence[Sequence[Judgment]] = ()) -> str:
-    """The answer of the study in three or four short sentences; "" if no trial has an answer.
+def verdict(
+    study: Study,
+    lines: PointRows,
+    judged: Sequence[Sequence[Judgment]] = (),
+    survey_share: float = 0.0,
+) -> str:
+    """The answer of the study in three to five short sentences; "" if no trial has an answer.
 
     1. Its requirements and thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
+    4. Whether the claimed errors are false.
     """
     done = answered(lines)
     if not done:
@@ -261,6 +267,11 @@ def verdict(study: Study, lines: PointRows, judged: Sequence[Sequence[Judgment]]
             place,
         ),
     ]
+    sentences += [
+        one
+        for one in claimed_errors(done, place, survey_share)
+        if one.startswith(f"{CLAIMED} No:")
+    ]
     return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
 
 
@@ -269,7 +280,14 @@ def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
     if not share.value > 0:
-        return f"{never} (in {sum(line.responses[name].trials for line in lines):,})."
+        trials = sum(line.responses[name].trials for line in lines)
+        refused = sum(
+            round(line.responses["refused"].value * line.responses["refused"].trials)
+            for line in lines
+        )
+        # A frame without an attitude has no wrong one.
+        count = f"{trials - refused:,} of {trials:,} frames" if refused else f"{trials:,}"
+        return f"{never} (in {count})."
     if len(lines) == 1:
         return f"{percent(share.value)} {text} ({interval(share)})."
     return f"Up to {percent(share.value)} {text}, most at {place(worst)}."

@@ -274,6 +274,10 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     if sampled != (design.points is not None):
         allowed = "a number of points" if sampled else "none (the levels define the points)"
         raise InputError("design.points", f"{design.points} for {design.kind}", allowed)
+    if sampled and not factors:
+        raise InputError(
+            "factors", f"missing: {design.kind} draws their values", "one or more"
+        )
     if (
         design.kind in ("sobol", "saltelli")
         and design.points is not None

@@ -427,9 +427,9 @@ class Study(ConfigModel):
     seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
-    factors: Annotated[
-        dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor], Field(min_length=1)
-    ]
+    factors: dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor] = Field(
+        default_factory=dict
+    )
     design: Design = Design()
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()

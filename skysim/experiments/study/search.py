@@ -179,6 +179,8 @@ def check(study: Study) -> None:
     config = study.optimize
     if config is None:
         return
+    if not study.factors:
+        raise InputError("factors", "missing: the search chooses their levels", "one or more")
     for n, objective in enumerate(config.objectives):
         check_response(objective.response, f"optimize.objectives.{n}.response")
     first, *others = (one.response for one in config.objectives)

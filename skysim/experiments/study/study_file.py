@@ -393,7 +393,12 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
 def each_level(
     factors: Mapping[str, Factor],
 ) -> Iterator[tuple[str, Value, Settings, Settings]]:
-    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings."""
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings.
+
+    Without factors the one point.
+    """
+    if not factors:
+        yield "", "", {}, {}
     middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
     for name, factor in factors.items():
         others = make_point(

@@ -277,7 +277,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     elif found.between:
         text = f"{crosses} between {name} = {found.between[0]:.4g} and {found.between[1]:.4g}{unit}"
     else:
-        text = f"{crosses} at {name} = {found.value:.4g}{unit}"
+        text = f"{crosses} at {name} = {found.value:.3g}{unit}"
     return f"{text} ({interval_text(found, name, unit)})."
 
 
@@ -301,8 +301,18 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
     return f"{100 * metrics.CONFIDENCE:g} %: {span}"
 
 
+def certain_text(found: Crossing) -> str:
+    """The interval of a crossing in brackets; an open end is named."""
+    low, high = found.low, found.high
+    if math.isfinite(low) and math.isfinite(high):
+        return f" ({low:.4g} to {high:.4g})"
+    if math.isfinite(low):
+        return f" (above {low:.4g})"
+    return f" (below {high:.4g})" if math.isfinite(high) else " (no level is certain)"
+
+
 def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
-    """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
+    """The threshold in one sentence with its intervals, all levels of `by` together; "" without trials."""
     axis = table.axis(study, lines, threshold.along)
     unit = table.unit_of(axis)
     found = [
@@ -316,7 +326,7 @@ def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
     at = [
         f"{one.between[0]:.4g} to {one.between[1]:.4g}{unit}{label}"
         if one.between
-        else f"{one.value:.4g}{unit}{label}"
+        else f"{one.value:.3g}{unit}{label}{certain_text(one)}"
         for label, one in found
         if math.isfinite(one.value)
     ]

@@ -438,3 +438,35 @@ def test_tracks_of_particles_are_neither_noise_nor_hot_pixels() -> None:
     assert 70 <= (~usable).sum() <= 76
     assert hit.moments(usable).variance_dn2 == pytest.approx(9 + 20 + 1 / 12, rel=0.04)
     assert hit.moments(np.ones(shape, bool)).variance_dn2 > 2 * 29
+
+
+def test_the_scatter_of_equal_pixels_in_whole_numbers_is_that_of_their_noise() -> None:
+    """Means of sixteen rounded numbers of 0.975: a step of the numbers is a tenth of the scatter of their mean.
+
+    The variance beyond the noise is 0 within its error, over twenty chips; a scatter of 5 % of the noise's is found.
+    """
+    rng = np.random.default_rng(4)
+    pulls = []
+    for own in [0.0] * 20 + [0.05**0.5]:
+        noise = RateNoise((0.975**2 + 1 / 12) / 16, 0.0)
+        each = own * np.sqrt(noise.reading) * rng.standard_normal(20_000)
+        frames = np.rint(7.3 + each + 0.975 * rng.standard_normal((16, 20_000)))
+        variance, error = fixed_pattern.own_variance(frames.mean(axis=0), noise)
+        pulls.append(variance / error)
+    assert abs(np.mean(pulls[:-1])) < 4 / np.sqrt(20)
+    assert 0.6 < np.std(pulls[:-1]) < 1.5
+    assert pulls[-1] == pytest.approx(0.05 / (1.1 * np.sqrt(2 / 20_000)), abs=3)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "text"),
+    [
+        (6.9997953, 7.000022, "6.9998 to 7.00002"),
+        (31.9998196, 32.0004566, "31.99982 to 32.00046"),
+        (0.2995905, 0.3004496, "0.29959 to 0.30045"),
+        (0.0, 3.518e-6, "0 to 3.518e-06"),
+        (5.0, 5.0, "5 to 5"),
+    ],
+)
+def test_an_interval_shows_its_width(low: float, high: float, text: str) -> None:
+    assert photon_transfer.interval_text(low, high) == text

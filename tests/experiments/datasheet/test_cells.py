@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
+from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.datasheet.cells import (
     FULL,
     MIN_FIELDS,
@@ -155,3 +157,75 @@ def test_a_scene_without_attitudes_of_single_frames_is_refused(scene, overrides,
         check_scene(load(scene, overrides))
     assert "allowed" in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_turn_about_the_boresight_smears_the_edge_as_far_as_the_streak_says():
+    """A star at half of the field's smaller side moves by radius times angle."""
+    scene = load("shefex2", {})
+    designer = Designer(scene, QUICK)
+    radius_px = min(scene.camera.width_px, scene.camera.height_px) / 2
+    for streak, rate in zip(
+        (2.0, 32.0), designer.rates_deg_s((2.0, 32.0), "boresight"), strict=True
+    ):
+        assert radius_px * np.radians(rate) * scene.exposure.time_s == pytest.approx(
+            streak, rel=0.05
+        )
+    cells = [one for one in designer.cells() if one.experiment == "boresight"]
+    assert all(one.settings["trial.rate_axis"] == "boresight" for one in cells)
+
+
+def test_displacement_damage_follows_the_universal_factor():
+    """1.9e5 carriers a second in a cm^3 for each MeV/g, and 2.8e7 MeV/g a krad, in a pixel of 10 x 10 x 2 um at 300 K.
+
+    It halves with each doubling step that the chip is colder.
+    """
+    camera = load("shefex2", {}).camera
+    chip = camera.detector.model_copy(
+        update={"dark_temperature_c": 26.85, "dark_doubling_c": 7.0}
+    )
+    warm = camera.model_copy(update={"pixel_m": 10e-6, "detector": chip})
+    expected = 3 * 1.9e5 * 2.8e7 * (1e-3 * 1e-3 * 2e-4)
+    life = scene_changes.parse_end_of_life("3")
+    assert scene_changes.added_dark_e_s(warm, life) == pytest.approx(expected)
+    chip = chip.model_copy(update={"dark_temperature_c": 26.85 - 14.0})
+    cold = warm.model_copy(update={"detector": chip})
+    assert scene_changes.added_dark_e_s(cold, life) == pytest.approx(expected / 4)
+    given = scene_changes.parse_end_of_life("{dose_krad: 3, dark_e_s_krad: 40}")
+    assert scene_changes.added_dark_e_s(cold, given) == pytest.approx(120)
+
+
+def test_the_glass_darkens_by_the_same_share_in_each_krad():
+    scene = load("shefex2", {"camera.transmission": "0.8"})
+    life = scene_changes.parse_end_of_life("{dose_krad: 10, transmission_krad: 0.05}")
+    together = scene_changes.aged(scene.camera, life)[scene_changes.ALL]
+    assert together["camera.transmission"] == pytest.approx(0.8 * 0.95**10)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("-1", "--end-of-life: dose_krad: .* allowed: greater than 0"),
+        ("{dose_krad: 1, dose: 2}", "--end-of-life: dose: unknown key"),
+        ("{dark_e_s_krad: 2}", "--end-of-life: dose_krad: missing"),
+    ],
+)
+def test_an_end_of_life_that_means_nothing_is_refused(text, message):
+    with pytest.raises(InputError, match=message) as refused:
+        scene_changes.parse_end_of_life(text)
+    assert "\n" not in str(refused.value)
+
+
+def test_exclusion_angles_need_a_baffle():
+    baffle = {
+        "camera.baffle": "{angle_deg: [10, 90], pst: [1e-3, 1e-6]}",
+        "light.bodies": "{}",
+    }
+    for overrides, bodies in (({}, ()), (baffle, ("sun", "moon"))):
+        scene = load("shefex2", overrides)
+        cells = [
+            one for one in Designer(scene, QUICK).cells() if one.experiment == "exclusion"
+        ]
+        assert {one.levels["body"] for one in cells} == set(bodies)
+        for one in cells:
+            off_deg = one.levels["off_deg"]
+            assert one.settings["trial.near"]["off_deg"] == [off_deg, off_deg]

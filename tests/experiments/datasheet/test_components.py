@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skysim.experiments.datasheet.statement import failed_checks
+from skysim.experiments.datasheet.datasheet_report import failed_checks
 from skysim.experiments.datasheet.variance_components import (
     Components,
     bounded,

@@ -293,11 +293,15 @@ def test_a_model_agrees_with_new_fields_of_its_own_errors_and_not_with_others(
         model_fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0]
     )
     found = model_fit.agreements(sheet)
-    assert [one.fitted for one in found] == ["even"] * 5 + ["odd"] * 5
+    assert [one.fitted for one in found] == ["even"] * 8 + ["odd"] * 8
+    # All rates that the model accepts, those of pairs of one attitude too.
+    assert [one.rate_deg_s for one in found[:8]] == model_fit.constants(sheet)["rates_deg_s"]
     assert np.mean([p > 0.05 for one in found for p in one.p_values]) >= 0.7
-    assert [one.correlation for one in found] == pytest.approx(
-        [one.expected_correlation for one in found], abs=0.06
-    )
+    # A sequence has fifteen pairs of frames, a faster rate one in each of 150 fields: 0.06 rms.
+    for one in found:
+        assert one.correlation == pytest.approx(
+            one.expected_correlation, abs=0.1 if one.rate_deg_s <= 2.3 else 0.2
+        )
     constants = model_fit.constants(sheet)
     assert constants["along"][:5] == pytest.approx(truth.along, abs=0.4)
     noisy = truth.constants | {"noise": [[2.0, 2.0, 20.0]] * 5}

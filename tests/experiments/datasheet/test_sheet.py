@@ -13,7 +13,9 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.experiments.datasheet import cells, datasheet_report, model_fit, performance
 from skysim.experiments.datasheet.cells import Designer, Size
-from skysim.experiments.datasheet.statement import Statement, numbers, sections, state
+from skysim.experiments.datasheet.datasheet_report import numbers
+from skysim.experiments.datasheet.scene_changes import parse_end_of_life
+from skysim.experiments.datasheet.statement import Statement, sections, state
 from skysim.experiments.datasheet.variance_components import contributions
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.plan import TrialSpec
@@ -28,6 +30,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few levels of every experiment."""
     monkeypatch.setattr(cells, "QUICK", SMALL)
     monkeypatch.setattr(cells, "STREAKS_PX", (1.0,))
+    monkeypatch.setattr(cells, "BORESIGHT_PX", (2.0,))
+    monkeypatch.setattr(cells, "MOST_FAIL", 2.0)
     monkeypatch.setattr(cells, "SEQUENCE", (0, 1))
     monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
     monkeypatch.setattr(cells, "FAINTER", (-1.0,))
@@ -59,7 +63,7 @@ def stop_after(batches: int) -> Callable[[int], Any]:
 
 def untimed(statement: Statement) -> str:
     """All numbers except the times of this machine."""
-    return json.dumps(numbers(statement._replace(times_s=[])))
+    return json.dumps(numbers(statement._replace(times_s=[], timing={})))
 
 
 def test_a_stopped_datasheet_resumes_with_the_same_result(
@@ -75,14 +79,16 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
     assert untimed(again) == untimed(whole)
-    report = datasheet_report.datasheet_report(whole, True)
+    report = datasheet_report.datasheet_report(whole, ["--quick"])
     paths = datasheet_report.write_all(tmp_path / "whole", whole, report)
     assert json.loads(paths["json"].read_text())["fields"] == 12
     text = paths["report"].read_text(encoding="utf-8")
     assert all(section.title in text for section in sections(whole))
-    assert text.count("<img") == 5
-    assert report.markdown().count("\n## ") == len(sections(whole))
-    assert len(list((tmp_path / "whole").glob("*.png"))) == 5
+    assert text.count("<img") == 6
+    # And what is left out, and the second page.
+    assert report.markdown().count("\n## ") == len(sections(whole)) + 2
+    assert "End of life: no dose was given" in text
+    assert len(list((tmp_path / "whole").glob("*.png"))) == 6
     with pytest.raises(InputError, match="contains another study"):
         cells.measure(
             "shefex2",
@@ -94,6 +100,59 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
         )
 
 
+def test_rates_double_until_most_fields_fail_and_are_kept(
+    small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To streaks of 4 px, the side of a field of that size; a second call finds the rates that the first one added.
+
+    Nothing is drawn again: the same rows as before.
+    """
+    monkeypatch.setattr(cells, "MOST_FAIL", 0.5)
+    monkeypatch.setattr(cells, "side_px", lambda scene: 4)
+    first = measured(tmp_path)
+    rates = first.levels("rate", "rate_deg_s")
+    assert [rate / rates[0] for rate in rates] == [1, 2, 4]
+    again = measured(tmp_path)
+    assert again.levels("rate", "rate_deg_s") == rates
+    assert again.columns["x_arcsec"].tobytes() == first.columns["x_arcsec"].tobytes()
+    more = measured(tmp_path, fields=13)
+    assert more.levels("rate", "rate_deg_s")[:3] == rates
+    assert more.columns["x_arcsec"][:, :12].tobytes() == first.columns["x_arcsec"].tobytes()
+    # Fewer than half of them right at the last rate: no faster one.
+    last = first.rows("rate", rate_deg_s=rates[-1])
+    monkeypatch.setattr(cells, "side_px", lambda scene: 1000)
+    assert "rate" in first.solved_at_all_rates()
+    first.columns["solved"][last[0], :7] = 0
+    assert "rate" not in first.solved_at_all_rates()
+
+
+def test_chosen_rates_and_the_end_of_life_are_measured(small: None, tmp_path: Path) -> None:
+    """Much more dark current leaves more of the mean square; a dose of nothing leaves it as it was."""
+    life = parse_end_of_life(
+        "{dose_krad: 10, dark_e_s_krad: 2000, hot_pixels_krad: 0, transmission_krad: 0}"
+    )
+    sheet = cells.measure(
+        "shefex2",
+        load("shefex2", {}),
+        {},
+        tmp_path,
+        quick=True,
+        rates_deg_s=[0.5, 0, 0.2],
+        end_of_life=life,
+        workers=1,
+    )
+    assert sheet.levels("rate", "rate_deg_s") == [0.2, 0.5]
+    assert sheet.levels("boresight", "rate_deg_s") == [0.2, 0.5]
+    found = {row["cause"].split()[0]: row for row in performance.end_of_life(sheet)}
+    dark, hot, glass, together = (
+        found[name] for name in ("dark", "hot", "transmission", "all")
+    )
+    assert dark["across"].value > 1.2
+    for unchanged in (hot, glass):
+        assert unchanged["across"].value == pytest.approx(1)
+    assert together["across"].value == pytest.approx(dark["across"].value)
+
+
 @pytest.mark.parametrize("solved", [0, 6])
 def test_what_was_measured_is_written_without_the_terms(
     small: None, tmp_path: Path, solved: int
@@ -103,7 +162,7 @@ def test_what_was_measured_is_written_without_the_terms(
     sheet.columns["solved"][:, solved:] = 0
     statement = state(sheet)
     assert statement.refusal
-    report = datasheet_report.datasheet_report(statement, True)
+    report = datasheet_report.datasheet_report(statement, ["--quick"])
     text = report.markdown()
     missing = f"The error terms are not stated. Fields 12: {solved} of them are solved in all"
     assert text.index(missing) < text.index("of frames lost in space have a right attitude")

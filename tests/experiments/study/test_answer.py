@@ -581,3 +581,20 @@ def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
     assert "Is it ambiguous anywhere?" in text
     # The worst trials of a map of two attitudes.
     assert text.count("<code>skysim study replay again ") == 2
+
+
+def test_frames_without_an_attitude_have_no_wrong_one() -> None:
+    """Forty of the hundred frames are refused: none of sixty is wrong."""
+    lines = [line(0, 500, 50, refused=40), line(1, 900, 50)]
+    text = answer.verdict(study(), lines)
+    assert "No attitude is wrong (in 60 of 100 frames)." in text
+    assert "(in 100)" in answer.verdict(study(), [line(0, 500, 50), line(1, 900, 50)])
+
+
+@pytest.mark.parametrize(("nees", "false"), [(12.0, True), (3.0, False)])
+def test_the_last_line_says_that_claimed_errors_are_false(nees: float, false: bool) -> None:
+    lines = [line(0, 500, 400)]
+    known = {"nees": Summary(nees, 0.9 * nees, 1.1 * nees, 400)}
+    lines = [one._replace(responses=one.responses | known) for one in lines]
+    said_so = "Are the claimed errors true? No: too small by a factor of 2 (NEES 12"
+    assert (said_so in answer.verdict(study(), lines)) == false

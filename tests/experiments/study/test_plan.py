@@ -293,3 +293,18 @@ def test_an_axis_is_a_name_or_a_vector(axis, complaint, tmp_path):
     )
     with pytest.raises(InputError, match=complaint):
         study_file.load(written(tmp_path, text))
+
+
+def test_a_study_without_factors_has_one_point(tmp_path):
+    lines = [one for one in STUDY.splitlines() if not one.startswith(("factors", "  "))]
+    one = study_file.load(written(tmp_path, "\n".join(lines)))
+    assert (len(one.points), one.trials) == (1, 4)
+    assert one.points[0] == ({}, {})
+    sampled = "\n".join([*lines, "design: {kind: lhs, points: 4}"])
+    with pytest.raises(InputError, match="factors: missing: lhs draws their values"):
+        study_file.load(written(tmp_path, sampled))
+    # What it sets is checked as that of a study with factors is.
+    with pytest.raises(InputError, match=r"exposure\.frames"):
+        study_file.load(
+            written(tmp_path, "\n".join(lines).replace("frames: 1", "frames: -1"))
+        )

@@ -269,3 +269,12 @@ def test_only_a_proportion_has_a_threshold() -> None:
         "along": "x",
         "by": None,
     }
+
+
+def test_the_short_answer_has_the_interval_and_no_more_digits_than_it_knows() -> None:
+    study = Study.model_validate(STUDY)
+    curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
+    said = thresholds.brief(study.thresholds[0], study, lines_of(study, curves, 400))
+    assert "at rate = 2.5 deg/s (slow) (2 to 3)" in said
+    few = thresholds.brief(study.thresholds[0], study, lines_of(study, curves, 50))
+    assert "(below 4)" in few

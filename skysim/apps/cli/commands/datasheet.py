@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -34,6 +35,21 @@ Processes = Annotated[
 Folder = Annotated[
     Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
 ]
+Rates = Annotated[
+    str | None,
+    typer.Option(
+        help="Rates to measure, such as 0,1,2,5, deg/s; by default doubled until fewer than half of the fields"
+        " are solved."
+    ),
+]
+AfterDose = Annotated[
+    str | None,
+    typer.Option(
+        "--end-of-life",
+        help="Also measure the aged camera: its dose in krad, or {dose_krad: 10, dark_e_s_krad: 40, ...}, what each"
+        " krad adds.",
+    ),
+]
 ModelFolder = Annotated[
     Path | None,
     typer.Option(
@@ -53,6 +69,8 @@ def datasheet(
     scene: SceneArg,
     quick: Quick = False,
     fields: FieldCount = None,
+    rates: Rates = None,
+    end_of_life: AfterDose = None,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Processes = None,
@@ -70,12 +88,15 @@ def datasheet(
     from skysim.core import files
     from skysim.core.yaml_reader import parse_overrides
     from skysim.experiments.datasheet import cells, datasheet_report, model_fit
-    from skysim.experiments.datasheet.statement import numbers, state
+    from skysim.experiments.datasheet.scene_changes import parse_end_of_life
+    from skysim.experiments.datasheet.statement import state
 
     if fmu and model is None:
         raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
     if fmu:
         model_fit.require_fmu_builder()
+    life = parse_end_of_life(end_of_life) if end_of_life else None
+    rates_deg_s = parse_rates(rates) if rates else []
     if markdown:
         page_path(markdown)
     if model:
@@ -93,16 +114,20 @@ def datasheet(
             quick=quick,
             fields=fields,
             least=cells.MODEL_FIELDS if model else cells.MIN_FIELDS,
+            rates_deg_s=rates_deg_s,
+            end_of_life=life,
             workers=workers,
             watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )
     statement = state(sheet)
-    report = datasheet_report.datasheet_report(statement, quick)
+    chosen = {"rates": rates, "end-of-life": end_of_life}
+    options = [f"--{name}={text}" for name, text in chosen.items() if text]
+    report = datasheet_report.datasheet_report(statement, ["--quick"] * quick + options)
     paths = datasheet_report.write_all(folder, statement, report)
     if markdown:
         files.write_text(markdown, report.markdown())
     if json:
-        print_json(numbers(statement))
+        print_json(datasheet_report.numbers(statement))
     else:
         report.print()
         print(f"report: {paths['report']}")
@@ -113,6 +138,17 @@ def datasheet(
         raise statement.refusal
     if model:
         write_model(model, sheet, fmu, json)
+
+
+def parse_rates(text: str) -> list[float]:
+    """Rates in degrees per second from "0,1,2". Raises InputError."""
+    try:
+        rates = [float(one) for one in text.split(",")]
+    except ValueError:
+        rates = [math.nan]
+    if not all(0 <= one < math.inf for one in rates) or not any(rates):
+        raise InputError(f"--rates {text}", "", "rates of 0 deg/s or more, such as 0,1,2,5")
+    return rates
 
 
 def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> None:
@@ -137,24 +173,25 @@ def print_agreements(agreements: list[Agreement]) -> None:
     rows = [
         [
             one.fitted,
-            f"{one.rate_deg_s:g}",
-            str(one.frames),
-            *(f"{p:.2g}" for p in one.p_values),
-            f"{one.correlation:.3f}",
-            f"{one.expected_correlation:.3f}",
+            one.rate_deg_s,
+            one.frames,
+            *one.p_values,
+            one.correlation,
+            one.expected_correlation,
         ]
         for one in agreements
     ]
-    heads = [
-        "rate °/s",
-        "frames",
-        "p of x",
-        "p of y",
-        "p of roll",
-        "correlation",
-        "of the model",
-    ]
-    table = Table([Column("fitted to", kind="text"), *map(Column, heads)], rows)
+    heads = {
+        "rate °/s": "g",
+        "frames": "d",
+        "p of x": ".2g",
+        "p of y": ".2g",
+        "p of roll": ".2g",
+        "correlation": ".3f",
+        "of the model": ".3f",
+    }
+    columns = [Column(head, format=form) for head, form in heads.items()]
+    table = Table([Column("fitted to", kind="text"), *columns], rows)
     p_values = [p for one in agreements for p in one.p_values]
     if len(p_values) * min(p_values) < 0.05:
         print_wrapped(
@@ -167,6 +204,7 @@ def print_agreements(agreements: list[Agreement]) -> None:
     )
     print_wrapped(
         "p: Kolmogorov-Smirnov; of a right model one in twenty is below 0.05. correlation: mean over the axes and the"
-        " pairs of frames of the sequences."
+        " pairs of frames of the sequences; at faster rates of two frames of one attitude. The table has all rates"
+        " that the model of this half accepts."
     )
     print()

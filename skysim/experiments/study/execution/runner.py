@@ -219,19 +219,28 @@ def prepare_store(
         check_functions(plan, store)
         check_scene(plan, store)
     if stored != plan.digest or not done:
-        file = str(plan.path.resolve())
-        store.begin(
-            plan.points,
-            grown=(kept, plan.study.replicates) if done else None,
-            study=plan.text,
-            file=file,
-            title=plan.study.title,
-            code=code_version(),
-            digest=plan.digest,
-            functions=json.dumps(plan.spec.digests),
-            replicates=str(plan.study.replicates),
-            overrides=json.dumps(dict(overrides or {})),
-        )
+        begin_store(plan, store, (kept, plan.study.replicates) if done else None, overrides)
+
+
+def begin_store(
+    plan: Plan,
+    store: Store,
+    grown: tuple[int, int] | None = None,
+    overrides: OverrideTexts | None = None,
+) -> None:
+    """Set the points and the metadata of a plan; its first points may be those that the store has (`Store.begin`)."""
+    store.begin(
+        plan.points,
+        grown=grown,
+        study=plan.text,
+        file=str(plan.path.resolve()),
+        title=plan.study.title,
+        code=code_version(),
+        digest=plan.digest,
+        functions=json.dumps(plan.spec.digests),
+        replicates=str(plan.study.replicates),
+        overrides=json.dumps(dict(overrides or {})),
+    )
 
 
 def stored_replicates(plan: Plan, store: Store) -> int:

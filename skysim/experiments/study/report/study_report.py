@@ -181,7 +181,7 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     return Analysis(
         lines,
         about,
-        answer.verdict(study, answered, judged),
+        answer.verdict(study, answered, judged, about.survey_share),
         headline,
         answer.ranges(study, answered),
         indices(plan, store) if sobol or switches_causes(study) else [],

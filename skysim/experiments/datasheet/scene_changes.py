@@ -1,0 +1,215 @@
+"""Changes of a scene that a datasheet measures: what would lower the error, disturbances, and the end of life.
+
+At the end of its life a camera has more dark current and hot pixels, and a darker lens, after an ionizing dose.
+
+Dark current. Displacement damage D in MeV/g adds K D carriers a second in each cm^3 of depleted silicon, with the
+universal damage factor K = 1.9e5 (1 +- 0.3) per cm^3 s and MeV/g at 300 K, a week after the irradiation (Srour & Lo
+2000, IEEE Trans. Nucl. Sci. 47, 2451). Protons of 60 MeV give D = 2.8e7 MeV/g in each krad (6.24e10 MeV/g of ionization
+by a stopping power of 8.6 MeV cm^2/g, 3.9e-3 of it displacement). The depth of the depleted layer is assumed. The
+charge that ionization sets free at interfaces depends on the process: give `dark_e_s_krad` from a test of the chip.
+
+Hot pixels and transmission have no common law: their defaults are assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from skysim.core.units import ConfigModel, Fraction, Length, NotNegative, Number, Positive
+from skysim.core.yaml_reader import explain, parse_yaml
+from skysim.experiments.study.factors import Settings
+from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.light import StarsConfig
+from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
+from skysim.tracking.onboard_model import onboard_catalog
+
+FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of `camera.detector`
+# Error and number of the true centroids in trials with false ones.
+FALSE_STARS_PX = 0.05
+TRUE_STARS = 20
+OFF_DEG = (10.0, 20.0, 30.0, 45.0, 60.0, 90.0)  # angles of the boresight from a bright body
+
+DAMAGE_E_S_M3 = 1.9e5 * 2.8e7 * 1e6  # carriers per second, m^3 and krad, at DAMAGE_C
+DAMAGE_C = 26.85
+ALL = "all together"
+
+
+class EndOfLife(ConfigModel):
+    """What a camera has suffered: a dose, and what each krad of it does.
+
+    Attributes
+    ----------
+    dose_krad
+        Ionizing dose at the chip and in the lens, krad(Si)
+    depth
+        Depth of the depleted silicon of a pixel; the default is assumed
+    dark_e_s_krad
+        Dark current added by each krad at the chip's dark_temperature_c; by default that of Srour & Lo for
+        protons of 60 MeV
+    hot_pixels_krad, hot_e_s
+        Fraction of the pixels that each krad makes hot, and their mean dark current; the defaults are assumed
+    transmission_krad
+        Fraction of the light that the glass loses in each krad; the default is assumed, for glass that is made for it
+    """
+
+    dose_krad: Positive
+    depth_m: Length = 2e-6
+    dark_e_s_krad: NotNegative | None = None
+    hot_pixels_krad: Fraction = 5e-4
+    hot_e_s: NotNegative = 1000.0
+    transmission_krad: Annotated[Number, Field(ge=0, lt=1)] = 0.002
+
+
+def parse_end_of_life(text: str) -> EndOfLife:
+    """The end of life from YAML: a dose in krad, or a mapping of the keys. Raises InputError."""
+    _, tree = parse_yaml(text)
+    tree = tree if isinstance(tree, dict) else {"dose_krad": tree}
+    try:
+        return EndOfLife.model_validate(tree)
+    except ValidationError as error:
+        raise explain(error, EndOfLife, tree, [], {}).within("--end-of-life") from None
+
+
+def added_dark_e_s(camera: CameraConfig, life: EndOfLife) -> float:
+    """Dark current that the dose adds to a pixel at the chip's dark_temperature_c."""
+    if life.dark_e_s_krad is not None:
+        return life.dose_krad * life.dark_e_s_krad
+    chip = camera.detector
+    warmer = (chip.dark_temperature_c - DAMAGE_C) / chip.dark_doubling_c
+    volume_m3 = camera.pixel_m**2 * life.depth_m
+    return life.dose_krad * DAMAGE_E_S_M3 * volume_m3 * 2.0**warmer
+
+
+def aged(camera: CameraConfig, life: EndOfLife) -> dict[str, Settings]:
+    """Settings of the aged camera: each damage alone, and all together.
+
+    A transmission that is a curve is not changed.
+    """
+    chip = camera.detector
+    dark_e_s = chip.dark_e_s + added_dark_e_s(camera, life)
+    hot = min(chip.hot_pixels + life.dose_krad * life.hot_pixels_krad, 1.0)
+    parts: dict[str, Settings] = {
+        f"dark current {dark_e_s:.3g} e-/s": {"camera.detector.dark_e_s": dark_e_s},
+        f"hot pixels {100 * hot:.3g} %": {
+            "camera.detector.hot_pixels": hot,
+            "camera.detector.hot_e_s": max(chip.hot_e_s, life.hot_e_s),
+        },
+    }
+    if not isinstance(camera.transmission, str):
+        left = camera.transmission * (1 - life.transmission_krad) ** life.dose_krad
+        parts[f"transmission {left:.3g}"] = {"camera.transmission": left}
+    together = {key: value for part in parts.values() for key, value in part.items()}
+    return {**parts, ALL: together}
+
+
+# Changes of any scene.
+
+
+def catalog_end_mag(scene: Scene) -> float:
+    """The V magnitude up to which the tracker's catalog has stars; no star is faint enough for a tracker of LEDs."""
+    if not isinstance(scene.light, StarsConfig):
+        return -math.inf
+    stars = onboard_catalog("tracker.catalog", scene.tracker.catalog)
+    return float(stars.v_mag.max()) + CATALOG_MARGIN_MAG
+
+
+def causes(scene: Scene) -> dict[str, Settings]:
+    """Changes of the scene that would lower the error; those without effect on it are left out."""
+    camera = scene.camera
+    chip = camera.detector
+    survey = scene.tracker.survey
+    exposure = scene.exposure
+    changes: dict[str, Settings] = {
+        "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
+    }
+    if 2 * exposure.time_s + exposure.trigger_jitter_s <= 1 / exposure.rate_hz:
+        changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
+    if chip.read_noise_e:
+        changes["half the read noise"] = {
+            "camera.detector.read_noise_e": chip.read_noise_e / 2
+        }
+    if any(getattr(chip, key) for key in FIXED_PATTERN):
+        none = {f"camera.detector.{key}": 0 for key in FIXED_PATTERN}
+        changes["no fixed pattern"] = none
+    if chip.cti_parallel or chip.cti_serial:
+        changes["no transfer loss"] = {
+            "camera.detector.cti_parallel": 0,
+            "camera.detector.cti_serial": 0,
+        }
+    if survey.lever_sigma_m:
+        changes["the lever known"] = {"tracker.survey.lever_sigma": "0 mm"}
+    if survey.led_sigma_m or survey.instrument:
+        changes["the LEDs' map known"] = {
+            "tracker.survey.led_sigma": "0 mm",
+            "tracker.survey.instrument": None,
+        }
+    if survey.focal_length_sigma_m:
+        changes["the focal length known"] = {"tracker.survey.focal_length_sigma": "0 mm"}
+    if scene.thermal:
+        reference = {"kind": "steady", "temperature_c": scene.thermal.reference_c}
+        changes["the temperature held"] = {"thermal.temperature": reference}
+    fainter_mag = scene.tracker.limit_mag + 0.5
+    if fainter_mag <= catalog_end_mag(scene):
+        changes["half a magnitude more stars known"] = {"tracker.limit_mag": fainter_mag}
+    return changes
+
+
+def disturbances(scene: Scene) -> dict[str, Settings]:
+    """Disturbances that the scene supports, beyond its own."""
+    chip = scene.camera.detector
+    exposure_s = scene.exposure.time_s
+    hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
+    own = scene.model_dump(mode="json", by_alias=True)["background"]
+    found: dict[str, Settings] = {
+        "protons, 1e3 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e3}]},
+        "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
+        "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,
+        "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
+    }
+    for electrons in (100, 1000):
+        glow = {"kind": "uniform", "e_s": electrons / exposure_s}
+        found[f"stray light, {electrons} e- a pixel"] = {"background": [*own, glow]}
+    if not isinstance(scene.light, StarsConfig):
+        return found
+    for count in (5, 20):
+        found[f"false stars, {count} among {TRUE_STARS} true"] = {
+            "trial.kind": "centroids",
+            "trial.noise_px": FALSE_STARS_PX,
+            "trial.lights": TRUE_STARS,
+            "trial.false_lights": count,
+        }
+    if has_bodies(scene):
+        edge_deg = float(f"{half_field_deg(scene):.2g}")
+        found["Moon in the field"] = beside("moon", 0, edge_deg)
+    return found
+
+
+def beside(body: str, least_deg: float, greatest_deg: float) -> Settings:
+    """Settings of attitudes at angles from a body that shines."""
+    near: dict[str, Any] = {"body": body, "off_deg": [least_deg, greatest_deg]}
+    return {"trial.near": near, "light.bodies": {}}
+
+
+def has_bodies(scene: Scene) -> bool:
+    """Whether Sun and Moon can be in the scene's sky, and their places are known at its start."""
+    known = BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]
+    return isinstance(scene.light, StarsConfig) and known
+
+
+def excluding_bodies(scene: Scene) -> tuple[str, ...]:
+    """Bodies whose stray light the scene's baffle lets through."""
+    return ("sun", "moon") if has_bodies(scene) and scene.camera.baffle else ()
+
+
+def side_px(scene: Scene) -> int:
+    """The field's smaller side."""
+    return min(scene.camera.width_px, scene.camera.height_px)
+
+
+def half_field_deg(scene: Scene) -> float:
+    """Half of the field's smaller side."""
+    return math.degrees(math.atan(side_px(scene) / 2 / scene.camera.focal_px))
