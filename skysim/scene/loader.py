@@ -330,7 +330,8 @@ def load(
     # 2. to 4. Merging and validation.
     scene = validate(layers, overrides)
     changes = f", {dict(overrides)!r}" if overrides else ""
-    scene._call = f"skysim.load_scene({str(name)!r}{changes})"
+    given = dict(name) if isinstance(name, Mapping) else str(name)
+    scene._source.call = f"skysim.load_scene({given!r}{changes})"
     # 5. Options without effect.
     if refuses_unused:
         unused.check(

@@ -163,7 +163,15 @@ def ephemeris_problem(start_time: datetime.datetime) -> str:
 
 
 class RawKeys(dict[str, Any]):
-    """The keys from which a scene was loaded. Equal to any other: the values of scenes are compared."""
+    """The keys from which a scene was loaded. Equal to any other: the values of scenes are compared.
+
+    Attributes
+    ----------
+    call
+        The Python call that loads the scene; empty if it was not loaded
+    """
+
+    call = ""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, RawKeys)
@@ -215,8 +223,6 @@ class Scene(ConfigModel, metaclass=SceneKind):
     _inherited: tuple[str, ...] = ()
     # Keys as loaded, see `loader.keys_of`.
     _source: RawKeys = RawKeys()
-    # How the loader got it, in Python.
-    _call: str = ""
 
     @model_validator(mode="after")
     def check_light_source(self) -> Scene:
@@ -494,7 +500,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     @property
     def call(self) -> str:
         """The Python call that loads this scene; empty if it was not loaded."""
-        return self._call
+        return self._source.call
 
     @property
     def inherited(self) -> tuple[str, ...]:
