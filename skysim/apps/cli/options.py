@@ -66,6 +66,13 @@ Seed = Annotated[
     ),
 ]
 Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
+Scene3d = Annotated[
+    bool,
+    typer.Option(
+        "--scene-3d",
+        help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.",
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 ANIMATION_FRAMES = 60
+LINE_S = 60.0  # longest time without a line of progress if stderr is no terminal
 
 
 def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> Iterator[T]:
@@ -78,25 +80,30 @@ def trial_progress(
 ) -> Iterator[Callable[[Progress], None]]:
     """Show a progress bar for trials on stderr: done, rate, time left, failures. Yields its update function.
 
-    If stderr is not a terminal, print a line after every tenth of the trials instead.
+    If stderr is not a terminal, print a line at the beginning, after every tenth of the trials, and once a minute.
     """
     from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     what = printable(what)
-    text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
+    text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.2g}/s  {task.fields[faults]}"
     tenth = 0
+    shown_s = time.monotonic()
+    if not console.is_terminal:
+        print(f"{what}: {total} {unit}", file=sys.stderr, flush=True)
     with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
         task = shown.add_task(what, total=total, rate=0.0, faults="")
 
         def update(done: Progress) -> None:
-            nonlocal tenth
+            nonlocal tenth, shown_s
             faults = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
             shown.update(task, completed=done.done, rate=done.rate, faults=faults)
-            if not console.is_terminal and 10 * done.done // total > tenth:
+            late = time.monotonic() - shown_s > LINE_S
+            if not console.is_terminal and (late or 10 * done.done // total > tenth):
                 tenth = 10 * done.done // total
-                line = f"{what}: {done.done} of {total}, {done.rate:.0f} {unit}/s, {faults}"
+                shown_s = time.monotonic()
+                line = f"{what}: {done.done} of {total}, {done.rate:.2g} {unit}/s, {faults}"
                 print(line, file=sys.stderr, flush=True)
 
         yield update
@@ -306,10 +313,11 @@ def study_status(plan: Plan, store: Store) -> dict[str, Any]:
 
 
 def print_study_status(status: dict[str, Any]) -> None:
-    rate = status["done"] / status["seconds"] if status["seconds"] else 0.0
+    seconds = status["seconds"]
+    speed = f"{seconds:.1f} s, {status['done'] / seconds:.2g} trials/s"
     print_wrapped(
         f"{status['title']}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
-        f" {status['wrong']} wrong attitudes; {status['seconds']:.1f} s, {rate:.0f} trials/s"
+        f" {status['wrong']} wrong attitudes; {speed if seconds else 'its first run has not ended'}"
     )
     print(f"store: {status['store']} (code {status['code']})")
 
@@ -351,8 +359,8 @@ def print_replay(replay: dict[str, Any]) -> None:
         print_error(
             f"differs from the store in {', '.join(replay['changed'])}: another code version"
         )
-    if replay["error"]:
-        print(replay["error"])
+    for reason in filter(None, [replay["error"], *replay["reasons"]]):
+        print_wrapped(reason)
     tables = [path for path in replay["files"] if not path.endswith(".fits")]
     for path in [*replay["pictures"][:10], *tables]:
         print(path)

@@ -20,6 +20,7 @@ from skysim.apps.cli.options import (
     Out,
     Overrides,
     Programs,
+    Scene3d,
     SceneArg,
     Seed,
     SolverName,
@@ -51,13 +52,7 @@ def run(
     solver: SolverName = None,
     tracker: Annotated[str | None, typer.Option(metavar="NAME", help=TRACKER_HELP)] = None,
     program: Programs = None,
-    scene_3d: Annotated[
-        bool,
-        typer.Option(
-            "--scene-3d",
-            help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.",
-        ),
-    ] = False,
+    scene_3d: Scene3d = False,
     open_: OpenReport = False,
     json: Json = False,
 ) -> None:

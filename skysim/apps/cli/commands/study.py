@@ -15,6 +15,7 @@ from skysim.apps.cli.options import (
     Out,
     Overrides,
     Programs,
+    Scene3d,
     complete_study,
     output_folder,
     study_names,
@@ -30,6 +31,7 @@ from skysim.apps.cli.terminal import (
     print_worst,
     study_status,
     trial_progress,
+    write_3d_views,
 )
 from skysim.core.errors import InputError, printable, unknown_name
 
@@ -201,15 +203,18 @@ def replay(
     show: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the first image.")
     ] = False,
+    scene_3d: Scene3d = False,
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Repeat one trial and write its frames."""
+    """Repeat one trial and write its frames; of a flight also telemetry and report, and what went wrong in it."""
     from skysim.experiments.study.execution import runner
 
     place, plan, _ = load_stored_plan(study, out, program or [])
+    folder = place.folder / f"trial_{trial}"
+    draw = write_3d_views if scene_3d else None
     with place.open() as stored:
-        repeated = runner.replay(plan, stored, trial, place.folder / f"trial_{trial}")
+        repeated = runner.replay(plan, stored, trial, folder, draw)
     row = repeated.row
     result: dict[str, Any] = {
         "trial": trial,
@@ -219,6 +224,7 @@ def replay(
         **{name: getattr(row.outcome, name) for name in row.outcome.__slots__},
         "changed": repeated.changed,
         "error": row.error,
+        "reasons": repeated.reasons,
         "files": list(map(str, repeated.files)),
         "pictures": list(map(str, repeated.pictures)),
     }

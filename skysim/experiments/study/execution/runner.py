@@ -18,7 +18,7 @@ from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image
-from skysim.core.types import Frame, Truth
+from skysim.core.types import Frame, Telemetry, Truth
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
@@ -40,11 +40,12 @@ from skysim.experiments.study.plan import (
     TrialSpec,
     resolve_point,
 )
-from skysim.results import scoring
+from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.files import recording
 from skysim.results.plots import annotate, visible
 from skysim.results.run import Recorder
 from skysim.simulation.checks import check
+from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
 CHUNK_S = (
@@ -367,12 +368,23 @@ MAX_FRAMES = 100  # maximum number of frames annotated for a flight
 
 
 class Replay(NamedTuple):
-    """A repeated trial: its row, names of stored quantities that differ now, files, annotated images."""
+    """A repeated trial: its row, names of stored quantities that differ now, files, annotated images.
+
+    Attributes
+    ----------
+    reasons
+        Why a flight went wrong, in words: actuators at their limits, pointing, refused frames
+    """
 
     row: Row
     changed: list[str]
     files: list[Path]
     pictures: list[Path]
+    reasons: list[str]
+
+
+# Makes pictures of a laboratory and its motion in a folder.
+Draw = Callable[[Lab, Telemetry, Path], Sequence[Path]]
 
 
 def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
@@ -388,7 +400,9 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
     return Segment(point, settings, trial, range(replicate, replicate + 1))
 
 
-def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
+def replay(
+    plan: Plan, store: Store, trial: int, folder: Path, draw: Draw | None = None
+) -> Replay:
     """Repeat a trial with its seed, and write its frame, or the files of `skysim run` for a flight, annotated.
 
     Only the first MAX_FRAMES frames of a flight are annotated. An exception of the trial is in its row; frames
@@ -396,6 +410,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
     """
     segment = segment_of(plan, store, trial)
     (row,) = trials.run_block(plan.spec, segment)
+    reasons: list[str] = []
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
     changed = [name for name, value in now.items() if stored and stored[name] != value]
@@ -407,7 +422,7 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
                 command = shlex.join(
                     ["skysim", "study", "replay", str(plan.path), str(trial)]
                 )
-                replay_flight(setup, row.seed, folder, command)
+                reasons = replay_flight(setup, row.seed, folder, command, draw)
             else:
                 frame, truth, report = replayed_frame(setup, row.seed)
                 recording.write_frame(folder, frame, truth, setup.lab.scene)
@@ -416,7 +431,8 @@ def replay(plan: Plan, store: Store, trial: int, folder: Path) -> Replay:
             if row.error is None:
                 raise
     files = [*sorted(folder.glob("frame_*.fits")), *sorted(folder.glob("[rst]*.*"))]
-    return Replay(row, changed, files, sorted(folder.glob("frame_*.annotated.png")))
+    pictures = sorted(folder.glob("frame_*.annotated.png"))
+    return Replay(row, changed, files, pictures, reasons)
 
 
 def write_annotated(folder: Path, frame: Frame, truth: Truth, report: Report) -> None:
@@ -429,8 +445,10 @@ def write_annotated(folder: Path, frame: Frame, truth: Truth, report: Report) ->
     write_image(folder / f"frame_{frame.index:04d}.annotated.png", picture)
 
 
-def replay_flight(setup: TrialSetup, seed: int, folder: Path, command: str) -> None:
-    """Fly a trial again and write its frames, solutions, telemetry and report, and the annotated images."""
+def replay_flight(
+    setup: TrialSetup, seed: int, folder: Path, command: str, draw: Draw | None
+) -> list[str]:
+    """Fly a trial again and write its frames, solutions, telemetry, report and pictures. Returns what went wrong."""
     with trials.trial_flight(setup, seed) as flight:
         recorder = Recorder(folder, flight.lab.camera)
         for shot in flight.shots(cameras=[0]):
@@ -438,10 +456,16 @@ def replay_flight(setup: TrialSetup, seed: int, folder: Path, command: str) -> N
             recorder.add(scoring.score(shot))
             if shot.frame.index < MAX_FRAMES:
                 write_annotated(folder, shot.frame, shot.truth, shot.report)
-        if recorder.rows:
-            recorder.finish(
-                command, flight.telemetry(), flight.imu_samples(), check(flight.lab)
-            )
+        if not recorder.rows:
+            return []
+        log = flight.telemetry()
+        plan = check(flight.lab)
+        pictures = draw(flight.lab, log, folder) if draw else ()
+        recorder.finish(command, log, flight.imu_samples(), plan, pictures)
+        return [
+            *telemetry_report.findings(log),
+            *run_report.refusals(recorder.rows, plan.findings),
+        ]
 
 
 def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:

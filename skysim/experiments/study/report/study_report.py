@@ -447,7 +447,7 @@ def from_the_last(kept: int, count: int) -> list[tuple[int]]:
 def runs_section(store: Store) -> Section:
     """The runs that have filled the store."""
     columns = [text_column("engine"), Column("workers"), Column("trials")]
-    columns += [Column("time", "s", ".1f"), Column("trials/s", format=".1f")]
+    columns += [Column("time", "s", ".1f"), Column("trials/s", format=".2g")]
     runs = store.runs()
     rows = []
     for run in runs:
