@@ -53,6 +53,8 @@ class TrackerScore:
         Count of each status other than solved, most frequent first
     errors
         Arcseconds, over right solutions only
+    nees
+        Mean of their normalized squared errors, 3 if the claimed errors are true; nan without a claim
     time_ms
         Time from image to solution, over the frames on which the tracker did not fail
     """
@@ -67,6 +69,7 @@ class TrackerScore:
     cross_arcsec_worst: float
     roll_arcsec_median: float
     roll_arcsec_worst: float
+    nees: float
     time_ms_median: float
     time_ms_p95: float
     refusals: dict[str, int]
@@ -122,6 +125,7 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     failed = sum(count for status, count in unsolved.items() if status.startswith(FAILED))
     cross = np.array([row.cross_arcsec for row in right] or [np.nan])
     roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
+    nees = np.array([row.nees for row in right if np.isfinite(row.nees)] or [np.nan])
     # Frames on which it failed are left out of the times: the time to a solution is unknown there.
     ms = np.array(
         [row.time_ms for row in rows if not row.status.startswith(FAILED)] or [np.nan]
@@ -137,6 +141,7 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
         float(np.max(cross)),
         float(np.median(roll)),
         float(np.max(roll)),
+        float(np.mean(nees)),
         float(np.median(ms)),
         float(np.percentile(ms, 95)),
         dict(unsolved.most_common()),

@@ -511,8 +511,13 @@ class Flight:
         """
         number = schedule.number
         if number not in self.trackers:
-            own = self.parts.tracker if number == 0 else None
-            self.trackers[number] = own or build_tracker(schedule.camera, self.parts.programs)
+            programs = self.parts.programs
+            if number == 0 and self.parts.tracker is not None:
+                programs = {
+                    **programs,
+                    schedule.camera.scene.tracker.name: self.parts.tracker,
+                }
+            self.trackers[number] = build_tracker(schedule.camera, programs)
             if not isinstance(self.trackers[number], factory.UserTracker):
                 factory.solve_frame(self.trackers[number], frame)
         return self.trackers[number]

@@ -6,12 +6,13 @@ an external tracker becomes the status of a frame.
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -29,7 +30,6 @@ from skysim.scene.sections.tracker import OWN
 from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (
     FAILED,
-    SOLVED,
     TRACKERS,
     Answer,
     Leds,
@@ -65,17 +65,11 @@ class ExternalTracker(FrameTracker):
 
     @classmethod
     def start(
-        cls,
-        scene: scenes.Scene,
-        camera: Camera,
-        settings: Settings,
-        lights: Stars | Leds,
-        commands: Mapping[str, str],
+        cls, scene: scenes.Scene, setup: Setup, commands: Mapping[str, str]
     ) -> ExternalTracker:
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         name = scene.tracker.name
         TRACKERS.check_name(name, commands)
-        setup = build_setup(scene, camera, settings, lights)
         image_format = None
         environment = None
         if name in commands:
@@ -93,13 +87,15 @@ class ExternalTracker(FrameTracker):
         self, frame: Frame, streak_px: tuple[float, float] | None = None
     ) -> Report:
         """The tracker's report on a frame; streak_px is as in `Picture`."""
-        picture = Picture(
-            frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px
-        )
         try:
-            return to_report(self.program.solve(picture))
+            return to_report(self.program.solve(picture_of(frame, streak_px)))
         except ProgramError as error:
             return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
+
+
+def picture_of(frame: Frame, streak_px: tuple[float, float] | None) -> Picture:
+    """What a tracker gets of a frame."""
+    return Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
 
 
 def build_setup(
@@ -147,34 +143,59 @@ def to_report(answer: Answer) -> Report:
     return Report(attitude, Centroids(xy_px, unmeasured, unmeasured), seconds)
 
 
-# A Python function as a star tracker.
+# A tracker of one's own in this process.
 
-NO_ATTITUDE = "no attitude"  # status if the function returned None
+
+def takes_setup(given: Any) -> bool:
+    """Whether a callable's first parameter is named `setup`: it makes a tracker from a set-up."""
+    try:
+        return next(iter(inspect.signature(given).parameters), "") == "setup"
+    except (TypeError, ValueError):  # no callable, or one without a signature
+        return False
 
 
 class FunctionTracker(FrameTracker):
-    """A tracker that is a function in this process.
+    """A tracker that is a Python object in this process.
 
     Attributes
     ----------
     name
         Name for messages and reports
     function
-        Function from an image (H, W) to an Answer, to the attitude cam_from_ref as a Rotation or as a unit quaternion
-        (4,) scalar last, or to None for no attitude
+        Function from an image (H, W) to the attitude, as `tracker_interface.to_answer` takes it; or one whose first
+        parameter is named `setup`, from a `Setup` to a tracker: a `tracker_interface.Tracker`, or the function that its
+        method `solve` would be
     """
 
-    def __init__(self, name: str, function: Callable[[NDArray], Any]) -> None:
+    def __init__(self, name: str, function: Callable[..., Any]) -> None:
         self.name = name
         self.function = function
+        self.takes_setup = takes_setup(function)
+
+    def set_up(self, setup: Setup) -> FunctionTracker:
+        """The tracker after its set-up: a function of a `Picture`. Raises InputError if it makes none."""
+        made = self.function(setup)
+        solve = getattr(made, "solve", made)
+        if not callable(solve):
+            raise InputError(
+                "tracker",
+                f"{self.name} made {type(made).__name__} of its set-up",
+                "an object with a method solve, or a function",
+            )
+        return SetUpTracker(self.name, solve)
+
+    def given(self, picture: Picture) -> Any:
+        """The argument of the function: the image alone."""
+        return picture.image_dn
 
     def solve_frame(
         self, frame: Frame, streak_px: tuple[float, float] | None = None
     ) -> Report:
         """The tracker's report on a frame; the function gets a copy of the image."""
+        picture = replace(picture_of(frame, streak_px), image_dn=np.array(frame.image_dn))
         begin_s = time.perf_counter()
         try:
-            answer = check_answer(to_answer(self.function(np.array(frame.image_dn))))
+            answer = check_answer(self.function(self.given(picture)))
         except Exception as error:
             errors.raise_wrapped(error)
             return Report(Attitude(f"{FAILED}{describe_error(error)}"), Centroids.empty())
@@ -183,12 +204,9 @@ class FunctionTracker(FrameTracker):
         return report
 
 
-def to_answer(value: Any) -> Any:
-    """The value that a function returned, as an Answer; `check_answer` refuses other values, which stay unchanged."""
-    if value is None:
-        return Answer(NO_ATTITUDE)
-    if isinstance(value, Rotation):
-        return Answer(SOLVED, value.as_quat())
-    if isinstance(value, np.ndarray | list | tuple):
-        return Answer(SOLVED, value)
-    return value
+class SetUpTracker(FunctionTracker):
+    """A tracker that has had its set-up: its function takes a `Picture`."""
+
+    def given(self, picture: Picture) -> Any:
+        """The argument of the function: image, time, exposure and streak."""
+        return picture

@@ -51,6 +51,7 @@ from skysim.tracking.onboard_model import (
     with_brightness,
     zero_point_mag,
 )
+from skysim.tracking.tracker_interface import Leds, Setup, Stars
 
 # Settings of the tracker from a scene.
 
@@ -133,15 +134,33 @@ Estimator = StarTracker | DomeTracker | CodedTracker | UserTracker
 
 
 def tracker_of(name: str, given: Any) -> Estimator:
-    """A star tracker given in Python, as `UserTracker` if it is a function of an image. Raises InputError."""
+    """A star tracker given in Python, as `FunctionTracker` if it is a function or a class. Raises InputError."""
     if isinstance(given, StarTracker | DomeTracker | FunctionTracker):
         return given
-    if callable(given) and not isinstance(given, type):
+    if callable(given) and (
+        not isinstance(given, type) or external_tracker.takes_setup(given)
+    ):
         return FunctionTracker(name, given)
     what = f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
     raise InputError(
-        "tracker", what, "a name, a function of an image, a StarTracker or a DomeTracker"
+        "tracker",
+        what,
+        "a name, a function of an image, a function or class of a set-up (first parameter `setup`), a StarTracker or"
+        " a DomeTracker",
     )
+
+
+def setup_of(scene: Scene, mount: Mount, sources: Sources) -> Setup:
+    """The set-up that a tracker of one's own gets: camera, catalog or map, and settings that skysim's would assume."""
+    settings = assumed_settings(scene)
+    if isinstance(scene.light, DomeConfig):
+        camera, leds, lever = onboard_dome(scene, scene.light, mount, sources)
+        leds = with_brightness(scene, scene.light, leds, lever)
+        lights: Stars | Leds = external_tracker.led_map(leds, lever)
+    else:
+        camera = assumed_camera(scene)
+        lights = external_tracker.star_map(*assumed_stars(scene, assumed_orbit(scene)))
+    return external_tracker.build_setup(scene, camera, settings, lights)
 
 
 def build_tracker(
@@ -167,11 +186,17 @@ def build_tracker(
         For a dome or a catalog that the tracker cannot use.
     """
     name = scene.tracker.name
-    if not isinstance(programs.get(name, ""), str):
-        return tracker_of(name, programs[name])
+    given = programs.get(name, "")
+    if not isinstance(given, str):
+        tracker = tracker_of(name, given)
+        if isinstance(tracker, FunctionTracker) and tracker.takes_setup:
+            return tracker.set_up(setup_of(scene, mount, sources))
+        return tracker
+    if name != OWN:
+        return ExternalTracker.start(scene, setup_of(scene, mount, sources), programs)
     if isinstance(scene.light, DomeConfig):
-        return build_dome_tracker(scene, scene.light, mount, sources, programs)
-    return build_sky_tracker(scene, programs)
+        return build_dome_tracker(scene, scene.light, mount, sources)
+    return build_sky_tracker(scene)
 
 
 def build_dome_tracker(
@@ -179,16 +204,11 @@ def build_dome_tracker(
     dome: DomeConfig,
     mount: Mount,
     sources: Sources,
-    programs: Programs,
-) -> DomeTracker | CodedTracker | ExternalTracker:
+) -> DomeTracker | CodedTracker:
     """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
     settings = assumed_settings(scene)
     camera, leds, lever = onboard_dome(scene, dome, mount, sources)
     leds = with_brightness(scene, dome, leds, lever)
-    if scene.tracker.name != OWN:
-        return ExternalTracker.start(
-            scene, camera, settings, external_tracker.led_map(leds, lever), programs
-        )
     try:
         if scene.tracker.decoder is None:
             return DomeTracker(camera, leds, lever, settings)
@@ -199,16 +219,12 @@ def build_dome_tracker(
         raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
 
 
-def build_sky_tracker(scene: Scene, programs: Programs) -> StarTracker | ExternalTracker:
+def build_sky_tracker(scene: Scene) -> StarTracker:
     """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
     camera = assumed_camera(scene)
     settings = assumed_settings(scene)
     orbit = assumed_orbit(scene)
     stars, directions = assumed_stars(scene, orbit)
-    if scene.tracker.name != OWN:
-        return ExternalTracker.start(
-            scene, camera, settings, external_tracker.star_map(stars, directions), programs
-        )
     if orbit:
         return OrbitStarTracker(camera, stars, directions, settings, orbit)
     return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))

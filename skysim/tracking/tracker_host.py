@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import IO, Any
@@ -55,18 +56,26 @@ def create_tracker(name: str, setup: Setup) -> Tracker:
     return tracker
 
 
-def create(name: str, setup: dict[str, Any]) -> Respond:
+def respond_by(tracker: Tracker) -> Respond:
     """The function with which `serve` answers frames."""
-    tracker = create_tracker(name, Setup.of_tree(setup))
 
     def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
-        return {
-            "frame": header["frame"],
-            **solve_picture(tracker, receive_picture(header, frames)).as_tree(),
-        }
+        answer = solve_picture(tracker, receive_picture(header, frames))
+        return {"frame": header["frame"], **answer.as_tree()}
 
     return respond
 
 
+def serve_tracker(make: Callable[[Setup], Tracker]) -> None:
+    """Serve a tracker as a program that skysim starts: the set-up comes once, then every frame.
+
+    Parameters
+    ----------
+    make
+        Class or function that makes the tracker from its set-up
+    """
+    serve(lambda tree: respond_by(make(Setup.of_tree(tree))))
+
+
 if __name__ == "__main__":
-    serve(partial(create, sys.argv[1]))
+    serve_tracker(partial(create_tracker, sys.argv[1]))

@@ -20,6 +20,7 @@ from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, printable
 from skysim.core.plugins import (
@@ -37,6 +38,7 @@ from skysim.scene.sections.tracker import OWN
 
 TRACKERS = PluginKind("tracker", "skysim.trackers", "tracker.name", (OWN,))
 SOLVED = "solved"
+NO_ATTITUDE = "no attitude"  # status if a tracker in Python returned None
 FAILED = "failed: "  # start of the status after an exception, hang, crash or invalid answer
 PROTOCOL = 1  # version of the protocol, the first key of the set-up
 # Deviation of a quaternion's norm from 1: single precision passes and is normalized
@@ -219,13 +221,36 @@ class Tracker(Protocol):
     The callable raises an exception for a set-up that it cannot use.
     """
 
-    def solve(self, picture: Picture) -> Answer:
-        """The attitude at mid-exposure, or the reason why there is none."""
+    def solve(self, picture: Picture) -> Any:
+        """The attitude at mid-exposure, or the reason why there is none, as `to_answer` takes it."""
         ...
 
 
-def check_answer(answer: Any) -> Answer:
+def to_answer(value: Any) -> Any:
+    """What a tracker in Python returned as an Answer; other values, which `check_answer` refuses, stay unchanged.
+
+    Allowed are an Answer, the attitude cam_from_ref as a Rotation, unit quaternion (4,) scalar last or matrix (3, 3),
+    and None for no attitude.
+    """
+    if value is None:
+        return Answer(NO_ATTITUDE)
+    if isinstance(value, np.ndarray | list | tuple):
+        if np.shape(value) == (3, 3):
+            matrix = finite_array(value, "the matrix", (3, 3))
+            if np.abs(matrix @ matrix.T - np.eye(3)).max() > UNIT_TOLERANCE or (
+                np.linalg.det(matrix) < 0
+            ):
+                raise ValueError(
+                    "the matrix is no rotation; allowed: orthogonal, determinant 1"
+                )
+            value = Rotation.from_matrix(matrix).as_quat()
+        return Answer(SOLVED, value)
+    return Answer(SOLVED, value.as_quat()) if isinstance(value, Rotation) else value
+
+
+def check_answer(given: Any) -> Answer:
     """The answer with a normalized quaternion. Raises ValueError for wrong shapes, quaternion, covariance or time."""
+    answer = to_answer(given)
     if not isinstance(answer, Answer):
         raise ValueError(f"the tracker returned {type(answer).__name__}; allowed: Answer")
     status = (

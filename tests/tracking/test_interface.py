@@ -78,7 +78,7 @@ UNIT = [0.5, -0.5, 0.5, 0.5]
         (Answer("solved", UNIT, None, None, -1.0), "allowed: 0 or more"),
         (Answer(""), "allowed: text"),
         (Answer(5), "allowed: text"),
-        (None, "allowed: Answer"),
+        ({}, "allowed: Answer"),
     ],
 )
 def test_an_invalid_answer_is_refused_in_one_line(answer: object, message: str) -> None:

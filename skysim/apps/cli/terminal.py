@@ -131,7 +131,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
         Column("right", "%", ".1f"),
         *map(Column, ("(95 %)", "wrong", "refused", "failed")),
         *(Column(head, "″", ".3g") for head in ("cross", "worst", "roll", "worst")),
-        *(Column(head, format=".3g") for head in ("ms", "95 % ms")),
+        *(Column(head, format=".3g") for head in ("NEES", "ms", "95 % ms")),
     ]
     rows = [
         [
@@ -146,12 +146,13 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
             line.cross_arcsec_worst,
             line.roll_arcsec_median,
             line.roll_arcsec_worst,
+            line.nees,
             line.time_ms_median,
             line.time_ms_p95,
         ]
         for line in lines
     ]
-    left_out = ((12,), (11,), (3,), (10,), (8,))  # the times, the interval, the worst errors
+    left_out = ((13,), (12,), (3,), (10,), (8,))  # the times, the interval, the worst errors
     print_table(Table(columns, rows, optional=left_out))
     for line in lines:
         for status, count in line.refusals.items():

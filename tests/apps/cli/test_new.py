@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -105,3 +107,26 @@ def test_a_new_study_runs(tmp_path: Path) -> None:
         tmp_path / "mine.yaml", {"replicates": 1}, out=tmp_path / "out", workers=1
     )
     assert len(result.trials()) == 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["scoreboard", "afit_simsat_ideal"])
+def test_a_new_tracker_solves_stars_and_leds(name: str, tmp_path: Path) -> None:
+    begin("tracker", tmp_path)
+    programs = {"mine": f"{sys.executable} {tmp_path / 'mine.py'}"}
+    changes = {"exposure.frames": 2, "tracker.time_limit": "3 min"}
+    scene = skysim.load_scene(name, changes)
+    run = skysim.simulate(scene, tracker="mine", programs=programs)
+    assert [step.attitude.status for step in run] == ["solved"] * 2
+    assert all(np.isfinite(step.row.nees) for step in run)
+    assert max(step.error_arcsec for step in run) < 600
+
+
+@pytest.mark.slow
+def test_a_new_controller_points_the_vehicle(tmp_path: Path) -> None:
+    begin("controller", tmp_path)
+    programs = {"mine": f"{sys.executable} {tmp_path / 'mine.py'}"}
+    scene = skysim.load_scene("simsat_slew", {"exposure.frames": 2})
+    log = skysim.simulate(scene, controller="mine", programs=programs).telemetry
+    off_rad = (log.lab_from_ref.inv() * log.lab_from_body).magnitude().max()
+    assert np.degrees(off_rad) < 1
