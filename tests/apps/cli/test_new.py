@@ -114,9 +114,9 @@ def test_a_new_study_runs(tmp_path: Path) -> None:
 def test_a_new_tracker_solves_stars_and_leds(name: str, tmp_path: Path) -> None:
     begin("tracker", tmp_path)
     programs = {"mine": f"{sys.executable} {tmp_path / 'mine.py'}"}
-    changes = {"exposure.frames": 2, "tracker.time_limit": "3 min"}
+    changes = {"exposure.frames": 2, "tracker.name": "mine", "tracker.time_limit": "3 min"}
     scene = skysim.load_scene(name, changes)
-    run = skysim.simulate(scene, tracker="mine", programs=programs)
+    run = skysim.simulate(scene, programs=programs)
     assert [step.attitude.status for step in run] == ["solved"] * 2
     assert all(np.isfinite(step.row.nees) for step in run)
     assert max(step.error_arcsec for step in run) < 600
