@@ -32,6 +32,7 @@ INTERVALS = {
     "mean": f"{BOOTSTRAP}; of the NEES chi-square, wider where trials vary more",
     "rms": BOOTSTRAP,
     "sd": "percentile bootstrap, from two values on",
+    "tol95": "none: it is a limit; tolNN of NN % of all values, with 95 % confidence",
     "worst": EXTREMUM,
     "least": EXTREMUM,
 }

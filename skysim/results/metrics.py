@@ -13,7 +13,7 @@ import bisect
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,12 +27,9 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
-WRONG_AS_CLAIMED_RAD = np.radians(
-    1
-)  # limit for an error that the tracker's covariance allows
-OVERCONFIDENCE_PROBABILITY = (
-    1e-8  # with which a correct covariance allows an error counted as overconfident
-)
+WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the covariance allows
+# Probability with which a correct covariance allows an error that is counted as overconfident.
+OVERCONFIDENCE_PROBABILITY = 1e-8
 OVERCONFIDENT_NEES = float(chdtri(3, OVERCONFIDENCE_PROBABILITY))
 
 
@@ -80,10 +77,8 @@ def normalized_error_squared(
 # Statistics of a sample.
 
 CONFIDENCE = 0.95
-TAILS = (
-    (1 - CONFIDENCE) / 2,
-    (1 + CONFIDENCE) / 2,
-)  # probabilities below the ends of an interval
+# Probabilities below the ends of an interval.
+TAILS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
 # Half of the interval of a normal variable, in sigmas.
 SIGMAS = float(scipy.special.ndtri((1 + CONFIDENCE) / 2))
 MOST_TRIALS = 10**9  # greatest number of trials that `trials_needed` considers
@@ -176,9 +171,8 @@ def resampled(values: Floats, statistic: Callable[..., Any]) -> Summary:
     value = float(statistic(values))
     if len(values) < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
-    batch = max(
-        1, 2_000_000 // len(values)
-    )  # limits the memory of a batch to two million values
+    # The memory of a batch is that of two million values.
+    batch = max(1, 2_000_000 // len(values))
     result = scipy.stats.bootstrap(
         (values,),
         statistic,
@@ -202,27 +196,16 @@ def without_resampling(values: Floats, value: float) -> Summary:
     )
 
 
-def mean_of(values: Floats) -> Summary:
-    """The mean with its bootstrap interval: that of `resampled`, or beyond MANY_VALUES of `bootstrap_of_many`."""
-    return (
-        bootstrap_of_few(values) if len(values) <= MANY_VALUES else bootstrap_of_many(values)
-    )
-
-
-def rms_of(values: Floats) -> Summary:
-    """The RMS likewise: the root of the mean of the squares, and of the ends of its interval."""
+def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
+    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`."""
     if len(values) <= MANY_VALUES:
-        return bootstrap_of_few(np.square(values), np.sqrt)
-    squares = bootstrap_of_many(np.square(values))
-    return Summary(
-        math.sqrt(squares.value),
-        math.sqrt(squares.low),
-        math.sqrt(squares.high),
-        squares.trials,
-    )
+        return bootstrap_of_few(values, function)
+    found = bootstrap_of_many(values)
+    value, low, high = map(float, function(found[:3]))
+    return found._replace(value=value, low=low, high=high)
 
 
-def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
+def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
     """A function of the mean, with the interval of `resampled` from the same draws.
 
     A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
@@ -232,17 +215,16 @@ def bootstrap_of_few(values: Floats, function: Callable[[Any], Any] = np.positiv
     value = float(function(np.mean(values)))
     if count < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
-    low, high = np.quantile(function(values @ resampling_counts(count) / count), TAILS)
-    return Summary(value, float(low), float(high), count)
+    means = function(values @ resampling_counts(count) / count)
+    low, high = np.quantile(means, TAILS).tolist()
+    return Summary(value, low, high, count)
 
 
 @lru_cache(maxsize=64)
 def resampling_counts(count: int) -> NDArray[np.uint8]:
     """(count, RESAMPLES) how often each resample has drawn each value."""
-    drawn = (
-        random_stream(1).integers(0, count, (RESAMPLES, count))
-        + count * np.arange(RESAMPLES)[:, None]
-    )
+    drawn = random_stream(1).integers(0, count, (RESAMPLES, count))
+    drawn += count * np.arange(RESAMPLES)[:, None]
     counts = np.bincount(drawn.ravel(), minlength=RESAMPLES * count)
     return np.ascontiguousarray(counts.reshape(RESAMPLES, count).T, dtype=np.uint8)
 
@@ -266,23 +248,22 @@ def bootstrap_of_many(values: Floats) -> Summary:
     inner = distance <= np.partition(distance, count - EXTREMES)[count - EXTREMES]
     others = values[inner]
     extremes = values[~inner]
-    middle = float(np.mean(others))
-    spread = float(np.std(others))
     weights, normal = resampling_draws()
     weights = weights[:, : len(extremes)]
     left = np.maximum(count - weights.sum(axis=1), 0)
-    means = middle + (weights @ (extremes - middle) + spread * np.sqrt(left) * normal) / count
-    low, high = np.quantile(means, TAILS)
-    return Summary(mean, float(low), float(high), count)
+    middle = float(np.mean(others))
+    scatter = float(np.std(others)) * np.sqrt(left) * normal
+    means = middle + (weights @ (extremes - middle) + scatter) / count
+    low, high = np.quantile(means, TAILS).tolist()
+    return Summary(mean, low, high, count)
 
 
 @lru_cache(maxsize=1)
 def resampling_draws() -> tuple[Floats, Floats]:
     """(RESAMPLES, EXTREMES) counts and (RESAMPLES,) normal variables of `bootstrap_of_many`; the seed is fixed."""
     rng = random_stream(2)
-    return rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float), rng.standard_normal(
-        RESAMPLES
-    )
+    counts = rng.poisson(1.0, (RESAMPLES, EXTREMES)).astype(float)
+    return counts, rng.standard_normal(RESAMPLES)
 
 
 def quantile(values: Floats, probability: float) -> Summary:
@@ -294,11 +275,10 @@ def quantile(values: Floats, probability: float) -> Summary:
     value = float(np.quantile(values, probability)) if count else math.nan
     ranks = quantile_ranks(count, probability)
     if ranks is None:
-        return Summary(
-            value, math.nan, math.nan, count, values_for_quantile(probability) - count
-        )
-    low, high = np.partition(values, ranks)[list(ranks)]
-    return Summary(value, float(low), float(high), count)
+        needs = values_for_quantile(probability) - count
+        return Summary(value, math.nan, math.nan, count, needs)
+    low, high = np.partition(values, ranks)[list(ranks)].tolist()
+    return Summary(value, low, high, count)
 
 
 @lru_cache(maxsize=4096)
@@ -340,9 +320,21 @@ def values_for_quantile(probability: float) -> int:
     return count
 
 
-def extremum(values: Floats, reduce: Callable[[Floats], Any]) -> Summary:
-    """The largest or smallest value of these trials, without an interval."""
-    return Summary(float(reduce(values)), math.nan, math.nan, len(values))
+def tolerance_limit(values: Floats, probability: float) -> Summary:
+    """The upper tolerance limit: with CONFIDENCE at least this share of all values is below it, whatever their law.
+
+    It is the least order statistic X_(s) that exceeds the quantile q with CONFIDENCE (Wilks 1941; David & Nagaraja
+    2003, section 7.2),
+
+        P(X_(s) >= q) = B(s - 1),    B the distribution function of Bin(n, p),
+
+    of 59 values the largest at 95 % ("95/95"), of 93 the second largest. Fewer have none: NaN, and `needs`.
+    """
+    count = len(values)
+    rank = int(scipy.stats.binom.ppf(CONFIDENCE, count, probability))  # s - 1
+    limit = float(np.sort(np.append(values, np.nan))[rank])  # NaN is the last
+    needs = max(trials_needed(1 - probability) - count, 0)
+    return Summary(limit, math.nan, math.nan, count, needs)
 
 
 def rms(values: Floats, axis: int = -1) -> Any:
@@ -362,17 +354,20 @@ DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
 QUANTILES = {"median": 0.5, "p90": 0.9, "p95": 0.95, "p99": 0.99}
+# Others by their digits: p997 is the quantile at 0.997, tol99 the tolerance limit of 99 %.
+QUANTILE = re.compile(r"(?:p|tol)(?!0+$)(\d{2,5})$")
 # The ending of a response name such as `cross_arcsec_p95`.
 STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
-    "rms": rms_of,
+    "rms": lambda values: mean_of(np.square(values), np.sqrt),
     "sd": lambda values: resampled(values, sample_std),
     **{
         name: lambda values, share=share: quantile(values, share)  # type: ignore[misc]
         for name, share in QUANTILES.items()
     },
-    "worst": lambda values: extremum(values, np.max),
-    "least": lambda values: extremum(values, np.min),
+    "tol95": lambda values: tolerance_limit(values, 0.95),
+    "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
+    "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }
 # The beginning of a response name. Errors are taken as magnitudes.
 QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
@@ -478,9 +473,8 @@ def mismatched(c: Columns) -> Summary:
     matches = np.sum(c["matched"][known] * c["frames"][known])
     if not matches:
         return NO_VALUE
-    return Summary(
-        float(np.sum(c["wrong_matches"][known]) / matches), math.nan, math.nan, round(matches)
-    )
+    share = float(np.sum(c["wrong_matches"][known]) / matches)
+    return Summary(share, math.nan, math.nan, round(matches))
 
 
 PROPORTIONS: dict[str, Response] = {
@@ -496,6 +490,16 @@ PROPORTIONS: dict[str, Response] = {
     "failed": lambda c: proportion(np.sum(c["frames"] == 0), len(c["frames"])),
 }
 COVERAGE = re.compile(r"coverage(?:_(\d+))?$")
+WITHIN = re.compile(r"right_within(?:_(?:cross|roll|angle)_arcsec_\d+(?:\.\d+)?)+$")
+LIMIT = re.compile(r"((?:cross|roll|angle)_arcsec)_([\d.]+)")
+OVER = re.compile(r"(\w+)_over_(\d[\d.e+-]*)$")
+
+
+def right_within(name: str, c: Columns) -> NDArray[Any]:
+    """(N,) whether each trial is solved in all frames, none of them wrong, with errors up to the limits in a name."""
+    right = (c["frames"] > 0) & (c["solved"] == c["frames"]) & (c["wrong"] == 0)
+    within = [QUANTITIES[error](c) <= float(limit) for error, limit in LIMIT.findall(name)]
+    return np.all([right, *within], axis=0)
 
 
 def response(name: str, where: str = "response") -> Response:
@@ -508,22 +512,25 @@ def response(name: str, where: str = "response") -> Response:
     identified, wrong, refused
         Proportions of the frames: solved and not wrong (`is_wrong`), wrong, without a solution
     ambiguous
-        Proportion of the frames refused because another attitude fits the lights as well (LEDs
-        only)
+        Proportion of the frames refused because another attitude fits the lights as well (LEDs only)
     misidentified
         Proportion of the frames solved with a light that is matched with a wrong star or LED
     misled
-        Proportion of the frames that are misidentified and have an error that the covariance
-        does not allow
+        Proportion of the frames that are misidentified and have an error that the covariance does not allow
     mismatched
         Proportion of the matches that are wrong, of all frames; without an interval
     roll_noise
-        Proportion of the frames solved with the right lights and a roll error beyond ten
-        arcminutes that the tracker's covariance allows
+        Proportion of the frames solved with the right lights and a roll error beyond ten arcminutes that the tracker's
+        covariance allows
     overconfident
         Proportion of the solutions with an error far outside their covariance
     failed
         Proportion of the trials that raised an exception
+    right_within_cross_arcsec_10, right_within_cross_arcsec_10_roll_arcsec_60
+        Proportion of the trials that are solved, not wrong, and have errors up to the limits (of a flight: all frames,
+        and the RMS errors)
+    cross_arcsec_over_60
+        Proportion of the values of a quantity that are above a limit
     coverage_N
         Proportion of the trials with at least N sources in the field of view; N is 5 if omitted
     nees, centroid_px, streak_px
@@ -536,37 +543,57 @@ def response(name: str, where: str = "response") -> Response:
         return lambda c: proportion(
             np.sum(c["stars"][c["frames"] > 0] >= least), np.sum(c["frames"] > 0)
         )
+    if WITHIN.match(name):
+        return lambda c: proportion(np.sum(right_within(name, c)), np.sum(c["frames"] > 0))
     quantity, statistic = split_name(name)
     if (quantity, statistic) == ("nees", "mean"):
         return mean_nees
-    if quantity not in QUANTITIES or statistic not in STATISTICS:
+    summary_of = statistic_of(statistic)
+    if quantity not in QUANTITIES or summary_of is None:
         raise InputError(
             where,
             f"unknown response {name!r}",
             f"{', '.join(PROPORTIONS)}, coverage, coverage_N, {', '.join(DEFAULT_STATISTICS)}, or one of"
-            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}",
+            f" {', '.join(QUANTITIES)} with _{', _'.join(STATISTICS)}, or right_within_cross_arcsec_10 or"
+            " cross_arcsec_over_60 with limits",
         )
 
     def summarize(columns: Columns) -> Summary:
         values = QUANTITIES[quantity](columns)
         values = values[np.isfinite(values)].astype(float)
-        return STATISTICS[statistic](values) if len(values) else NO_VALUE
+        return summary_of(values) if len(values) else NO_VALUE
 
     return summarize
+
+
+def statistic_of(name: str) -> Callable[[Floats], Summary] | None:
+    """The statistic with a name such as mean, p95, tol99 or over_60; None if there is none."""
+    probability = probability_of(name)
+    if probability is not None:
+        function = tolerance_limit if name.startswith("tol") else quantile
+        return partial(function, probability=probability)
+    if name.startswith("over_"):
+        return lambda values: proportion(np.sum(values > float(name[5:])), len(values))
+    return STATISTICS.get(name)
+
+
+def probability_of(statistic: str) -> float | None:
+    """The probability of a quantile or a tolerance limit: 0.95 of p95 and tol95; None of other statistics."""
+    match = QUANTILE.match(statistic)
+    return float(f"0.{match[1]}") if match else QUANTILES.get(statistic)
 
 
 def split_name(name: str) -> tuple[str, str]:
     """Quantity and statistic of a response such as `cross_arcsec_p95`; empty quantity for a proportion."""
     if name in DEFAULT_STATISTICS:
         return name, DEFAULT_STATISTICS[name]
+    if match := OVER.match(name):
+        return match[1], f"over_{match[2]}"
     quantity, _, statistic = name.rpartition("_")
     return quantity, statistic
 
 
 def is_proportion(name: str) -> bool:
     """Whether a response is a proportion between 0 and 1."""
-    return (
-        name in PROPORTIONS
-        or bool(COVERAGE.match(name))
-        or split_name(name)[0] == "availability"
-    )
+    limited = any(kind.match(name) for kind in (COVERAGE, WITHIN, OVER))
+    return limited or name in PROPORTIONS or split_name(name)[0] == "availability"

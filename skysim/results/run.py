@@ -13,7 +13,7 @@ import numpy as np
 from skysim.core.files import make_folder, write_image, write_table
 from skysim.core.types import Frame, FrameRow, Telemetry, Truth
 from skysim.dynamics import imu
-from skysim.results import run_report, scoring, telemetry_report
+from skysim.results import requirements, run_report, scoring, telemetry_report
 from skysim.results.files.recording import remove_results, write_frame
 from skysim.results.plots import annotate_truth
 from skysim.results.report import Report
@@ -123,6 +123,7 @@ class Recorder:
         ]
         motion = telemetry_report.summary(log)
         flown = telemetry_report.findings(log)
+        judged = requirements.of_run(scene.require, self.rows, plan.facts)
         report = run_report.run_report(
             scene.title,
             command,
@@ -137,6 +138,7 @@ class Recorder:
             views=pictures,
             facts=facts,
             findings=plan.findings,
+            judged=judged,
         )
         report.save(page)
         statistics = run_report.summary(self.rows) | {
@@ -148,6 +150,7 @@ class Recorder:
             "exposures_ms": [1e3 * row.exposure_s for row in self.rows],
             "findings": plan.findings,
             "flight_findings": flown,
+            **({"requirements": [one._asdict() for one in judged]} if judged else {}),
         }
         return statistics, report
 

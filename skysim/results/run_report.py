@@ -28,6 +28,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
+from skysim.results.requirements import NOT_MET, Judgment
 
 # Settings that help where the tracker's own refusal names none.
 HELP = {
@@ -64,6 +65,7 @@ def run_report(
     views: Sequence[Path],
     facts: Sequence[tuple[str, Sequence[str]]],
     findings: Sequence[str],
+    judged: Sequence[Judgment] = (),
 ) -> Report:
     """The report of a run.
 
@@ -89,6 +91,8 @@ def run_report(
         Image files of the laboratory in 3-D
     facts, findings
         Names and lines of the scene's table, and the check's warnings
+    judged
+        Judgments of the scene's requirements
     """
     frame = Figure(cv2.imencode(".png", annotated)[1].tobytes(), FRAME_CAPTION)
     laboratory = [
@@ -101,6 +105,7 @@ def run_report(
     last = [Text(f"Median ms a frame: {stages}"), Text(computer), Text(magnitude_text(rows))]
     blocks = [
         verdict(rows),
+        required(judged, rows),
         Text(warned, "bad", on_terminal=False),
         Section("The last solved frame", [frame]),
         Section("The laboratory", laboratory),
@@ -205,6 +210,19 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
         )
     text += f"; image to attitude in {run['time_ms_median']:.1f} ms (median)"
     return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
+
+
+def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
+    """The judgments of requirements in words, and how many independent draws the frames are if they are fewer."""
+    lines = [one.text() for one in judged]
+    draws = max((one.draws for one in judged), default=math.inf)
+    if draws < 0.99 * sum(row.status == "solved" for row in rows):
+        lines.append(
+            f"{len(rows)} frames count as {draws:.3g} independent draws, for a run draws the errors of its survey"
+            " once; a study draws them anew by `hardware: [tracker.survey.seed]`"
+        )
+    unmet = any(one.answer == NOT_MET for one in judged)
+    return Items(lines, "Requirements" if lines else "", "bad" if unmet else "")
 
 
 def refusals(rows: Sequence[FrameRow]) -> list[str]:

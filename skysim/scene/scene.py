@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import html
 import math
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -123,6 +124,31 @@ class HeadConfig(ConfigModel):
     exposure: ExposureConfig | None = None
 
 
+# Requirements of scenes and studies: shares of frames, and quantiles of errors.
+SHARES = (
+    r"identified|refused|wrong|ambiguous|misidentified|misled|coverage_\d+"
+    r"|right_within(_(cross|roll|angle)_arcsec_\d+(\.\d+)?)+"
+)
+QUANTILES = r"(cross|roll|angle|filter|pointing|drift)_arcsec_(median|(p|tol)(?!0+$)\d{2,5})"
+
+
+def check_requirements(require: dict[str, float]) -> dict[str, float]:
+    """Check the names of requirements, and that the limit of a share is below 1. Raises InputError."""
+    for name, limit in require.items():
+        share = re.fullmatch(SHARES, name)
+        if not share and not re.fullmatch(QUANTILES, name):
+            raise InputError(
+                name,
+                "nothing that a number of trials shows without assumptions",
+                "quantiles of errors (cross_arcsec_p95, roll_arcsec_median, pointing_arcsec_p99) and shares (wrong,"
+                " refused, identified, right_within_cross_arcsec_10, coverage_4)",
+            )
+        if share and limit >= 1:
+            raise InputError(name, f"{limit:g}", "a share between 0 and 1")
+    return require
+
+
+Requirements = Annotated[dict[str, Positive], AfterValidator(check_requirements)]
 MAX_HEADS = 8
 # Sections of a head, whose keys override those of the main camera.
 HEAD_SECTIONS = ("camera", "tracker", "exposure")
@@ -147,7 +173,15 @@ class SceneKind(ModelMetaclass):
 
 
 class Scene(ConfigModel, metaclass=SceneKind):
-    """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker."""
+    """A complete simulation: the laboratory, the vehicle and its motion, the light, the camera and the tracker.
+
+    Attributes
+    ----------
+    require
+        Requirements on the frames: greatest quantile of an error (`cross_arcsec_p95: 60`), greatest share of an event
+        (`wrong: 0.001`), least share of `identified`, `coverage_N` or frames that are right with errors within limits
+        (`right_within_cross_arcsec_10: 0.99`)
+    """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
@@ -166,6 +200,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     tracker: TrackerConfig = TrackerConfig()
     filter: FilterConfig | None = None
     heads: Annotated[tuple[HeadConfig, ...], Field(max_length=MAX_HEADS)] = ()
+    require: Requirements = Field(default_factory=dict)
     name: Annotated[str, Field(exclude=True, alias=NAME_ALIAS)] = ""
     # Keys of the vehicle that the loader took from a base with another vehicle.model.
     _inherited: tuple[str, ...] = ()

@@ -142,6 +142,9 @@ def test_every_response_has_a_row_with_its_meaning() -> None:
     wanted = {
         *metrics.PROPORTIONS,
         "coverage_N",
+        "right_within_cross_arcsec_10",
+        "right_within_cross_arcsec_10_roll_arcsec_60",
+        "cross_arcsec_over_60",
         *metrics.QUANTITIES,
         *(f"_{name}" for name in metrics.STATISTICS),
     }

@@ -178,7 +178,7 @@ def test_the_fast_bootstrap_of_many_values_matches_the_plain_one_where_it_starts
     width, for a normal law, of two of them, four times; more where tails are longer."""
     values = SKEW[name](np.random.default_rng(4), metrics.MANY_VALUES)
     by_hand = metrics.resampled(values, statistic)
-    many = metrics.mean_of if statistic is np.mean else metrics.rms_of
+    many = metrics.STATISTICS["mean" if statistic is np.mean else "rms"]
     more = np.append(values, values.mean())
     found = many(more)
     assert found.trials == metrics.MANY_VALUES + 1
@@ -196,7 +196,7 @@ def test_the_bootstrap_of_few_values_matches_scipy(name: str, count: int) -> Non
     values = SKEW[name](np.random.default_rng(count), count)
     for found, statistic in (
         (metrics.mean_of(values), np.mean),
-        (metrics.rms_of(values), metrics.rms),
+        (metrics.STATISTICS["rms"](values), metrics.rms),
     ):
         assert found == pytest.approx(
             metrics.resampled(values, statistic), rel=1e-12, nan_ok=True

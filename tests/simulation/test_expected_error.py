@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,10 +18,23 @@ from skysim.core.types import Floats, Frame, Truth
 from skysim.results import metrics
 from skysim.results.simulate import render_at
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, beliefs, detection, expected_error, sampling
+from skysim.simulation.checks import (
+    attitudes,
+    beliefs,
+    detection,
+    expected_error,
+    facts,
+    sampling,
+)
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, timing_sigma_s
-from skysim.simulation.checks.expected_error import Common, Independent, covariance, gains
+from skysim.simulation.checks.expected_error import (
+    Common,
+    Expected,
+    Independent,
+    covariance,
+    gains,
+)
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -571,3 +585,38 @@ def test_the_expected_error_is_nan_with_two_lights(stars: Lab) -> None:
     at = attitudes.of_frames(stars)
     few = [one.take(np.arange(2)) for one in sampling.sampled(at, context).used]
     assert np.isnan(expected_error.expected(few, at, context).rms_arcsec()).all()
+
+
+def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
+    """Cross by Rayleigh's law, roll by the normal one, their hypotenuse by drawing; one of two frames is dark."""
+    none = dict.fromkeys(facts.DRAWN_ONCE, np.zeros(2))
+    noise = np.array([ARCSEC_RAD**2 * 15, np.nan])
+    error = Expected(
+        none | {"centroid noise": noise, "LED survey": noise / 15},
+        none | {"centroid noise": 2 * noise},
+    )
+    require = {
+        "cross_arcsec_p95": 6.93,
+        "roll_arcsec_median": 4.0,
+        "angle_arcsec_tol90": 20.0,
+        "right_within_cross_arcsec_4": 0.3,
+        "wrong": 0.001,
+    }
+    context = SimpleNamespace(lab=SimpleNamespace(scene=SimpleNamespace(require=require)))
+    samples = SimpleNamespace(frames=SimpleNamespace(error=error))
+    fact = facts.requirements(context, samples)
+    found = {name: fact.values[name]["expected"] for name in require}
+    rng = np.random.default_rng(1)
+    drawn = rng.normal(size=(3, 400_000)) * np.sqrt([[8.0], [8.0], [30.0]])
+    angle = np.quantile(np.linalg.norm(drawn, axis=0), 0.9)
+    assert found["cross_arcsec_p95"] == pytest.approx(4 * np.sqrt(-np.log(0.05)), rel=2e-3)
+    assert found["roll_arcsec_median"] == pytest.approx(0.6745 * np.sqrt(30), rel=5e-3)
+    assert found["angle_arcsec_tol90"] == pytest.approx(angle, rel=5e-3)
+    assert found["right_within_cross_arcsec_4"] == pytest.approx(
+        (1 - np.exp(-1)) / 2, abs=1e-3
+    )
+    assert fact.values["drawn_once"] == pytest.approx(1 / 16)
+    met = ["expected to be met" in one for one in fact.lines]
+    assert met == [True, True, True, True, False]
+    assert "not forecast" in fact.lines[-1]
+    assert not any(": met" in one for one in fact.lines)

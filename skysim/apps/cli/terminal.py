@@ -102,6 +102,14 @@ def trial_progress(
         yield update
 
 
+def fail_if_not_met(judged: Iterable[Mapping[str, Any]]) -> None:
+    """End with exit code 1 if a requirement is not met; one that is not shown yet is no failure."""
+    from typer import Exit
+
+    if any(one["answer"] == "not met" for one in judged):
+        raise Exit(1)
+
+
 def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
     """Print the facts of a check, with names at the left, and its warnings."""
     warnings = [Items(findings, tone="warning")] if findings else [Text("no warnings")]

@@ -28,6 +28,7 @@ from skysim.experiments.study.table import (
 )
 from skysim.results import metrics
 from skysim.results.metrics import Summary
+from skysim.results.requirements import Judgment, percent
 
 # Claims that a study's numbers support, in words: whether the tracker's claimed errors are true, and rare events.
 
@@ -173,6 +174,7 @@ def headline(
     lines: PointRows,
     may_be_ambiguous: bool,
     worst: str = "skysim study worst STUDY",
+    judged: Sequence[Sequence[Judgment]] = (),
 ) -> list[str]:
     """Thresholds, refusals, ambiguity and wrong answers, in one or two sentences each; none if all trials failed.
 
@@ -184,12 +186,14 @@ def headline(
         Whether the tracker can refuse a frame as ambiguous
     worst
         The command that lists the worst trials
+    judged
+        Judgments of each requirement at all points
     """
     done = answered(lines)
     if not done:
         return []
     place = placer(study, done)
-    found = list[str]()
+    found = [thresholds.requirement_text(one, done, place) for one in judged]
     for threshold in study.thresholds:
         found += thresholds.sentences(threshold, study, done)
     found.append(solved_everywhere(study, done, place, worst))
@@ -208,17 +212,21 @@ def answered(lines: PointRows) -> list[PointRow]:
     ]
 
 
-def verdict(study: Study, lines: PointRows) -> str:
+def verdict(study: Study, lines: PointRows, judged: Sequence[Sequence[Judgment]] = ()) -> str:
     """The answer of the study in three or four short sentences; "" if no trial has an answer.
 
-    1. Its thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
+    1. Its requirements and thresholds. 2. How many frames are refused. 3. How many attitudes are wrong.
     """
     done = answered(lines)
     if not done:
         return ""
     place = placer(study, done)
     frame = "attitude" if study.trial.kind == "centroids" else "frame"
-    sentences = [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
+    sentences = []
+    for one in judged:
+        worst, where = thresholds.decisive(one)
+        sentences.append(f"`{one[worst].claim}` is {one[worst].answer}{where}.")
+    sentences += [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
     sentences += [
         worst_share(
             "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done, place
@@ -384,8 +392,3 @@ def none_of(shares: Sequence[Summary]) -> str:
 def interval(share: Summary) -> str:
     """The interval of a fraction in percent."""
     return f"{100 * share.low:.3g} to {percent(share.high)}"
-
-
-def percent(share: float) -> str:
-    """A fraction in percent, to three digits."""
-    return f"{100 * share:.3g} %"

@@ -41,7 +41,7 @@ from skysim.core.yaml_reader import Tree, explain, is_file, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.results.files.parts import Prices, find_prices, read_prices
 from skysim.scene import loader
-from skysim.scene.scene import Scene
+from skysim.scene.scene import Requirements, Scene
 
 TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
@@ -418,6 +418,10 @@ class Study(ConfigModel):
         kind, not for one of them
     responses
         Names that `metrics.response` accepts
+    require
+        Requirements at every point, by default those of the scene: greatest quantile of an error
+        (`cross_arcsec_p95: 60`), greatest share of an event (`wrong: 0.001`), least share of `identified`, `coverage_N`
+        or `right_within_cross_arcsec_10`
     """
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
@@ -437,6 +441,7 @@ class Study(ConfigModel):
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
+    require: Requirements = Field(default_factory=dict)
     optimize: Search | None = None
 
     @model_validator(mode="before")

@@ -149,6 +149,8 @@ def check(plan: Plan, to_run: bool) -> None:
         metrics.response(name, f"responses.{n}")
     check_figures(plan)
     if study.optimize:
+        if study.require:
+            raise InputError("require", "has no effect in a search", "optimize.constraints")
         search.check(study)
     if study.budget.trials is not None and plan.trials > study.budget.trials:
         raise InputError(
@@ -321,6 +323,7 @@ def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> No
     """Raise InputError for a response that no trial of the study measures."""
     where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
     where |= {one.response: key for key, one in named_sections(study)}
+    where |= {name: f"require.{name}" for name in study.require}
     for name, key in where.items():
         measured = MEASURED_BY.get(metrics.split_name(name)[0], kinds)
         if not kinds & set(measured):

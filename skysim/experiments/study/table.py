@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
     Distribution,
@@ -157,7 +157,7 @@ def format_level(value: Any) -> str:
 def format_summary(summary: Summary) -> str:
     """Text of a statistic with its interval, or with the number of further values that it needs to have one."""
     if np.isnan(summary.value):
-        return "-"
+        return f"needs {summary.needs} more values" if summary.needs else "-"
     value, low, high = (0.0 if abs(one) < ROUNDING else one for one in summary[:3])
     if summary.needs:
         return f"{value:.3g} (needs {summary.needs} more values)"
@@ -217,6 +217,7 @@ def with_levels(rows: Rows, levels: dict[str, Array]) -> Rows:
 # Error budget: Sobol indices of the attitude error for each factor (Sobol 1993).
 
 
+OFF = ("off", "none", "no", "exact", "false", "0")
 AXES = {"cross_arcsec": ("x_arcsec", "y_arcsec"), "roll_arcsec": ("roll_arcsec",)}
 RESAMPLES = 200
 
@@ -234,9 +235,85 @@ class Index(NamedTuple):
     rms_arcsec: float
 
 
+def is_off(level: Value) -> bool:
+    """Whether a level switches a cause of errors off: zero, false, or a name in OFF."""
+    return same(level, 0) or format_level(level).partition(" ")[0].lower() in OFF
+
+
+def switches_causes(study: Study) -> bool:
+    """Whether the factors are causes of errors, each off or on, in a design with levels."""
+    levels = [
+        [is_off(one) for one, _ in factor.options()] for factor in study.factors.values()
+    ]
+    return not is_sampled(study) and all(sorted(one) == [False, True] for one in levels)
+
+
+def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
+    """The part of each cause, and of the rest, in the mean square m of one error with all causes on.
+
+    Its first index is what it adds alone, its total one what goes without it,
+
+        (m({i}) - m({})) / m(all),    (m(all) - m(all but i)) / m(all),
+
+    which are equal if the errors are independent and the tracker weights lights alike. NaN without these points;
+    without that of all causes m(all) is m({}) + sum of m({i}) - m({}). The intervals are of the percentile bootstrap
+    over replicates, none of fewer than MIN_VALUES.
+    """
+    squares = complete_outputs(plan, store, AXES[response]) ** 2
+    if not len(squares):
+        squares = np.full((1, len(plan.points)), np.nan)
+    names = [*plan.study.factors, "the rest"]
+    count = len(squares)
+    drawn = random_stream(1).integers(count, size=(RESAMPLES, count))
+    means = np.concatenate([[squares.mean(axis=0)], squares[drawn].mean(axis=1)])
+    points = np.array(
+        [[not is_off(one) for one in each.levels.values()] for each in plan.points]
+    )
+
+    def mean(on: Bools) -> Floats:
+        """(1 + RESAMPLES,) mean square with some causes on; NaN without this point."""
+        there = np.all(points == on, axis=1)
+        return means @ there / (there.sum() or np.nan)
+
+    one = np.eye(len(points[0]), dtype=bool)
+    none = mean(np.zeros(len(one), bool))
+    alone = [mean(on) - none for on in one]
+    every = mean(np.ones(len(one), bool))
+    if np.isnan(every).any():
+        every = none + sum(alone)
+    without = [every - mean(~on) for on in one]
+    shares = np.array([[*alone, none], [*without, np.nan * none]]) / every
+    ends = np.quantile(shares[..., 1:], metrics.TAILS, axis=-1)
+    ends[...] = ends if count >= MIN_VALUES else np.nan
+    sigma_arcsec = math.sqrt(every[0] * len(AXES[response]))
+    return to_indices(names, response, [shares[..., 0], *ends], count, sigma_arcsec)
+
+
+def to_indices(
+    names: Sequence[str],
+    response: str,
+    estimates: Sequence[Floats],
+    count: int,
+    sigma_arcsec: float,
+) -> list[Index]:
+    """The indices of factors from (2, D) first and total values and their ends."""
+    first, total = (
+        [Summary(value, least, most, count) for value, least, most in index]
+        for index in np.stack(estimates, axis=-1).tolist()
+    )
+    return [
+        Index(name, response, one, other, sigma_arcsec * math.sqrt(max(one.value, 0.0)))
+        for name, one, other in zip(names, first, total, strict=True)
+    ]
+
+
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
+    if switches_causes(plan.study):
+        return [
+            index for response in AXES for index in switched_causes(plan, store, response)
+        ]
     if kind != "saltelli" or plan.study.optimize:
         raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
     return [index for response in AXES for index in response_indices(plan, store, response)]
@@ -255,18 +332,10 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     selections = rng.integers(count, size=(RESAMPLES, count))
     resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
     low, high = np.quantile(resampled, metrics.TAILS, axis=0)
-    first, total = (
-        [Summary(value, least, most, count) for value, least, most in index]
-        for index in np.stack([estimate, low, high], axis=-1).tolist()
-    )
     # The variance of the cross-boresight error is the sum of the variances about its two axes.
     variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
     sigma_arcsec = math.sqrt(variance)
-    found = []
-    for name, one, other in zip(names, first, total, strict=True):
-        alone_arcsec = sigma_arcsec * math.sqrt(max(one.value, 0.0))
-        found.append(Index(name, response, one, other, alone_arcsec))
-    return found
+    return to_indices(names, response, [estimate, low, high], count, sigma_arcsec)
 
 
 def sample_outputs(
@@ -274,10 +343,21 @@ def sample_outputs(
 ) -> tuple[Floats, Floats, Floats]:
     """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
 
-    There are N sample rows, D factors and S outputs, one per axis and replicate. A replicate is left out if any of its
-    trials has no solution or is not done yet.
+    There are N sample rows, D factors and S outputs, see `complete_outputs`.
     """
     width = len(plan.study.factors)
+    complete = complete_outputs(plan, store, axes)
+    # Points are in the order A, B, AB_1 .. AB_D.
+    rows = len(plan.points) // (width + 2)
+    blocks = complete.reshape(len(complete), width + 2, rows)
+    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+
+
+def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:
+    """(S, P) errors at the points: S outputs, one per axis and replicate.
+
+    A replicate is left out if any of its trials has no solution or is not done yet.
+    """
     each = plan.study.replicates
     columns = store.columns()
     values = np.full((len(axes), plan.trials), np.nan)
@@ -285,11 +365,7 @@ def sample_outputs(
     # Trial number = point * replicates + replicate.
     by_point = values.reshape(len(axes), len(plan.points), each)
     outputs = by_point.transpose(0, 2, 1).reshape(len(axes) * each, -1)
-    complete = outputs[np.isfinite(outputs).all(axis=1)]
-    # Points are in the order A, B, AB_1 .. AB_D.
-    rows = len(plan.points) // (width + 2)
-    blocks = complete.reshape(len(complete), width + 2, rows)
-    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
+    return outputs[np.isfinite(outputs).all(axis=1)]
 
 
 def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
@@ -377,7 +453,7 @@ def label(name: str, unit: str = "") -> str:
     """Readable name with its unit in brackets: `cross_arcsec_p95` becomes "cross p95 [arcsec]"."""
     stem, _, statistic = name.rpartition("_")
     tail = f" {statistic}"
-    if statistic not in metrics.STATISTICS:
+    if not stem or metrics.statistic_of(statistic) is None:
         stem, tail = name, ""
     ending = next((ending for ending in UNITS if stem.endswith(ending)), "")
     unit = unit or UNITS.get(ending, "")

@@ -8,6 +8,8 @@ one side of the limit to the first level that is certainly on the other, so more
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from itertools import starmap
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +19,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study import table
 from skysim.experiments.study.plan import Curve, Study, Threshold
-from skysim.experiments.study.table import Axis, PointRows
+from skysim.experiments.study.table import Axis, Place, PointRows
 from skysim.results import metrics
+from skysim.results.requirements import MET, NOT_MET, NOT_SHOWN, Judgment, judge, requirement
 
 MOST_TRIALS = 1_000_000  # greatest number of trials that is advised
 MISFIT_PROBABILITY = 1e-3  # probability that a monotonic curve deviates from its isotonic fit by more than is accepted
@@ -151,6 +154,34 @@ def certain_levels(
             break
         beneath = place
     return above, beneath
+
+
+# Requirements of a study.
+
+
+def judged(require: Mapping[str, float], lines: PointRows) -> list[list[Judgment]]:
+    """The judgments of each requirement at all points; a "not met" holds at 95 % for all points together."""
+    return [
+        [judge(one, line.responses[one.response], points=len(lines)) for line in lines]
+        for one in starmap(requirement, require.items())
+    ]
+
+
+def decisive(found: Sequence[Judgment]) -> tuple[int, str]:
+    """The point that decides on a requirement at all points, and at how many of them it has the same answer."""
+    order = (MET, NOT_SHOWN, NOT_MET)
+    keys = [(order.index(one.answer), one.needs, one.misses) for one in found]
+    worst = keys.index(max(keys))
+    same = sum(key[0] == keys[worst][0] for key in keys)
+    if len(found) == 1:
+        return worst, ""
+    return worst, f" at {'all' if same == len(found) else f'{same} of'} {len(found)} points"
+
+
+def requirement_text(found: Sequence[Judgment], lines: PointRows, place: Place) -> str:
+    """Whether a requirement is met at all points, in a sentence with the point that decides."""
+    worst, where = decisive(found)
+    return found[worst].text(f"{where}, most at {place(lines[worst])}" if where else "") + "."
 
 
 # Thresholds of a study.

@@ -162,33 +162,27 @@ def worst_trial(columns: Columns, value: float, flight: bool) -> WorstTrial:
             for name in ("cross_arcsec", "roll_arcsec")
         ),
         *(float(columns[name][0]) for name in DIRECTION),
-        *([] if flight else body_angles_deg(columns, 0)),
+        *([] if flight else body_angles_deg(columns)),
     )
 
 
-def body_angles_deg(columns: Columns, row: int) -> list[float]:
+def body_angles_deg(columns: Columns) -> list[float]:
     """Yaw, pitch and roll of a trial's body under a dome; none under the stars, where the lab is the sky."""
-    wxyz = [float(columns[f"lab_from_body_{part}"][row]) for part in "wxyz"]
-    if not (np.isfinite(columns["body_tilt_deg"][row]) and np.isfinite(wxyz).all()):
+    wxyz = [float(columns[f"lab_from_body_{part}"][0]) for part in "wxyz"]
+    if not np.isfinite([columns["body_tilt_deg"][0], *wxyz]).all():
         return []
-    return [
-        float(angle)
-        for angle in Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True)
-    ]
+    return Rotation.from_quat(wxyz, scalar_first=True).as_euler("ZYX", degrees=True).tolist()
 
 
 def unit_directions(columns: Columns) -> Floats:
     """(N, 3) direction of each trial's attitude: the body's z axis in the lab, or the boresight on the sky."""
     in_dome = np.isfinite(columns["body_tilt_deg"])
-    zenith = np.radians(
-        np.where(in_dome, columns["body_tilt_deg"], 90 - columns["boresight_dec_deg"])
-    )
-    azimuth = np.radians(
-        np.where(in_dome, columns["body_azimuth_deg"], columns["boresight_ra_deg"])
-    )
+    body = columns["body_tilt_deg"], columns["body_azimuth_deg"]
+    boresight = 90 - columns["boresight_dec_deg"], columns["boresight_ra_deg"]
+    zenith, azimuth = np.radians(np.where(in_dome, body, boresight))
+    across = np.sin(zenith)
     return np.stack(
-        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)],
-        axis=1,
+        [across * np.cos(azimuth), across * np.sin(azimuth), np.cos(zenith)], axis=1
     )
 
 
@@ -210,9 +204,12 @@ def ranking(columns: Columns, response: str) -> tuple[list[Floats], Floats]:
         values = metrics.QUANTITIES[quantity](columns)
         key = values if quantity in metrics.MORE_IS_BETTER else -values
         return [key, fewest_first], values
-    flagged = np.nan_to_num(
-        np.asarray(FLAGS.get(response, lambda c: c[response])(columns), dtype=float)
+    flags = (
+        (columns["frames"] > 0) & ~metrics.right_within(response, columns)
+        if metrics.WITHIN.match(response)
+        else FLAGS.get(response, lambda c: c[response])(columns)
     )
+    flagged = np.nan_to_num(np.asarray(flags, dtype=float))
     return [-flagged, unsolved_first, fewest_first], np.where(flagged > 0, flagged, np.nan)
 
 

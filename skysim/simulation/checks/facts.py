@@ -6,12 +6,14 @@ Each function in `FACTS` returns one fact from the context and the samples, or N
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
@@ -32,6 +34,7 @@ SIDES = 12  # number of azimuths of the greatest tilt, and of rays around the fi
 MIN_SHARE = 0.005  # least share of the variance of a cause that is printed
 ARCSEC = "″"
 TRACKER_KNOWS = "tracker knows"
+REQUIREMENTS = "requirements"
 UNTESTED = (
     "matches accepted by the thesis's rule, not tested against chance (tracker.acceptance)"
 )
@@ -478,8 +481,63 @@ def errors_text(cross: float, roll: float) -> str:
     )
 
 
+EQUALLY_LIKELY = (np.arange(1000) + 0.5) / 1000
+# Errors about the boresight's axes of 1 sigma each in 1000 equally likely draws: Rayleigh's law of the length of two
+# equal normal ones, of which cross is the root sum square, and the magnitude of a normal one.
+UNIT_ERRORS = {
+    "cross": np.sqrt(-np.log(EQUALLY_LIKELY)),
+    "roll": special.ndtri(
+        (1 + np.mod(EQUALLY_LIKELY * len(EQUALLY_LIKELY) * attitudes.GOLDEN_RATIO, 1)) / 2
+    ),
+}
+
+
+def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
+    """The expected value of each required error or share at the frames, None without requirements.
+
+    The errors are normal with the expected variances, those about both axes across the boresight equal. `drawn_once` is
+    the share of the variance by errors that a run draws once, of cross or roll, whichever is more.
+    """
+    error = samples.frames.error
+    known = np.isfinite(error.total("cross"))
+    cross, roll = (
+        np.outer(np.sqrt(error.total(angle)), unit) / ARCSEC_RAD
+        for angle, unit in UNIT_ERRORS.items()
+    )
+    sizes = {"cross": cross, "roll": roll, "angle": np.hypot(cross, roll)}
+    lines = []
+    values: dict[str, Any] = {}
+    for name, limit in context.lab.scene.require.items():
+        limits = re.findall(r"([a-z]+)_arcsec_([\d.]+)", name)
+        quantile = re.fullmatch(r"([a-z]+)_arcsec_(?:median|[a-z]+(\d+))", name)
+        expected = math.nan
+        text = "not forecast; `skysim run` and `skysim study` show it"
+        if limits:
+            within = [sizes[angle] <= float(most) for angle, most in limits]
+            expected = float(np.all(within, axis=0).mean())
+            text = f"{100 * expected:.3g} % of at least {100 * limit:g} %"
+        elif quantile and known.any():
+            share = float(f"0.{quantile[2] or 5}")
+            expected = float(np.quantile(sizes[quantile[1]][known], share))
+            text = f"{short(expected)}{ARCSEC} of {limit:g}{ARCSEC}"
+        if not math.isnan(expected):
+            met = expected >= limit if limits else expected <= limit
+            text = f"expected {'' if met else 'not '}to be met: {text}"
+        lines.append(f"{name}: {text}")
+        values[name] = {"limit": limit, "expected": expected}
+    shares = [
+        sum(error.by_cause(angle)[name] for name in DRAWN_ONCE) / error.total(angle)
+        for angle in UNIT_ERRORS
+    ]
+    values["drawn_once"] = (
+        float(np.mean(np.max(shares, axis=0)[known])) if known.any() else 1.0
+    )
+    return Fact(REQUIREMENTS, lines, values) if lines else None
+
+
 # Causes of the expected error that are drawn with the survey.
 SURVEYED = ("LED survey", "survey set-up", "common survey", "lever survey", "surface survey")
+DRAWN_ONCE = (*SURVEYED, "focal length")
 
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
@@ -520,4 +578,5 @@ FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
     depth_of_focus,
     tracker_beliefs,
     expected_error,
+    requirements,
 )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,7 @@ from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import RollingShutterConfig, TwoStopsConfig
+from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes
@@ -93,20 +94,24 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     """
     scene = context.lab.scene
     sources = context.lab.camera.sources
-    cures = dict[str, str]()
-    led = getattr(scene.light, "led", None)
-    if led is not None and led.intensity_cd is not None:
-        cures["light.led.intensity"] = f"{short(1e3 * factor * led.intensity_cd, 2)} mcd"
-    elif led is not None:
-        cures["light.led.radiant_intensity"] = (
-            f"{short(1e6 * factor * led.radiant_intensity_w_sr, 2)} uW / sr"
-        )
+    cures = led_strength(scene, factor)
     cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
-    if factor * scene.exposure.time_s >= max(cycle_s, SHORTEST_S) or led is None:
+    if factor * scene.exposure.time_s >= max(cycle_s, SHORTEST_S) or not cures:
         cures["exposure.time"] = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
     if scene.camera.f_number / math.sqrt(factor) <= LARGEST_F_NUMBER:
         cures["camera.f_number"] = short(scene.camera.f_number / math.sqrt(factor), 2)
     return cures
+
+
+def led_strength(scene: Scene, factor: float) -> dict[str, str]:
+    """The key of the strength of the LEDs with a value that makes them stronger by a factor; empty without LEDs."""
+    led = getattr(scene.light, "led", None)
+    if led is None:
+        return {}
+    if led.intensity_cd is not None:
+        return {"light.led.intensity": f"{short(1e3 * factor * led.intensity_cd, 2)} mcd"}
+    radiant_uw_sr = 1e6 * factor * led.radiant_intensity_w_sr
+    return {"light.led.radiant_intensity": f"{short(radiant_uw_sr, 2)} uW / sr"}
 
 
 def bright_background(context: Context, samples: CheckedSamples) -> str:
@@ -193,7 +198,8 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
         return ""
     # 4. Recommendation.
     if isinstance(scene.light, DomeConfig):
-        return f"{density_key(scene.light.layout)}: {text}; {denser(scene.light.layout, float(on_chip.mean()))}"
+        key, change = denser(scene.light.layout, float(on_chip.mean()))
+        return f"{key}: {text}; {change}"
     fainter = scene.tracker.limit_mag + 1
     sky_mag = getattr(scene.light, "limit_mag", None)
     if sky_mag is not None and sky_mag < scene.tracker.limit_mag:
@@ -226,33 +232,21 @@ def least_lights(scene: Scene) -> int:
     return 2 if scene.tracker.decoder else MIN_LIGHTS
 
 
-def density_key(layout: Layout) -> str:
-    """The key that sets the number of LEDs of a layout."""
-    key = "light.layout"
-    points = layout
-    if isinstance(layout, OnPoints):
-        key = "light.layout.points"
-        points = layout.points
-    for name in ("count", "spacing_m", "limit_mag"):
-        if getattr(points, name, None) is not None:
-            return f"{key}.{name.removesuffix('_m')}"
-    return key
-
-
-def denser(layout: Layout, mean: float) -> str:
-    """The change of a layout that gives a mean of three times the lights that an identification needs.
+def denser(layout: Layout, mean: float) -> tuple[str, str]:
+    """The key that sets the number of LEDs, and its change to a mean of three times what an identification needs.
 
     `mean` is the mean number of lights on the detector.
     """
+    key = "light.layout.points" if isinstance(layout, OnPoints) else "light.layout"
     points = layout.points if isinstance(layout, OnPoints) else layout
     factor = max(3 * MIN_LIGHTS / max(mean, 0.5), 1.5)
-    count = getattr(points, "count", None)
-    spacing_m = getattr(points, "spacing_m", None)
-    if count is not None:
-        return f"change it to {math.ceil(factor * count)}"
-    if spacing_m is not None:
-        return f"change it to {1e3 * spacing_m / math.sqrt(factor):.3g} mm"
-    return f"add LEDs: {factor:.1f} times as many"
+    if (count := getattr(points, "count", None)) is not None:
+        return f"{key}.count", f"change it to {math.ceil(factor * count)}"
+    if (spacing_m := getattr(points, "spacing_m", None)) is not None:
+        spacing_mm = 1e3 * spacing_m / math.sqrt(factor)
+        return f"{key}.spacing", f"change it to {spacing_mm:.3g} mm"
+    limited = getattr(points, "limit_mag", None) is not None
+    return key + ".limit_mag" * limited, f"add LEDs: {factor:.1f} times as many"
 
 
 def undetected(context: Context, samples: CheckedSamples) -> str:
@@ -290,24 +284,15 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
     It names the exposure time if the frame rate allows it, else the lens for stars and the current for LEDs.
     """
     exposure_s = factor * scene.exposure.time_s
-    led = getattr(scene.light, "led", None)
+    led = led_strength(scene, factor)
     if exposure_s <= 1 / scene.exposure.rate_hz:
-        other = (
-            "light.led.intensity as much"
-            if led is not None
-            else "camera.f_number to a faster lens"
-        )
+        other = "light.led.intensity as much" if led else "camera.f_number to a faster lens"
         return (
             f"exposure.time: {text}; change it to {short(1e3 * exposure_s, 2)} ms, or {other}"
         )
-    if led is None:
-        return f"camera.f_number: {text}; change it to {short(scene.camera.f_number / math.sqrt(factor), 2)}"
-    if led.intensity_cd is not None:
-        return f"light.led.intensity: {text}; change it to {short(1e3 * factor * led.intensity_cd, 2)} mcd"
-    radiant_uw_sr = 1e6 * factor * led.radiant_intensity_w_sr
-    return (
-        f"light.led.radiant_intensity: {text}; change it to {short(radiant_uw_sr, 2)} uW / sr"
-    )
+    led = led or {"camera.f_number": short(scene.camera.f_number / math.sqrt(factor), 2)}
+    ((key, value),) = led.items()
+    return f"{key}: {text}; change it to {value}"
 
 
 def not_where_expected(context: Context, samples: CheckedSamples) -> str:
@@ -340,17 +325,6 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
 
 
-def surface_error_m(scene: Scene) -> float:
-    """Survey error of the dome's surface; 0 without a dome."""
-    return float(scene.light.surface.error_m) if isinstance(scene.light, DomeConfig) else 0.0
-
-
-def row_time_us(scene: Scene) -> float:
-    """Row time of a rolling shutter in us; 0 for another shutter."""
-    shutter = scene.camera.shutter
-    return 1e6 * shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-
-
 MISMATCH_KEYS = {
     "focal length": "tracker.assumed_focal_length",
     "distortion": "tracker.assumed_distortion",
@@ -360,7 +334,7 @@ MISMATCH_KEYS = {
     "surface survey": "light.surface.error",
 }
 # The recommended change, as a function of the scene and of the ratio of the displacement to the allowed one.
-CHANGES: dict[str, Callable[[Scene, float], str]] = {
+CHANGES: dict[str, Callable[[Any, float], str]] = {
     "focal length": lambda scene, excess: (
         f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
     ),
@@ -371,14 +345,14 @@ CHANGES: dict[str, Callable[[Scene, float], str]] = {
         "leave it out, or fit the place with tracker.solver: pnp"
     ),
     "rolling shutter": lambda scene, excess: (
-        f"leave it out, so that the tracker corrects the rows for {short(row_time_us(scene), 3)} us each, or turn"
-        f" {short(excess, 2)} times slower"
+        "leave it out, so that the tracker corrects the rows for"
+        f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
     ),
     "survey set-up": lambda scene, excess: (
         f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
     ),
     "surface survey": lambda scene, excess: (
-        f"change it to {short(1e3 * surface_error_m(scene) / excess, 2)} mm"
+        f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
     ),
 }
 
@@ -396,11 +370,7 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     # No key changes the positions of listed LEDs.
     if getattr(light.layout, "points", light.layout).kind == "listed":
         return ""
-    key = (
-        "light.layout.points.cap_deg"
-        if hasattr(light.layout, "points")
-        else "light.layout.cap_deg"
-    )
+    key = f"light.layout{'.points' * hasattr(light.layout, 'points')}.cap_deg"
     uncovered = (
         "the tilt itself is not covered"
         if found.tilt_deg > found.cap_deg

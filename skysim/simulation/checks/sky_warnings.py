@@ -221,10 +221,8 @@ def floor_too_small(context: Context, samples: CheckedSamples) -> str:
     high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        if expected_nees(samples.reach, context, middle) > TRUE_NEES:
-            low = middle
-        else:
-            high = middle
+        small = expected_nees(samples.reach, context, middle) > TRUE_NEES
+        low, high = (middle, high) if small else (low, middle)
     return (
         f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"
         f" {nees:.2g}; 3 if true); change it to {short(high, 2)}"

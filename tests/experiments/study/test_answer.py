@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 from scipy import stats
 
-from skysim.experiments.study import answer, study_file
+from skysim.experiments.study import answer, study_file, thresholds
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
@@ -60,6 +60,35 @@ def line(n: int, leds: int, trials: int, **hits: int) -> PointRow:
 def said(texts: list[str], start: str) -> str:
     (text,) = [one for one in texts if one.startswith(start)]
     return text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "start", "brief"),
+    [
+        ((0, 0), "wrong ≤ 0.001: met at all 2 points, most at", "is met at all 2 points."),
+        (
+            (0, 40),
+            "wrong ≤ 0.001: not met at 1 of 2 points, most at leds = 900: 1 %",
+            "is not met",
+        ),
+        (
+            (0, 3),
+            "wrong ≤ 0.001: not shown yet at 1 of 2 points, most at leds = 900, needs",
+            "not",
+        ),
+    ],
+)
+def test_a_requirement_is_answered_for_all_points_by_the_one_that_decides(
+    wrong: tuple[int, int], start: str, brief: str
+) -> None:
+    lines = [
+        line(n, leds, 4000, wrong=count)
+        for n, (leds, count) in enumerate(zip((500, 900), wrong, strict=True))
+    ]
+    judged = thresholds.judged({"wrong": 0.001}, lines)
+    assert answer.headline(study(), lines, False, judged=judged)[0].startswith(start)
+    assert answer.verdict(study(), lines, judged).startswith("`wrong ≤ 0.001` is")
+    assert brief in answer.verdict(study(), lines, judged)
 
 
 def test_without_ambiguity_the_answer_has_a_confidence() -> None:

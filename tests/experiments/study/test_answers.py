@@ -96,7 +96,7 @@ def test_correct_covariances_are_not_called_overconfident():
 
 
 @pytest.mark.parametrize(
-    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p91", "coverage_", "_p95", ""]
+    "name", ["identify", "cross_arcsec", "cross_p95", "stars_p9", "coverage_", "_p95", ""]
 )
 def test_an_unknown_response_is_refused_with_the_known_ones(name):
     with pytest.raises(
@@ -158,6 +158,58 @@ def test_the_error_budget_attributes_errors_to_their_factors(tmp_path):
     )
     drawn = np.degrees(1) * 3600 * 0.2 / (48 * 25.4)
     assert found["cross_arcsec", "lever_x"].rms_arcsec == pytest.approx(drawn, rel=0.6)
+
+
+SWITCHED = """schema: 1
+title: causes off and on
+scene: afit_simsat
+seed: 1
+trial: {kind: centroids, noise_px: 0.1, tilt_deg: [0, 10]}
+factors:
+  leds: {key: tracker.survey.led_sigma, values: ["0 mm", "0.2 mm"]}
+  lever: {levels: {exact: {tracker.survey.lever_sigma: "0 mm"}, surveyed: {}}}
+replicates: 3
+responses: [identified]
+"""
+
+
+@pytest.mark.parametrize(
+    ("design", "first", "total"),
+    [
+        # Of variances 1, 4 and 16; 25 with all on, by an interaction of 4.
+        ("factorial", (4 / 25, 16 / 25, 1 / 25), (8 / 25, 20 / 25, math.nan)),
+        ("one_at_a_time", (4 / 21, 16 / 21, 1 / 21), (4 / 21, 16 / 21, math.nan)),
+    ],
+)
+def test_switched_causes_have_their_parts_of_the_mean_square(
+    tmp_path, monkeypatch, design, first, total
+):
+    path = tmp_path / "question.yaml"
+    path.write_text(SWITCHED + f"design: {{kind: {design}}}\n")
+    study_plan = study_file.load(path)
+    assert table.switches_causes(study_plan.study)
+    squares = {(0, 0): 1.0, (1, 0): 5.0, (0, 1): 17.0, (1, 1): 25.0}
+    on = [
+        (int(a != "0 mm"), int(b != "exact"))
+        for a, b in (one.levels.values() for one in study_plan.points)
+    ]
+    errors = np.sqrt([squares[one] for one in on]) * np.array([[1.0], [-1.0]] * 4)
+    monkeypatch.setattr(table, "complete_outputs", lambda plan, store, axes: errors)
+    found = [one for one in table.indices(study_plan, None) if one.response == "roll_arcsec"]
+    assert [one.factor for one in found] == ["leds", "lever", "the rest"]
+    assert [one.first.value for one in found] == pytest.approx(first)
+    assert [one.total.value for one in found] == pytest.approx(total, nan_ok=True)
+    assert [one.rms_arcsec for one in found] == pytest.approx([2, 4, 1])
+    assert found[0].first.low == pytest.approx(first[0])
+
+
+@pytest.mark.parametrize(
+    "levels", ['values: ["0.1 mm", "0.2 mm"]', 'values: ["0 mm", "0.1 mm", "0.2 mm"]']
+)
+def test_other_factors_than_switches_have_no_causes(tmp_path, levels):
+    path = tmp_path / "question.yaml"
+    path.write_text(SWITCHED.replace('values: ["0 mm", "0.2 mm"]', levels))
+    assert not table.switches_causes(study_file.load(path).study)
 
 
 def test_one_output_has_the_indices_of_many_equal_ones():
@@ -225,9 +277,10 @@ def test_independent_factors_are_said_to_matter_in_at_most_one_study_of_twenty(t
     assert said <= 5 + 4 * math.sqrt(4.75)
 
 
-def test_a_budget_without_trials_is_nan_and_no_error(tmp_path):
+@pytest.mark.parametrize("text", [ERRORS, SWITCHED])
+def test_a_budget_without_trials_is_nan_and_no_error(tmp_path, text):
     path = tmp_path / "question.yaml"
-    path.write_text(ERRORS)
+    path.write_text(text)
     study_plan = study_file.load(path)
     with store.writing(tmp_path / "study.sqlite") as rows:
         runner.prepare_store(study_plan, rows, resume=False)

@@ -70,8 +70,8 @@ def test_an_override_changes_the_study(tmp_path):
             r"replicas: unknown key; did you mean replicates\?.*line 10\)",
         ),
         (
-            ("cross_arcsec_p95", "cross_arcsec_p96"),
-            r"responses.1: unknown response 'cross_arcsec_p96'; allowed: over.*line 11\)",
+            ("cross_arcsec_p95", "cross_arcsec_p"),
+            r"responses.1: unknown response 'cross_arcsec_p'; allowed: over.*line 11\)",
         ),
         (
             ("trial.false_lights", "trial.falselights"),

@@ -94,6 +94,7 @@ def run(
     statistics = print_results(loaded, finished, rows, plan, json)
     if open_:
         typer.launch(statistics["report"])
+    terminal.fail_if_not_met(statistics.get("requirements", ()))
 
 
 def print_results(

@@ -21,6 +21,7 @@ from skysim.apps.cli.options import (
     used_programs,
 )
 from skysim.apps.cli.terminal import (
+    fail_if_not_met,
     print_error,
     print_json,
     print_replay,
@@ -345,7 +346,7 @@ def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
 
 def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
     """Write the HTML report, print it, and open it in the browser if `open_`."""
-    from skysim.experiments.study import search, table
+    from skysim.experiments.study import answer, search, table, thresholds
     from skysim.experiments.study.report import study_report
 
     path = place.folder / "report.html"
@@ -357,10 +358,12 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
     report.save(path)
     if open_:
         typer.launch(str(path))
+    judged = [one._asdict() for row in found.judged for one in row]
     if not json:
         report.print()
         print(f"store: {progress['store']} (code {progress['code']})")
         print(f"report: {path}")
+        fail_if_not_met(judged)
         return
     columns = table.to_columns(table.select_responses(found.lines, plan.study.responses))
     told = {
@@ -369,7 +372,20 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
         "answers": found.answers,
         "findings": found.about.findings,
     }
+    if judged:
+        lines = answer.answered(found.lines)
+        progress["requirements"] = [
+            row[thresholds.decisive(row)[0]]._asdict()
+            | {
+                "points": [
+                    one._asdict() | {"point": line.point}
+                    for one, line in zip(row, lines, strict=False)
+                ]
+            }
+            for row in found.judged
+        ]
     print_json(progress | told | (search.front_columns(found.result) if found.result else {}))
+    fail_if_not_met(judged)
 
 
 class Place(NamedTuple):

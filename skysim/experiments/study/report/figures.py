@@ -255,16 +255,15 @@ def draw_points(
         return
     size = min(max(4.5 * (MAX_POINTS_WITH_BARS / len(one.x)) ** 0.3, 1.8), 4.5)
     axes.plot(one.x, one.value, markersize=size, markeredgewidth=0, alpha=0.5, **style)
-    if numeric:
-        axes.plot(*running_median(one), color=ink, linewidth=2.2, label=one.label or None)
-    else:
-        medians = {
+    style = {"linewidth": 2.2}
+    if not numeric:
+        style = {
             "marker": "_",
             "markersize": 26,
             "markeredgewidth": 2.2,
             "linestyle": "none",
         }
-        axes.plot(*level_medians(one), color=ink, label=one.label or None, **medians)
+    axes.plot(*medians(one, numeric), color=ink, label=one.label or None, **style)
 
 
 def draw_bars(axes: Any, x: Floats, one: Series | Panel, ink: Any, where: Any) -> None:
@@ -283,21 +282,17 @@ def drawn_interval(axes: Any, one: Series | Panel) -> tuple[Floats, Floats]:
     return np.maximum(one.low, below), np.maximum(one.high, below)
 
 
-def running_median(one: Series) -> tuple[Floats, Floats]:
-    """Medians of x and of value in twelve groups of equal size, along a series ascending in x."""
-    good = np.isfinite(one.value)
-    groups = [rows for rows in np.array_split(np.flatnonzero(good), 12) if len(rows)]
-    x = [np.median(one.x[rows]) for rows in groups]
-    values = [np.median(one.value[rows]) for rows in groups]
-    return np.array(x), np.array(values)
-
-
-def level_medians(one: Series) -> tuple[Floats, Floats]:
-    """Median of the values at each distinct x."""
-    places = np.unique(one.x[np.isfinite(one.value)])
-    return places, np.array(
-        [np.nanmedian(one.value[one.x == coordinate]) for coordinate in places]
+def medians(one: Series, numeric: bool) -> tuple[Floats, Floats]:
+    """Medians of x and value in twelve groups of equal size along a series ascending in x, or at each named level."""
+    good = np.flatnonzero(np.isfinite(one.value))
+    groups = np.array_split(good, 12)
+    if not numeric:
+        groups = [good[one.x[good] == level] for level in np.unique(one.x[good])]
+    filled = [rows for rows in groups if len(rows)]
+    x, values = (
+        np.array([np.median(each[rows]) for rows in filled]) for each in (one.x, one.value)
     )
+    return x, values
 
 
 def colors(count: int, group_axis: Axis | None) -> list[Any]:
@@ -424,7 +419,7 @@ def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None
 
 
 def indices_png(indices: Sequence[Index], response: str) -> bytes:
-    """Bar chart of the first-order and total Sobol indices of one response, largest total first, as PNG."""
+    """Bar chart of the first-order and total indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
     return png(

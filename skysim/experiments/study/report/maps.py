@@ -129,7 +129,7 @@ def least_values(response: str) -> int:
     Of 1 / (1 - p) values one exceeds the quantile p, of 1 / p one is below it. With fewer values the quantile is about
     the largest or the smallest one.
     """
-    share = metrics.QUANTILES.get(metrics.split_name(response)[1], 0.5)
+    share = metrics.probability_of(metrics.split_name(response)[1]) or 0.5
     return max(MIN_VALUES, math.ceil(round(1 / min(share, 1 - share), 9)))
 
 
@@ -137,14 +137,9 @@ def radial_range(radial_deg: Floats, sky: bool) -> tuple[float, float]:
     """Range of tilts or declinations to draw: that of the trials in whole degrees, extended to near poles."""
     low = float(np.floor(radial_deg.min()))
     high = float(np.floor(radial_deg.max())) + 1
-    if not sky:
-        return (0.0 if low <= 1 else low), high
-    bottom, top = SKY_RANGE_DEG
-    if low < bottom + 5:
-        low = bottom
-    if high > top - 5:
-        high = top
-    return low, high
+    bottom, top = SKY_RANGE_DEG if sky else (0.0, math.inf)
+    near = 5 if sky else 2
+    return (bottom if low < bottom + near else low), (top if high > top - near else high)
 
 
 def partition(

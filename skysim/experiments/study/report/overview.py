@@ -6,6 +6,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -51,12 +52,15 @@ class Overview(NamedTuple):
         Whether the tracker can refuse a frame as ambiguous
     fixed
         Seeds of hardware that all trials share, see `study_file.fixed_seeds`
+    require
+        Requirements of the study, or else of its scene
     """
 
     rows: list[tuple[str, str]]
     findings: list[str]
     may_be_ambiguous: bool
     fixed: tuple[str, ...] = ()
+    require: Mapping[str, float] = MappingProxyType({})
 
 
 def overview(plan: Plan) -> Overview:
@@ -67,6 +71,7 @@ def overview(plan: Plan) -> Overview:
     checked = 0
     may_be_ambiguous = False
     fixed = dict[str, None]()
+    require = plan.study.require
     for levels, point in checked_points(plan):
         if checked == MAX_CHECKED:
             break
@@ -85,6 +90,8 @@ def overview(plan: Plan) -> Overview:
             leds[levels] = len(lab.camera.sources)
         may_be_ambiguous |= may_report_ambiguity(scene)
         fixed |= dict.fromkeys(fixed_seeds(plan.study, scene))
+        if not plan.study.optimize:  # candidates need not meet them
+            require = require or scene.require
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
@@ -92,7 +99,7 @@ def overview(plan: Plan) -> Overview:
         finding_text([(line, with_leds(at, leds)) for line, at in one], checked)
         for one in found.values()
     ]
-    return Overview(rows, findings, may_be_ambiguous, tuple(fixed))
+    return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require)
 
 
 def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:

@@ -39,11 +39,9 @@ def names_with_values(store: Store) -> list[str]:
     """Names of the columns of `trial_columns` that are not empty; all names if there are no trials."""
     every = [*COLUMNS, *level_columns(store)]
     empty = set(COLUMNS)
-    some = False
     for block in store.blocks():
-        some |= bool(len(block["trial"]))
         empty -= {name for name in empty if has_values(block[name])}
-    return [name for name in every if name not in empty] if some else every
+    return every if "trial" in empty else [name for name in every if name not in empty]
 
 
 def has_values(column: Array) -> bool:

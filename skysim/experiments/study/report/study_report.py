@@ -6,13 +6,14 @@ import itertools
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core.paths import STUDIES, shipped_files
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import OverrideTexts
-from skysim.experiments.study import answer, search
+from skysim.experiments.study import answer, search, thresholds
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
@@ -35,6 +36,7 @@ from skysim.experiments.study.table import (
     same,
     select_responses,
     shown_points,
+    switches_causes,
     table,
 )
 from skysim.experiments.study.worst import ColumnsOf, ranked, worst_trials
@@ -57,6 +59,7 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
+from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
@@ -64,9 +67,16 @@ STUDY_FILE = "The study file"
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
 OPEN_ROWS = 20  # number of rows above which that table is folded
+# Title and caption of the indices.
 SOBOL = (
+    "Sobol indices",
     "Sobol indices of {}: the share of its variance that would go were a factor known, and that would stay were all"
-    " others known; intervals of 95 %."
+    " others known; intervals of 95 %.",
+)
+ERROR_CAUSES = (
+    "Error causes",
+    "Causes of {}: of its mean square with all causes on, the share that each adds alone (first order), and that goes"
+    " without it (total); intervals of 95 %.",
 )
 
 
@@ -86,11 +96,13 @@ class Analysis(NamedTuple):
     ranges
         Range of each response, in words
     indices
-        Sobol indices, for the design saltelli
+        Sobol indices, for the design saltelli; shares of causes where the factors switch causes on and off
     result
         Candidates and front, for a search
     pooled
         In place of the table of points: all points of a sampled design together
+    judged
+        Judgments of each requirement at all points with an answer
     """
 
     lines: PointRows
@@ -101,6 +113,7 @@ class Analysis(NamedTuple):
     indices: Sequence[Index] = ()
     result: SearchResult | None = None
     pooled: Sequence[Block] = ()
+    judged: Sequence[Sequence[Judgment]] = ()
 
     @property
     def answers(self) -> list[str]:
@@ -154,22 +167,27 @@ def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis
     """The analysis of the trials in a store; `command` is the function of `commands`."""
     study = plan.study
     about = overview(plan)
-    names = list(dict.fromkeys([*responses(study), *answer.RESPONSES]))
+    deciding = [one.response for one in starmap(requirement, about.require.items())]
+    names = list(dict.fromkeys([*responses(study), *answer.RESPONSES, *deciding]))
     lines = table(store, names)
     columns = pooled(plan, store)
     answered = [pooled_row(plan, columns, names)] if columns else lines
-    headline = answer.headline(study, answered, about.may_be_ambiguous, command("worst"))
+    judged = thresholds.judged(about.require, answer.answered(answered))
+    headline = answer.headline(
+        study, answered, about.may_be_ambiguous, command("worst"), judged
+    )
     headline += answer.one_unit(about.fixed) if headline else []
     sobol = study.design.kind == "saltelli" and not study.optimize
     return Analysis(
         lines,
         about,
-        answer.verdict(study, answered),
+        answer.verdict(study, answered, judged),
         headline,
         answer.ranges(study, answered),
-        indices(plan, store) if sobol else [],
+        indices(plan, store) if sobol or switches_causes(study) else [],
         search.collect_result(plan, store) if study.optimize else None,
         pooled_blocks(plan, columns, command("replay")) if columns else (),
+        judged,
     )
 
 
@@ -201,19 +219,22 @@ def compose(
     costs = (
         {one.number: one.cost for one in found.result.candidates} if found.result else None
     )
+    title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
         *search_figures(lines, study, front, costs, also),
-        *sobol_figures(found.indices),
+        *index_figures(found.indices, shares),
         *study_figures(lines, study, store.point_columns, command("replay")),
     ]
     shown = {one.response for one in layout.figures(study, lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
     done = progress(study, store)
+    unmet = any(one.answer == NOT_MET for row in found.judged for one in row)
+    tone: Tone = "bad" if unmet else done.tone
     further = [*drawn[1:], Text(left and f"In the table alone: {left}.")]
     blocks = [
         Text(question(store.meta("study")), on_terminal=False),
         *(
-            [Verdict(found.verdict, done.tone), done]
+            [Verdict(found.verdict, tone), done]
             if found.verdict
             else [Verdict(done.text, done.tone)]
         ),
@@ -224,7 +245,8 @@ def compose(
         folded("Ranges of the responses", [range_table(study, found.lines)])
         if not found.pooled
         else Text(""),
-        Section("Sobol indices", [index_table(found.indices)]),
+        Section("Requirements", requirement_table(study, found)),
+        Section(title, [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
         Section(POOLED, found.pooled)
         if found.pooled
@@ -372,6 +394,19 @@ def range_table(study: Study, lines: PointRows) -> Table:
     )
 
 
+def requirement_table(study: Study, found: Analysis) -> list[Block]:
+    """The judgment of each requirement at each point, and the share of its trials that miss it."""
+    if not any(found.judged) or found.pooled:
+        return []
+    lines = answer.answered(found.lines)
+    places = map(answer.placer(study, lines), lines)
+    answers = [
+        [f"{one.answer} ({percent(one.misses)} miss)" for one in row] for row in found.judged
+    ]
+    heads = ["at", *(row[0].claim for row in found.judged)]
+    return [Table(list(map(text_column, heads)), list(zip(places, *answers, strict=True)))]
+
+
 def index_table(indices: Sequence[Index]) -> Table:
     """The Sobol indices, the largest total of each error first."""
     columns = [
@@ -501,11 +536,11 @@ def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
     return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
 
 
-def sobol_figures(indices: Sequence[Index]) -> list[Figure]:
-    """Sobol indices, one image per response."""
+def index_figures(indices: Sequence[Index], caption: str) -> list[Figure]:
+    """Bar charts of indices, one per response."""
     named = dict.fromkeys(one.response for one in indices)
     return [
-        Figure(figures.indices_png(indices, name), SOBOL.format(name), name=name)
+        Figure(figures.indices_png(indices, name), caption.format(name), name=name)
         for name in named
     ]
 
