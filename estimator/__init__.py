@@ -15,6 +15,8 @@ MODULE_OF = {
     "GyroModel": "filter.error_models",
     "Health": "trackers.tracking_mode",
     "ImageError": "core.errors",
+    "LedMap": "attitude.dome_map",
+    "Lever": "attitude.dome_map",
     "Report": "trackers.pipeline",
     "Settings": "trackers.pipeline",
     "StarCatalog": "catalog.catalog",

@@ -8,14 +8,19 @@ surface gives points whose directions from the bearing center have angles that d
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
+
+UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,92 @@ class LedMap:
     def radius_m(self) -> Floats:
         """(N,) distance of each LED from the bearing center."""
         return np.linalg.norm(self.position_m, axis=1)
+
+    @classmethod
+    def from_csv(
+        cls, path: str | Path, unit: str | None = None, sigma_m: float = 0.0
+    ) -> LedMap:
+        """Return the map of a list of LEDs: a text file whose first line names its columns.
+
+        Columns are separated by commas, or by blanks in a line without commas; lines that begin with # are comments.
+        x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, are places from the bearing center in the dome's axes. `id`
+        numbers the LEDs; without it they are numbered from 0. Other columns are not used.
+
+        The surface is the sphere about the bearing center with their mean distance. The default identifier and solver
+        do not use it; for the others replace it by the dome's.
+
+        Parameters
+        ----------
+        path
+            The file
+        unit
+            Unit of columns x, y, z, which have none in their names: m, mm, cm or in
+        sigma_m
+            Standard deviation of a place along each axis
+
+        Raises
+        ------
+        ImageError
+            With the number of the line, for a file that cannot be read in this way, or that has an LED twice.
+        """
+        lines, table = _read_leds(path, unit)
+        position_m = table[:, :3]
+        number = table[:, 3] if table.shape[1] == 4 else np.arange(len(table))
+        first = dict(zip(number[::-1], lines[::-1], strict=True))
+        for n, line in zip(number, lines, strict=True):
+            if n % 1 or n < 0 or first[n] != line:
+                raise ImageError(
+                    f"{path}: line {line}: id {n:g}; allowed: whole numbers from 0, each once"
+                )
+        if pairs := cKDTree(position_m).query_pairs(SAME_PLACE_M):
+            one, other = (lines[n] for n in min(pairs))
+            raise ImageError(
+                f"{path}: line {other}: the LED of line {one}; allowed: each once"
+            )
+        radius_m = np.full(3, np.linalg.norm(position_m, axis=1).mean())
+        numbers = number.astype(np.int64)
+        return cls(numbers, position_m, np.zeros(3), radius_m, sigma_m=sigma_m)
+
+
+def _read_leds(path: str | Path, unit: str | None) -> tuple[list[int], Floats]:
+    """Return the numbers of the lines of a list of LEDs, and its columns x_m, y_m, z_m and id, if it has that."""
+    units = {f"_{name}": scale for name, scale in UNIT_M.items()}
+    if unit is not None:
+        checks.known("unit", unit, UNIT_M)
+        units[""] = UNIT_M[unit]
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ImageError(
+            f"{path}: cannot be read: {error}; allowed: a list of LEDs"
+        ) from None
+    rows = [
+        (n, [cell.strip() for cell in line.split("," if "," in line else None)])
+        for n, line in enumerate(text, 1)
+        if line.strip() and line[0] != "#"
+    ]
+    names = rows[0][1] if rows else []
+    found = [end for end in units if {f"{axis}{end}" for axis in "xyz"} <= {*names}]
+    if len(found) != 1 or len({*names}) < len(names) or len(rows) < 2:
+        raise ImageError(
+            f"{path}: no list of LEDs; allowed: columns x_m, y_m, z_m, or x_mm, x_cm, x_in and so on, or x, y, z with a"
+            " unit; one LED a line"
+        )
+    used = [f"{axis}{found[0]}" for axis in "xyz"] + ["id"] * ("id" in names)
+    table = []
+    for n, cells in rows[1:]:
+        try:
+            row = dict(zip(names, cells, strict=True))
+            table.append([float(row[name]) for name in used])
+        except ValueError:
+            table.append([np.nan])
+        if not np.isfinite(table[-1]).all():
+            raise ImageError(
+                f"{path}: line {n}: {','.join(cells)[:40]!r}; allowed: {len(names)} columns, finite numbers in"
+                f" {', '.join(used)}"
+            )
+    scales = [units[found[0]]] * 3 + [1.0]
+    return [n for n, _ in rows[1:]], np.array(table) * scales[: len(used)]
 
 
 @dataclass(frozen=True, slots=True)

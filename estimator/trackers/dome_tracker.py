@@ -200,7 +200,8 @@ class DomeTracker:
     camera, leds, lever
         On-board calibration, map of the dome, and position and orientation of the camera
     settings
-        Algorithms of the stages, and their parameters
+        Algorithms of the stages, and their parameters; `default` is led_pairs for the identifier, and rotation_only for
+        the solver
 
     Raises
     ------
@@ -217,6 +218,9 @@ class DomeTracker:
         settings: Settings = SETTINGS,
     ) -> None:
         checks.of_type("camera", camera, Camera)
+        for stage in ("identifier", "solver"):
+            if getattr(settings, stage, "") == "default":
+                settings = replace(settings, **{stage: getattr(SETTINGS, stage)})
         check_algorithms(settings, IDENTIFIERS, SOLVERS)
         check_map(leds)
         check_lever(leds, lever)

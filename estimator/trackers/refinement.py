@@ -129,19 +129,10 @@ class FieldMatcher:
         ):
             return Attitude(NO_MATCH)
         # 4. Covariance
-        seen_cam = cam_from_ref.apply(vectors)
-        residual_px = camera.pixels(seen_cam) - xy
-        rms_px = float(np.sqrt(np.mean(residual_px**2)))
-        residual = residual_px / (camera.focal_px * sigma_rad)[:, None]
-        parameters = 5 if fit_lens else 3
-        sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual, parameters))
-        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(
-            covariance_rad2, camera, xy, seen_cam, sigma_rad
-        )
         match = StarMatch(observed, star, cam_from_ref, chance, self.stars.v_mag[star])
-        return Attitude(
-            "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
+        parameters = 5 if fit_lens else 3
+        return solved_attitude(
+            match, vectors, xy, camera, sigma_rad, self.settings.solver, parameters
         )
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
@@ -230,6 +221,40 @@ class FieldMatcher:
         # The gates of all stars cover the share N pi gate^2 / (4 pi) of the sky.
         covered = min(len(self.stars) * gate_rad**2 / 4, 1.0)
         return near, (len(centroids) - len(solution.star)) * covered
+
+
+def solved_attitude(
+    match: StarMatch,
+    vectors_ref: Floats,
+    xy_px: Floats,
+    camera: Camera,
+    sigma_rad: Floats,
+    solver: str,
+    parameters: int,
+) -> Attitude:
+    """Return the attitude of K matches with its covariance, for the errors that the residuals imply.
+
+    Parameters
+    ----------
+    vectors_ref, xy_px, sigma_rad
+        (K, 3) directions of the stars, (K, 2) centroids, and their (K,) claimed errors
+    solver
+        Solver of the attitude
+    parameters
+        Number of parameters of the fit
+    """
+    seen_cam = match.cam_from_ref.apply(vectors_ref)
+    residual_px = camera.pixels(seen_cam) - xy_px
+    residual = residual_px / (camera.focal_px * sigma_rad)[:, None]
+    sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual, parameters))
+    covariance_rad2 = covariance(camera.rays(xy_px), sigma_rad, solver)
+    covariance_rad2, common_rad2 = with_focal_error(
+        covariance_rad2, camera, xy_px, seen_cam, sigma_rad
+    )
+    rms_px = float(np.sqrt(np.mean(residual_px**2)))
+    return Attitude(
+        "solved", match.cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
+    )
 
 
 def log10_chance(

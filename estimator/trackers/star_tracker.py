@@ -51,7 +51,7 @@ from estimator.trackers.pipeline import (
     check_algorithms,
     process_frame,
 )
-from estimator.trackers.refinement import NO_MATCH, FieldMatcher
+from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
 from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
@@ -158,14 +158,7 @@ class StarTracker:
         )
         # Field of view in tangents: least and largest x, least and largest y
         corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
-        self.field = np.array(
-            [
-                corners[:, 0].min(),
-                corners[:, 0].max(),
-                corners[:, 1].min(),
-                corners[:, 1].max(),
-            ]
-        )
+        self.field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
         zero_point_mag = (
             np.nan if settings.zero_point_mag is None else settings.zero_point_mag
         )
@@ -455,28 +448,17 @@ class StarTracker:
         observed, star = checks.row_pairs(
             ("observed", observed, len(centroids)), ("star", star, len(self.stars))
         )
-        sigma_px = self.sigma_px(centroids)[observed]
-        rays = self.camera.rays(centroids.xy_px[observed])
+        xy_px = centroids.xy_px[observed]
         vectors = self.stars.vectors[star]
-        sigma_rad = sigma_px / self.camera.focal_px
+        sigma_rad = self.sigma_px(centroids)[observed] / self.camera.focal_px
+        solver = self.settings.solver
         try:
-            cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
+            cam_from_ref = SOLVERS[solver](self.camera.rays(xy_px), vectors, sigma_rad)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
         # Covariance, with the errors that the residuals imply
-        seen_cam = cam_from_ref.apply(vectors)
-        xy_px = centroids.xy_px[observed]
-        residual = self.camera.pixels(seen_cam) - xy_px
-        sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual / sigma_px[:, None], 3))
-        covariance_rad2 = covariance(rays, sigma_rad, self.settings.solver)
-        covariance_rad2, common_rad2 = with_focal_error(
-            covariance_rad2, self.camera, xy_px, seen_cam, sigma_rad
-        )
         match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
-        rms_px = float(np.sqrt(np.mean(residual**2)))
-        return Attitude(
-            "solved", cam_from_ref, covariance_rad2, match, rms_px, self.camera, common_rad2
-        )
+        return solved_attitude(match, vectors, xy_px, self.camera, sigma_rad, solver, 3)
 
     def sigma_px(
         self,

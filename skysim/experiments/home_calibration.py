@@ -409,17 +409,13 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
 
 def spread(values: Floats, sets: Sequence[Bools]) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
-    return {
-        "mean": float(values.mean()),
-        "sd": float(values.std(ddof=1)),
-        "stops": [
-            {
-                "mean": float(values[one].mean()),
-                "sd": float(values[one].std(ddof=1)) if one.sum() > 1 else np.nan,
-            }
-            for one in sets
-        ],
-    }
+    return moments(values) | {"stops": [moments(values[one]) for one in sets]}
+
+
+def moments(values: Floats) -> Record:
+    """Mean and standard deviation (n - 1) of (F,) values; NaN for the deviation of one."""
+    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
+    return {"mean": float(values.mean()), "sd": sd}
 
 
 def calibration_report(

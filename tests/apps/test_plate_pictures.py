@@ -22,7 +22,7 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import picture as plate_picture
-from skysim.apps.plate_solver import solver
+from skysim.apps.plate_solver import plate_solution, solver
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Truth
@@ -358,7 +358,7 @@ def test_annotated_images_have_the_images_names() -> None:
 
 
 def test_stars_have_their_catalog_s_designation() -> None:
-    assert [plate_picture.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
+    assert [plate_solution.star_name(n) for n in (71683, 1_048_915, 2_345_678)] == [
         "HIP 71683",
         "HD 48915",
         "Gaia 345678",

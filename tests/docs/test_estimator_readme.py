@@ -37,10 +37,29 @@ def picture(cam_from_icrs: Rotation) -> np.ndarray:
     ).astype(np.uint8)
 
 
+def dome_picture(folder: Path, cam_from_lab: Rotation) -> None:
+    """Write a list of LEDs, 30 mm apart on a plane 1 m above the bearing, and a picture of them, as the README has."""
+    x, y = np.meshgrid(np.arange(-300, 301, 30.0), np.arange(-300, 301, 30.0))
+    rng = np.random.default_rng(3)
+    place_mm = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1000.0)])
+    place_mm[:, :2] += rng.uniform(-8, 8, (len(place_mm), 2))
+    rows = [f"{n},{row[0]},{row[1]},{row[2]}" for n, row in enumerate(place_mm)]
+    (folder / "leds.csv").write_text("\n".join(["id,x_mm,y_mm,z_mm", *rows]))
+    camera = Camera.from_fov(1000, 800, fov_deg=14.9)
+    xy = camera.pixels(cam_from_lab.apply(place_mm / 1e3) - [0, 0, 0.38])
+    light = rng.normal(100, 3, (800, 1000))
+    down, along = np.mgrid[:800, :1000]
+    for x_px, y_px in xy[camera.contains(np.nan_to_num(xy, nan=-1e9))]:
+        light += 3000 * np.exp(-((along - x_px) ** 2 + (down - y_px) ** 2) / 4)
+    cv2.imwrite(str(folder / "my_dome.png"), light.astype(np.uint16))
+
+
 @pytest.mark.slow
 def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
     truth = Rotation.from_euler("xyz", [25, 40, 10], degrees=True)
     cv2.imwrite(str(tmp_path / "my_sky.jpg"), picture(truth))
+    turn = Rotation.from_euler("zyx", [20, 4, -5], degrees=True)
+    dome_picture(tmp_path, turn)
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     names: dict = {}
@@ -51,6 +70,8 @@ def test_five_lines_solve_an_image(tmp_path: Path, monkeypatch, capsys) -> None:
     found = names["attitude"].cam_from_ref
     # Ten stars of a tenth of a pixel of 54": some tens of arcseconds, roll ten times that.
     assert (found * truth.inv()).magnitude() < 2e-3
+    assert names["under_dome"].status == "solved"
+    assert (names["under_dome"].cam_from_ref * turn.inv()).magnitude() < 1e-3
     assert ra_dec_roll_rad(found)[0] == pytest.approx(ra_dec_roll_rad(truth)[0], abs=3e-4)
 
 

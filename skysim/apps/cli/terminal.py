@@ -153,15 +153,24 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 
 def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
+    """Print the attitudes of pictures of the sky, or of a dome's LEDs, with remarks."""
     columns = [Column("file", kind="text"), Column("status", kind="text")]
-    columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
-    columns += [Column("stars"), Column("rms", "″", ".1f"), Column("ms", format=".0f")]
-    keys = ("ra_deg", "dec_deg", "roll_deg", "fov_deg", "matches", "rms_arcsec", "time_ms")
+    if "leds" in solutions[0]:
+        keys = (
+            "roll_deg pitch_deg yaw_deg cross_sigma_arcsec roll_sigma_arcsec matches rms_px"
+        )
+        columns += [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
+        columns += [Column(name, "″", ".3g") for name in ("cross 1σ", "roll 1σ")]
+        columns += [Column("LEDs"), Column("rms px", "", ".2f")]
+    else:
+        keys = "ra_deg dec_deg roll_deg fov_deg matches rms_arcsec"
+        columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
+        columns += [Column("stars"), Column("rms", "″", ".1f")]
     rows = []
     for one in solutions:
         status = one["status"] if one["time_ms"] is not None else "bad input"
-        rows.append([one["file"], status, *(one[key] for key in keys)])
-    print_table(Table(columns, rows))
+        rows.append([one["file"], status, *(one[key] for key in (*keys.split(), "time_ms"))])
+    print_table(Table([*columns, Column("ms", format=".0f")], rows))
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")
@@ -172,17 +181,18 @@ def print_remarks(solution: dict[str, Any]) -> None:
     if not solution["hint"]:
         return
     print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
-    if solution["ra_deg"] is None:
+    if solution["roll_deg"] is None:
+        print(
+            f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
+            f" the background {solution['background_dn']:g} DN"
+        )
+    if solution["roll_deg"] is None and "leds" not in solution:
         fields = " and ".join(
             f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"]
         )
-        print(
-            f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
-            f" the background {solution['background_dn']:g} DN\n"
-            f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}"
-        )
+        print(f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}")
     print(
-        f"  {'likely' if solution['ra_deg'] is None else 'note'}: {printable(solution['hint'])}"
+        f"  {'likely' if solution['roll_deg'] is None else 'note'}: {printable(solution['hint'])}"
     )
 
 

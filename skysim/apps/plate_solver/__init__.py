@@ -2,8 +2,14 @@
 
 A file is loaded as a picture in the orientation of viewing (`picture.py`) and solved without a prior attitude
 (`solver.py`). After a refusal other centroids are tried (`retries.py`), and the likely cause is found (`diagnosis.py`).
+Pictures of a dome's LEDs are solved by the tracker of a scene (`dome_pictures.py`).
 """
 
+from skysim.apps.plate_solver.dome_pictures import (
+    DomeSolution,
+    DomeSolver,
+    make_dome_solver,
+)
 from skysim.apps.plate_solver.picture import (
     Outputs,
     annotated_paths,
@@ -34,6 +40,8 @@ from skysim.apps.plate_solver.solver import (
 
 __all__ = [
     "FIELD_SEARCH",
+    "DomeSolution",
+    "DomeSolver",
     "Outputs",
     "PlateSolution",
     "Solver",
@@ -42,6 +50,7 @@ __all__ = [
     "best_attitude",
     "kept_solver",
     "load_picture",
+    "make_dome_solver",
     "make_solver",
     "outcome_fields",
     "pictures_in",

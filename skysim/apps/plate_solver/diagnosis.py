@@ -49,6 +49,7 @@ TRAIL_PX = 20.0
 THIN = 6.0
 SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel trails
 TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
+MIRRORED = "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
 FEW_LIGHTS = 10
 EFFORTS = 3  # number of searches of the mirrored picture, so that diagnosis is faster than the searches before it
 
@@ -96,7 +97,11 @@ class Refusal:
 
 def likely_cause(refusal: Refusal) -> str:
     """The likeliest cause in one line, with a remedy."""
-    return next(text for cause in CAUSES if (text := cause(refusal)))
+    text = next(text for cause in CAUSES if (text := cause(refusal)))
+    camera = refusal.solvers[0].camera
+    if camera and camera.dome:
+        return f"LEDs of the dome of {camera.dome}? solve them with --dome {camera.dome}; of the sky: {text}"
+    return text
 
 
 def shallow_catalog(refusal: Refusal) -> str:
@@ -145,7 +150,7 @@ def mirrored(refusal: Refusal) -> str:
             flipped, solver, refusal.size_px, refusal.date_utc, Clock(), EFFORTS
         )
         if attitude.solved:
-            return "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
+            return MIRRORED
     return ""
 
 

@@ -18,16 +18,24 @@ from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.plate_solver import retries
+from skysim.apps.plate_solver import diagnosis, retries
+from skysim.apps.plate_solver.dome_pictures import (
+    DomeReading,
+    DomeSolution,
+    DomeSolver,
+    dome_fields,
+    make_dome_solver,
+    solve_dome,
+)
 from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
     solution_fields,
-    star_name,
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
+    KnownCamera,
     Solver,
     kept_solver,
     make_solver,
@@ -61,7 +69,7 @@ class Reading(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Files to write of a picture, each None for none: with its stars marked; of a solved one its stars and header."""
+    """Files to write of a picture, each None for none: with marked lights; of a solved one its lights and header."""
 
     annotated: Path | None = None
     table: Path | None = None
@@ -79,6 +87,11 @@ class SolvedReading(NamedTuple):
     tracker: StarTracker
     tried: list[Reading]
 
+    @property
+    def pixels(self) -> NDArray:
+        """The pixels of the hypothesis."""
+        return self.hypothesis.pixels
+
 
 def solve(
     path: str | Path,
@@ -89,8 +102,10 @@ def solve(
     catalog: str | Path | None = None,
     size_px: tuple[int, int] | None = None,
     near_deg: tuple[float, float, float] | None = None,
-) -> PlateSolution:
-    """Solve the attitude of an image file of the sky, lost in space. Public as `skysim.solve`.
+    dome: str | Path | None = None,
+    map: str | Path | None = None,
+) -> PlateSolution | DomeSolution:
+    """Solve the attitude of an image file of the sky or a dome's LEDs, lost in space. Public as `skysim.solve`.
 
     Parameters
     ----------
@@ -107,13 +122,26 @@ def solve(
         Width and height of the picture, for a list of lights (CSV or ECSV with x_px, y_px, flux)
     near_deg
         Right ascension, declination and radius: only answers within this circle are searched
+    dome, map
+        Scene of the dome whose LEDs the image shows, and the map of a survey in place of the scene's LEDs, lever and
+        lens. The result is then a `DomeSolution`; no other keyword is allowed
 
     Raises
     ------
     InputError
         With one line for an image that cannot be read.
     """
-    if camera or catalog or near_deg or size_px:
+    solver: Solver | DomeSolver
+    kind: type[PlateSolution | DomeSolution] = PlateSolution
+    sky = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
+    if dome:
+        if any(one is not None for one in sky):
+            raise InputError("solve.dome", "with a keyword of the sky", "dome and map alone")
+        kind = DomeSolution
+        solver = make_dome_solver(dome, map)
+    elif map:
+        raise InputError("solve.map", "has no effect without a dome", "with the dome's scene")
+    elif camera or catalog or near_deg or size_px:
         solver = make_solver(
             fov_deg,
             Path(camera) if camera else None,
@@ -125,7 +153,7 @@ def solve(
     else:
         solver = kept_solver(fov_deg, time_utc)
     result = read_and_solve(Path(path), solver)
-    return PlateSolution(**{name.name: result[name.name] for name in fields(PlateSolution)})
+    return kind(**{one.name: result[one.name] for one in fields(kind)})
 
 
 def pictures_in(paths: Iterable[Path]) -> list[Path]:
@@ -146,7 +174,7 @@ def pictures_in(paths: Iterable[Path]) -> list[Path]:
             for child in path.iterdir()
             if images.image_suffix(child.name)
             and child.name[0] != "."
-            and not child.name.endswith(ANNOTATED)
+            and not f".{child.name}".endswith(ANNOTATED)
         )
         if not names:
             raise InputError(
@@ -175,7 +203,7 @@ def annotated_paths(folder: Path, paths: list[Path]) -> list[Path]:
 
 def solve_file(
     path: Path,
-    solver: Solver,
+    solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
 ) -> dict[str, Any]:
@@ -188,73 +216,88 @@ def solve_file(
     try:
         return read_and_solve(path, solver, outputs, picture)
     except InputError as error:
-        return blank_result(path) | {"status": str(error), "bad_input": True}
+        return blank_result(path, solver) | {"status": str(error), "bad_input": True}
 
 
-def blank_result(path: Path) -> dict[str, Any]:
+def blank_result(path: Path, solver: Solver | DomeSolver) -> dict[str, Any]:
     """The fields of a file that is not solved."""
     run = {"date_utc": None, "time_ms": None, "warning": ""}
-    return {"file": str(path), **asdict(PlateSolution()), **run}
+    blank = DomeSolution() if isinstance(solver, DomeSolver) else PlateSolution()
+    return {"file": str(path), **asdict(blank), **run}
 
 
 def read_and_solve(
     path: Path,
-    solver: Solver,
+    solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
 ) -> dict[str, Any]:
     """As `solve_file`, but raise InputError for an unreadable image."""
-    result = blank_result(path)
+    result = blank_result(path, solver)
     begin = time.perf_counter()
     date_utc = None
+    reading: SolvedReading | DomeReading
     try:
+        source: images.ViewedImage | Centroids
         if path.suffix.lower() in LIST_SUFFIXES:
-            outcome = solve_list(path, solver)
+            source = read_lights(path)
         else:
-            picture = load_picture(path, solver, picture)
-            date_utc, warning = validated_date(picture.date_utc)
+            source = load_picture(path, solver.camera, picture)
+            date_utc, warning = validated_date(source.date_utc)
             if warning and not solver.time_utc:
                 result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
-            outcome = solve_picture(picture, solver, date_utc)
+        if isinstance(solver, DomeSolver):
+            reading = solve_dome(source, solver)
+        elif isinstance(source, Centroids):
+            reading = solve_list(path, source, solver)
+        else:
+            reading = solve_picture(source, solver, date_utc)
     except InputError as error:
         raise error if error.key == printable(path) else error.within(path) from None
     except ImageError as error:
         raise InputError(path, error) from None
     result["time_ms"] = 1e3 * (time.perf_counter() - begin)
-    result |= {"bad_input": False} | outcome_fields(outcome, date_utc)
+    result["bad_input"] = False
+    if isinstance(reading, DomeReading):
+        result |= dome_fields(reading)
+    else:
+        result |= outcome_fields(reading, date_utc)
     taken_utc = solver.time_utc or date_utc
     result["date_utc"] = taken_utc.isoformat() if taken_utc else None
-    write_outputs(outputs, outcome, result)
+    write_outputs(outputs, reading, result)
     return result
 
 
-def write_outputs(outputs: Outputs, outcome: SolvedReading, result: dict[str, Any]) -> None:
-    """Write the files of a picture; stars and header only if it is solved."""
-    reading = outcome.hypothesis
+def write_outputs(
+    outputs: Outputs, reading: SolvedReading | DomeReading, result: dict[str, Any]
+) -> None:
+    """Write the files of a picture; lights and header only if it is solved."""
+    rows = result["leds"] if isinstance(reading, DomeReading) else result["stars"]
+    report = reading.report
     if outputs.annotated:
-        image = annotated_image(reading.pixels, outcome.report, outcome.tracker)
-        files.write_image(outputs.annotated, image)
-    if not outcome.report.attitude.solved:
+        names = [one["name"] for one in rows]
+        files.write_image(outputs.annotated, annotated_image(reading.pixels, report, names))
+    if not report.attitude.solved:
         return
     if outputs.table:
         from astropy.table import Table
 
-        files.write_table(outputs.table, Table(list(result["stars"])))
-    if outputs.wcs:
+        files.write_table(outputs.table, Table(list(rows)))
+    if outputs.wcs and isinstance(reading, SolvedReading):
         from astropy.io import fits
 
-        header = wcs_header(outcome.report.attitude, reading.flipped)
+        header = wcs_header(report.attitude, reading.hypothesis.flipped)
         with files.atomic_file(outputs.wcs) as temporary:
             fits.PrimaryHDU(header=header).writeto(temporary, overwrite=True)
 
 
-def solve_list(path: Path, solver: Solver) -> SolvedReading:
-    """Solve a list of lights: columns x_px, y_px and optionally flux, without it the brightest first.
+def solve_list(path: Path, centroids: Centroids, solver: Solver) -> SolvedReading:
+    """Solve a list of lights.
 
     Raises
     ------
     InputError
-        Without the picture's size, which a camera or `solver.size_px` gives, or for other columns.
+        Without the picture's size, which a camera or `solver.size_px` gives.
     """
     camera = solver.camera
     size_px = (camera.model.width_px, camera.model.height_px) if camera else solver.size_px
@@ -264,7 +307,6 @@ def solve_list(path: Path, solver: Solver) -> SolvedReading:
             "a list of lights of a picture of unknown size",
             "a size in pixels, or a camera",
         )
-    centroids = read_lights(path)
     begin = Clock()
     attitude, tracker = solve_centroids(centroids, solver, size_px, None, begin)
     report = Report(attitude, centroids, begin.seconds)
@@ -273,7 +315,11 @@ def solve_list(path: Path, solver: Solver) -> SolvedReading:
 
 
 def read_lights(path: Path) -> Centroids:
-    """The lights of a CSV or ECSV file, brightest first; errors of 0.1 px are assumed."""
+    """The lights of a CSV or ECSV file, brightest first; errors of 0.1 px are assumed.
+
+    Columns are x_px, y_px and optionally flux; without it the first light is the brightest. Raises InputError for
+    others.
+    """
     from astropy.table import Table
 
     form = "ascii.ecsv" if path.suffix.lower() == ".ecsv" else "ascii.csv"
@@ -298,20 +344,23 @@ def read_lights(path: Path) -> Centroids:
 
 
 def load_picture(
-    path: Path, solver: Solver, picture: images.ViewedImage | None = None
+    path: Path,
+    camera: KnownCamera | None = None,
+    picture: images.ViewedImage | None = None,
 ) -> images.ViewedImage:
     """Read a picture in monochrome, in the orientation in which it is viewed.
 
-    Raises InputError or ImageError if the file cannot be read or does not suit the solver.
+    Raises InputError or ImageError if the file cannot be read or does not suit the camera.
     """
     picture = picture or images.read_picture(path)
-    check_image(path, picture.pixels, solver)
+    if camera:
+        check_image(path, picture.pixels, camera)
     pixels = images.monochrome(picture.pixels)
     check_size(pixels)
     return replace(picture, pixels=pixels)
 
 
-def check_image(path: Path, image: NDArray, solver: Solver) -> None:
+def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
     Raises
@@ -319,9 +368,6 @@ def check_image(path: Path, image: NDArray, solver: Solver) -> None:
     InputError
         If the image cannot come from this camera.
     """
-    camera = solver.camera
-    if camera is None:
-        return
     if detector := camera.detector:
         if image.ndim != 2:
             raise InputError(
@@ -439,8 +485,6 @@ def outcome_fields(
             report, outcome.tracker, solver.stars
         )
         return seen | solved | {"hint": assumption}
-    from skysim.apps.plate_solver import diagnosis
-
     rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(
         pixels, report.centroids, tuple(solvers), date_utc, rows_known
@@ -448,15 +492,12 @@ def outcome_fields(
     return seen | {"hint": diagnosis.likely_cause(refusal)}
 
 
-def annotated_image(
-    image: NDArray, report: Report, tracker: StarTracker
-) -> NDArray[np.uint8]:
-    """The image annotated with detections, matched stars and their numbers."""
+def annotated_image(image: NDArray, report: Report, names: list[str]) -> NDArray[np.uint8]:
+    """The image annotated with detections, matched lights and their names."""
     from skysim.results.plots import annotate
 
     match = report.attitude.match
     detected_px = report.centroids.xy_px
     if match is None:
         return annotate(image, detected_px, np.empty((0, 2)))
-    names = [star_name(int(tracker.stars.id[star])) for star in match.star]
     return annotate(image, detected_px, detected_px[match.observed], names)

@@ -220,19 +220,24 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
                 "the order of time",
             )
         one["rate_deg_s"] = None
-        if one["ra_deg"] is None:
+        if quaternion_of(one) is None:
             continue
         if last is not None:
-            first = Rotation.from_quat(last["cam_from_icrs_xyzw"])
-            second = Rotation.from_quat(one["cam_from_icrs_xyzw"])
+            first = Rotation.from_quat(quaternion_of(last))
+            second = Rotation.from_quat(quaternion_of(one))
             turn_rad = (first * second.inv()).as_rotvec()
             one["rate_deg_s"] = np.degrees(turn_rad / (one["t_s"] - last["t_s"])).tolist()
         last = one
 
 
+def quaternion_of(result: dict[str, Any]) -> Any:
+    """The camera's attitude in the sky or in a dome, None of a refusal."""
+    return result["cam_from_lab_xyzw" if "leds" in result else "cam_from_icrs_xyzw"]
+
+
 def sequence_summary(results: list[dict[str, Any]]) -> str:
     """A sentence on a sequence: solved images, gaps, rate."""
-    solved = [one["ra_deg"] is not None for one in results]
+    solved = [quaternion_of(one) is not None for one in results]
     edges = np.flatnonzero(np.diff([True, *solved, True]))
     gaps = [
         results[min(end, len(results) - 1)]["t_s"] - results[max(begin - 1, 0)]["t_s"]

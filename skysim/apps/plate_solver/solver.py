@@ -135,11 +135,14 @@ class KnownCamera(NamedTuple):
         Relative uncertainty of its focal length
     detector
         Its detector; None if only a calibration is known
+    dome
+        Its scene if that has a dome
     """
 
     model: Camera
     uncertainty: float = CALIBRATED_UNCERTAINTY
     detector: DetectorConfig | None = None
+    dome: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -381,10 +384,14 @@ def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
         camera = Camera(*size_px, lens.focal_px, lens.center_px, lens.distortion)
         return KnownCamera(camera), Settings()
     is_file = path.suffix or path.exists()  # else the name of a shipped scene
-    config = loader.load_camera(path if is_file else loader.find(str(path)))
+    file = path if is_file else loader.find(str(path))
+    config = loader.load_camera(file)
     detector = config.detector
     settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
-    return KnownCamera(calibration(config), 0.0, detector), settings
+    light = loader.read(file)[0].get("light")
+    is_dome = isinstance(light, dict) and light.get("kind") == "dome"
+    dome = path if is_dome else None
+    return KnownCamera(calibration(config), 0.0, detector, dome), settings
 
 
 def read_catalog(name: str | None) -> star_catalog.StarCatalog:

@@ -275,26 +275,18 @@ def with_names(run: SurveyRun) -> SurveyRun:
     name[old] = new
     name[np.setdiff1d(others, free)] = np.setdiff1d(free, others)
     position_m = run.prior.leds.position_m.copy()
-    covariance_m2 = np.empty_like(survey.led_covariance_m2)
-    surveyed = np.empty_like(survey.surveyed)
     position_m[new] = survey.leds.position_m[old]
-    covariance_m2[name] = survey.led_covariance_m2
-    surveyed[name] = survey.surveyed
+    order = np.argsort(name)
     common_m = survey.common_m
-    if common_m is not None:
-        common_m = common_m[:, np.argsort(name)]
-    leds = replace(survey.leds, position_m=position_m)
-    return replace(
-        run,
-        survey=replace(
-            survey,
-            leds=leds,
-            led_covariance_m2=covariance_m2,
-            surveyed=surveyed,
-            common_m=common_m,
-        ),
-        matches=[Correspondences(match.light, name[match.led]) for match in run.matches],
+    renamed = replace(
+        survey,
+        leds=replace(survey.leds, position_m=position_m),
+        led_covariance_m2=survey.led_covariance_m2[order],
+        surveyed=survey.surveyed[order],
+        common_m=None if common_m is None else common_m[:, order],
     )
+    matches = [Correspondences(match.light, name[match.led]) for match in run.matches]
+    return replace(run, survey=renamed, matches=matches)
 
 
 def displaced_leds(run: SurveyRun) -> dict[int, Floats]:

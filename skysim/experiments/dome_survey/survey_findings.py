@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, project
+from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
@@ -385,6 +385,42 @@ def fault_lines(faults: Record) -> Iterator[str]:
 
 
 # --- as numbers ---------------------------------------------------------------------------------------------
+
+
+def attitude_record(body_from_lab: Rotation, covariance_rad2: Floats, lever: Lever) -> Record:
+    """An attitude as numbers, with the covariance of its small rotation about the camera axes.
+
+    Roll, pitch and yaw are the vehicle's. The quaternion, scalar last, turns the dome's axes (lab) to the camera's.
+    """
+    roll_deg, pitch_deg, yaw_deg = euler_deg(body_from_lab.inv()).tolist()
+    cam_from_lab = lever.cam_from_body * body_from_lab
+    return {
+        "roll_deg": roll_deg,
+        "pitch_deg": pitch_deg,
+        "yaw_deg": yaw_deg,
+        "cam_from_lab_xyzw": cam_from_lab.as_quat(canonical=True).tolist(),
+        "covariance_rad2": covariance_rad2.tolist(),
+    }
+
+
+def attitude_rows(run: SurveyRun, names: Sequence[str]) -> list[Record]:
+    """The attitude of each image by the survey (`attitude_record`), in the order of their names.
+
+    The covariance includes the errors of LEDs, lever and lens. An image without an attitude has only a status.
+    """
+    survey = run.survey
+    R_cam_from_body = survey.lever.cam_from_body.as_matrix()
+    rows: list[Record] = [{"file": name, "status": "not identified"} for name in names]
+    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+        row = rows[frame.index]
+        row |= {"status": "too few surveyed LEDs", "matches": len(match.led)}
+        if survey.tied[k]:
+            covariance = (
+                R_cam_from_body @ survey.attitude_covariance_rad2[k] @ R_cam_from_body.T
+            )
+            row |= attitude_record(frame.body_from_lab, covariance, survey.lever)
+            row["status"] = "solved"
+    return rows
 
 
 def coverage_statistics(so_far: Coverage) -> Record:

@@ -8,11 +8,12 @@ file are identified by the tracker with the list of LEDs, or with the survey of 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -26,15 +27,17 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 from skysim.core.text import excerpt, read_named_rows
-from skysim.core.types import Ints
+from skysim.core.types import Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.results.telemetry_report import euler_deg
 
 ATTITUDES = "attitudes.csv"
+SOLVED = "solved_attitudes.csv"
 FRAME = "frame_{:04d}.fits"
 COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
+NO_COLUMNS: Mapping[str, Sequence[object]] = {}
 MIN_IMAGES = 3
 # Of several images with the same name, the first format of this list is read.
 FORMATS = (".fits", ".fit", ".fits.gz", ".tif", ".tiff", ".png")
@@ -56,6 +59,11 @@ def image_files(folder: Path) -> list[Path]:
             folder, f"{len(paths)} images", f"{MIN_IMAGES} or more, typically tens"
         )
     return paths
+
+
+def frame_names(count: int) -> list[str]:
+    """The names of the images of a plan or a simulation."""
+    return [FRAME.format(n) for n in range(count)]
 
 
 def best_images(folder: Path) -> list[Path]:
@@ -107,23 +115,29 @@ def write_attitudes(
     path: Path,
     names: Sequence[str],
     lab_from_body: Rotation,
-    leds: Ints | None = None,
+    more: Mapping[str, Sequence[object]] = NO_COLUMNS,
 ) -> None:
-    """Write attitudes as `read_attitudes` reads them.
-
-    Parameters
-    ----------
-    leds
-        (F,) number of LEDs in view at each attitude of a plan
-    """
-    lines = [",".join((*COLUMNS, "leds") if leds is not None else COLUMNS)]
-    for n, (name, angles) in enumerate(zip(names, euler_deg(lab_from_body), strict=True)):
-        cells = [name, *(f"{angle:.4f}" for angle in angles)]
-        if leds is not None:
-            cells.append(f"{leds[n]}")
-        lines.append(",".join(cells))
+    """Write attitudes as `read_attitudes` reads them; `more` are further columns."""
+    angles = ([f"{angle:.4f}" for angle in column] for column in euler_deg(lab_from_body).T)
+    columns = {**dict(zip(COLUMNS, (names, *angles), strict=True)), **more}
+    rows = (columns, *zip(*columns.values(), strict=True))
     with atomic_file(path) as temporary:
+        lines = [",".join(map(str, row)) for row in rows]
         temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def write_solved(path: Path, rows: Sequence[Record]) -> None:
+    """Write the attitudes of `survey_findings.attitude_rows` that are solved, with the upper half of the covariance."""
+    solved = [row for row in rows if row["status"] == "solved"]
+    quaternions = np.array([row["cam_from_lab_xyzw"] for row in solved])
+    covariances = np.array([row["covariance_rad2"] for row in solved])
+    more: dict[str, list[float]] = {"leds": [row["matches"] for row in solved]}
+    for n, axis in enumerate("xyzw"):
+        more[f"cam_from_lab_{axis}"] = quaternions[:, n].tolist()
+    for i, j in zip(*np.triu_indices(3), strict=True):
+        more[f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"] = covariances[:, i, j].tolist()
+    names = [row["file"] for row in solved]
+    write_attitudes(path, names, survey_frames.from_rows(solved), more)
 
 
 def frames_with_attitude(
@@ -162,6 +176,13 @@ def lost_in_space(
     lever = Lever(
         model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m
     )
+    return dome_tracker(camera, leds, lever, settings)
+
+
+def dome_tracker(
+    camera: Camera, leds: LedMap, lever: Lever, settings: Settings
+) -> DomeTracker:
+    """A `DomeTracker`. Raises InputError for LEDs that it cannot use."""
     try:
         return DomeTracker(camera, leds, lever, settings)
     except ImageError as error:

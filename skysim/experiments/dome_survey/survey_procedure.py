@@ -34,6 +34,7 @@ from skysim.experiments.dome_survey.survey_images import (
     ATTITUDES,
     FRAME,
     SurveyImage,
+    frame_names,
     frames_with_attitude,
     write_attitudes,
 )
@@ -112,8 +113,8 @@ def plan_survey(
 
 def write_plan(path: Path, plan: HeldAttitudes) -> None:
     """Write the attitudes as CSV with the names of the images to take, as `attitudes.csv` has them."""
-    names = [FRAME.format(n) for n in range(len(plan.shown))]
-    write_attitudes(path, names, plan.lab_from_body, plan.shown.sum(axis=1))
+    leds = plan.shown.sum(axis=1).tolist()
+    write_attitudes(path, frame_names(len(leds)), plan.lab_from_body, {"leds": leds})
 
 
 def simulated_frames(
@@ -125,7 +126,7 @@ def simulated_frames(
     """The frames of a simulated survey, which are also written to a folder as FITS with the IMU's attitudes."""
     measured = imu_attitudes(lab.scene, lab_from_body, uncertainty.imu_sigma_rad)
     if folder is not None:
-        names = [FRAME.format(n) for n in range(len(lab_from_body))]
+        names = frame_names(len(lab_from_body))
         write_attitudes(files.make_folder(folder) / ATTITUDES, names, measured.inv())
     for (frame, truth, lights), body_from_lab in zip(
         take_frames(lab, lab_from_body), measured, strict=True

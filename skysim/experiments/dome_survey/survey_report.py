@@ -26,6 +26,7 @@ from skysim.experiments.dome_survey.survey_findings import (
     fault_lines,
     residuals_px,
 )
+from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
 from skysim.results import metrics
 from skysim.results.plots import INK, bgr_image, png
@@ -54,7 +55,11 @@ FIT = (
     "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
     " {led_sigma_mm_median:.2g} mm, worst {led_sigma_mm_worst:.2g} mm."
 )
-FILES = (("map, for tracker.map", "leds.ecsv"), ("every number of this page", "survey.json"))
+FILES = (
+    ("map, for tracker.map", "leds.ecsv"),
+    ("attitudes of the images", SOLVED),
+    ("every number of this page", "survey.json"),
+)
 
 
 def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:

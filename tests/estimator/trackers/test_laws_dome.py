@@ -107,6 +107,38 @@ def even(count: int) -> LedMap:
     )
 
 
+# Lists of LEDs
+
+
+@law(dome_map.LedMap.from_csv)
+@given(
+    rng=SEEDS,
+    count=some.integers(1, 9),
+    unit=some.sampled_from(sorted(dome_map.UNIT_M)),
+    names=some.booleans(),
+    text=some.text("0123456789.,xyz_mid \n#-e", max_size=60),
+)
+def test_a_list_of_leds_is_read_in_its_unit_and_any_other_text_refused(
+    rng: np.random.Generator,
+    count: int,
+    unit: str,
+    names: bool,
+    text: str,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    path = tmp_path_factory.mktemp("list") / "leds.csv"
+    place_m = units(rng, count)
+    rows = (place_m / dome_map.UNIT_M[unit]).tolist()
+    head = [f"{axis}_{unit}" if names else axis for axis in "xyz"]
+    path.write_text("\n".join(",".join(map(str, row)) for row in [head, *rows]))
+    read = LedMap.from_csv(path, None if names else unit)
+    np.testing.assert_allclose(read.position_m, place_m, rtol=1e-12)
+    assert read.id.tolist() == list(range(count))
+    path.write_text(text)
+    other = answered(lambda: LedMap.from_csv(path, "m"), ImageError)
+    assert other is None or np.isfinite(other.position_m).all()
+
+
 # Surfaces
 
 

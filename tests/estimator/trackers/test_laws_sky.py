@@ -310,6 +310,7 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
     FieldMatcher.in_field,
     StarTracker.solve_centroids,
     StarTracker.solve_matches,
+    refinement.solved_attitude,
     StarTracker.attitude_of,
     Attitude.solved,
 )

@@ -397,12 +397,40 @@ HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"
 def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
     held = survey_frames.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
     survey_images.write_attitudes(
-        tmp_path / "a.csv", ["b.fits", "a.fits"], held, np.array([3, 4])
+        tmp_path / "a.csv", ["b.fits", "a.fits"], held, {"leds": [3, 4]}
     )
     read = survey_images.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
     # Four decimals.
     assert (Rotation.concatenate(list(read.values())) * held.inv()).magnitude().max() < 2e-6
+
+
+def test_solved_attitudes_are_written_with_covariances_and_read_as_an_imu_s(
+    tmp_path: Path,
+) -> None:
+    covariance = np.arange(9.0).reshape(3, 3)
+    row = {
+        "file": "b.fits",
+        "status": "solved",
+        "roll_deg": 1.0,
+        "pitch_deg": -20.0,
+        "yaw_deg": 170.0,
+        "cam_from_lab_xyzw": [0.1, 0.2, 0.3, 0.9],
+        "covariance_rad2": (covariance + covariance.T).tolist(),
+        "matches": 7,
+    }
+    unknown = dict.fromkeys(row) | {"file": "a.fits", "status": "not identified"}
+    path = tmp_path / "solved.csv"
+    survey_images.write_solved(path, [unknown, row])
+    assert list(survey_images.read_attitudes(path)) == ["b.fits"]
+    head, only = (line.split(",") for line in path.read_text().splitlines())
+    found = dict(zip(head, only, strict=True))
+    assert [float(found[f"cam_from_lab_{one}"]) for one in "xyzw"] == [0.1, 0.2, 0.3, 0.9]
+    upper = [
+        float(found[f"covariance_{one}_rad2"]) for one in ("xx", "xy", "xz", "yy", "yz", "zz")
+    ]
+    assert upper == [0, 4, 8, 8, 12, 16]
+    assert found["leds"] == "7"
 
 
 @pytest.mark.parametrize(

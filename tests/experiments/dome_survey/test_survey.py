@@ -131,6 +131,26 @@ def test_a_survey_reduces_the_tracker_s_error_substantially(
 
 
 @pytest.mark.long
+def test_each_attitude_is_the_true_one_within_its_covariance(
+    statistics: dict[str, Any], folder: Path
+) -> None:
+    """The errors of one survey are common to its attitudes, so that each is tested alone: chi-square of three."""
+    scene = loader.load(folder / "small.yaml")
+    lab, _, plan = survey_procedure.plan_survey(scene, UNCERTAINTY, 40, 18.0)
+    true = lab.camera.mount.cam_from_body * plan.lab_from_body.inv()
+    rows = statistics["attitudes"]
+    assert [row["file"] for row in rows] == [f"frame_{n:04d}.fits" for n in range(40)]
+    assert sum(row["status"] == "solved" for row in rows) == statistics["tied"]
+    for row, truth in zip(rows, true, strict=True):
+        if row["status"] == "solved":
+            error_rad = (
+                Rotation.from_quat(row["cam_from_lab_xyzw"]) * truth.inv()
+            ).as_rotvec()
+            square = error_rad @ np.linalg.solve(row["covariance_rad2"], error_rad)
+            assert square < chi2.ppf(1 - RARE, 3)
+
+
+@pytest.mark.long
 def test_lens_and_lever_are_the_true_ones_within_their_errors_and_better_than_before(
     statistics: dict[str, Any],
 ) -> None:

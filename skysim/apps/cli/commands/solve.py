@@ -22,7 +22,7 @@ from skysim.apps.cli.terminal import print_error, print_json, print_solutions, p
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.plate_solver import Outputs, Solver
+    from skysim.apps.plate_solver import DomeSolver, Outputs, Solver
     from skysim.core.images import ViewedImage
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
@@ -46,6 +46,18 @@ def solve(
         Path | None,
         typer.Option(
             help="Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration."
+        ),
+    ] = None,
+    dome: Annotated[
+        str | None,
+        typer.Option(
+            help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."
+        ),
+    ] = None,
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."
         ),
     ] = None,
     live: Annotated[
@@ -89,7 +101,7 @@ def solve(
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option(help="Also write the matched stars of one image here, as ECSV."),
+        typer.Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
     ] = None,
     annotate: Annotated[
         Path | None,
@@ -112,7 +124,7 @@ def solve(
     ),
     json: Json = False,
 ) -> None:
-    """Solve the attitude of sky images, lost in space; uncertain matches are rejected.
+    """Solve the attitude of images of the sky or of a dome's LEDs, lost in space; uncertain matches are rejected.
 
     Exit code 0 if all images could be read, solved or not; 2 otherwise.
     """
@@ -124,15 +136,25 @@ def solve(
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
-    settings = plate_solver.make_solver(
-        fov,
-        camera,
-        datetime_from_iso(time),
-        stages,
-        catalog,
-        size_px=numbers("size", size, "x", 2, int),
-        near_deg=numbers("near", near, ",", 3, float),
-    )
+    settings: Solver | DomeSolver
+    if dome is None:
+        if map_ is not None:
+            raise InputError("--map", "has no effect without --dome", "with --dome SCENE")
+        settings = plate_solver.make_solver(
+            fov,
+            camera,
+            datetime_from_iso(time),
+            stages,
+            catalog,
+            size_px=numbers("size", size, "x", 2, int),
+            near_deg=numbers("near", near, ",", 3, float),
+        )
+    else:
+        sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
+        for name, value in (sky | {"camera": camera, "wcs": wcs}).items():
+            if value is not None:
+                raise InputError(f"--{name}", "has no effect with --dome", "without it")
+        settings = plate_solver.make_dome_solver(dome, map_, stages)
     files.make_folder(out)
     paths = pictures(images or [], live, out)
     if sequence:  # a frame that is there as FITS and as PNG is one
@@ -188,7 +210,11 @@ def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
 
 
 def solve_all(
-    paths: list[Path], solver: Solver, chosen: Outputs, out: Path, quiet: bool
+    paths: list[Path],
+    solver: Solver | DomeSolver,
+    chosen: Outputs,
+    out: Path,
+    quiet: bool,
 ) -> tuple[list[dict[str, Any]], list[str], list[str]]:
     """Solve the images. Returns their results, warnings, and the errors of those that could not be read."""
     from skysim.apps import plate_solver

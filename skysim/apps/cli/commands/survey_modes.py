@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -118,7 +118,8 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
         coverage_shown(request, observations, before, plan.model.sigma_px),
     ):
         run = adjust.run_survey(observations, before, uncertainty, update)
-    statistics = write_results(request, run, before, lab)
+    names = survey_images.frame_names(len(observations))
+    statistics = write_results(request, run, before, lab, names)
     tracker = factory.build_tracker(
         survey_prior.with_map(lab.scene, statistics["map"]),
         lab.camera.mount,
@@ -165,9 +166,9 @@ def from_images(
         run = survey_procedure.survey_images(
             pictures, found, before, request.uncertainty, stages, update
         )
-    return write_report(
-        request, run, write_results(request, run, before, None) | {"frames": len(pictures)}
-    )
+    names = [picture.name for picture in pictures]
+    statistics = write_results(request, run, before, None, names)
+    return write_report(request, run, statistics | {"frames": len(pictures)})
 
 
 def followed(
@@ -239,9 +240,16 @@ def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> di
 
 
 def write_results(
-    request: Request, run: SurveyRun, before: CalibrationPrior, lab: Lab | None
+    request: Request,
+    run: SurveyRun,
+    before: CalibrationPrior,
+    lab: Lab | None,
+    names: Sequence[str],
 ) -> dict[str, Any]:
-    """Write map and picture of a survey and return its statistics; the picture of a simulated one shows its errors."""
+    """Write map, attitudes and picture of a survey of images of these names, and return its statistics.
+
+    The picture of a simulated one shows its errors.
+    """
 
     folder = files.make_folder(request.folder)
     path = folder / "leds.ecsv"
@@ -255,9 +263,11 @@ def write_results(
     statistics |= {
         "scene": request.scene.name,
         "faults": asdict(faults),
+        "attitudes": survey_findings.attitude_rows(run, names),
         "map": str(path),
         "picture": str(picture),
     }
+    survey_images.write_solved(folder / survey_images.SOLVED, statistics["attitudes"])
     further = survey_frames.from_rows(statistics["next"])
     errors = survey_report.led_errors(run.survey, before, lab) if lab else None
     files.write_image(

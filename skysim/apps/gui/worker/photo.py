@@ -99,7 +99,7 @@ def photo_from_file(
         path = Path(folder) / f"upload{suffix}"
         path.write_bytes(data)
         try:
-            picture = plate_solver.load_picture(path, solver)
+            picture = plate_solver.load_picture(path)
         except InputError as error:
             raise InputError(Path(name).name, error.problem, error.allowed) from None
     date_utc, _ = plate_solver.validated_date(picture.date_utc)
