@@ -1,4 +1,6 @@
-"""Messages from a worker to its page: plain numbers, arrays, strings and bytes, so that they can be pickled."""
+"""Messages from a worker to its page: plain numbers, arrays, strings and bytes, so that they can be pickled.
+
+NiceGUI writes arrays as JSON, with null for NaN."""
 
 from __future__ import annotations
 
@@ -179,8 +181,8 @@ class Lens:
     """
 
     n: int
-    x: tuple[float, ...]
-    y: tuple[float, ...]
+    x: Floats
+    y: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +193,12 @@ class Pose:
     ----------
     place_m, depth_m
         Under a dome, the camera's place in the lab frame, and for each point of the lens's tables
-        the depth along the boresight at which its ray meets the surface (None if it does not)
+        the depth along the boresight at which its ray meets the surface (NaN if it does not)
     """
 
-    rotation: tuple[float, ...]
-    place_m: tuple[float, ...] = ()
-    depth_m: tuple[float | None, ...] = ()
+    rotation: Floats
+    place_m: Floats | None = None
+    depth_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +225,7 @@ class FrameView:
     saturation_dn: float
     size_px: tuple[int, int]
     angles_deg: Triple
-    body_wxyz: tuple[float, ...]
+    body_wxyz: Floats
     exposure_s: float
     statistics: plots.FrameStatistics
     lights: LightColumns
@@ -291,11 +293,11 @@ class LookFrom(NamedTuple):
         Vertical field of view
     """
 
-    eye_m: Triple
-    target_m: Triple
-    up: Triple
+    eye_m: Floats
+    target_m: Floats
+    up: Floats
     fov_deg: float
-    on_vehicle: bool
+    on_vehicle: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,8 +327,8 @@ class LabGeometry:
 class MotionLog:
     """Curves of a simulated motion against time, decimated for display."""
 
-    t_s: tuple[float, ...]
-    curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    t_s: Floats = field(default_factory=lambda: np.empty(0))
+    curves: dict[str, Floats] = field(default_factory=dict)
 
 
 class FlightRow(NamedTuple):
@@ -415,8 +417,8 @@ class SurveyPlan(NamedTuple):
         (None if not determined)
     """
 
-    angles_deg: tuple[tuple[float, ...], ...]
-    shown: tuple[int, ...]
+    angles_deg: list[list[float]]
+    shown: list[int]
     leds: int
     steps: tuple[tuple[int, int, float | None], ...]
 

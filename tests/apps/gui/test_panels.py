@@ -393,7 +393,7 @@ def test_a_frame_s_pose_and_lens_map_a_light_s_pixel_back_to_the_light() -> None
             [table(lens.x)(xy[:, ::-1]), table(lens.y)(xy[:, ::-1]), np.ones(len(xy))]
         )
         pointed = rays_cam @ np.reshape(pose.rotation, (3, 3)).T
-        if pose.depth_m:
+        if pose.depth_m is not None:
             pointed = (
                 np.array(pose.place_m) + table(pose.depth_m)(xy[:, ::-1])[:, None] * pointed
             )

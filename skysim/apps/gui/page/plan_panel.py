@@ -335,7 +335,7 @@ def survey_lines(found: SurveyFound) -> list[str]:
 
 
 def survey_flight(
-    scene: str, overrides: Mapping[str, str], angles_deg: tuple[tuple[float, ...], ...]
+    scene: str, overrides: Mapping[str, str], angles_deg: Sequence[Sequence[float]]
 ) -> dict[str, str]:
     """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
 

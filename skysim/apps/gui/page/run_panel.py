@@ -69,7 +69,7 @@ class RunPanel:
         self.sensor = sensor
         self.feedback: str | None = None
         self.rows: list[FlightRow] = []
-        self.log = MotionLog(())
+        self.log = MotionLog()
         self.times_s: list[float] = []
         self.residuals: list[tuple[float, int, float]] = []
         self.computing = self.stopping = self.playing = self.showing = False
@@ -163,7 +163,7 @@ class RunPanel:
 
     def clear(self) -> None:
         self.rows = []
-        self.log = MotionLog(())
+        self.log = MotionLog()
         self.times_s = []
         self.residuals = []
         self.index = 0

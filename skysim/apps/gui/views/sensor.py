@@ -242,7 +242,7 @@ class SensorView:
     def fields(self) -> dict[str, Any]:
         """Further data for frame.js: pointing and marks."""
         view = {
-            "pose": pose_fields(self.pose) if self.pose else None,
+            "pose": asdict(self.pose) if self.pose else None,
             "label": self.description(),
         }
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
@@ -320,14 +320,6 @@ class SensorView:
                     f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"
                 ]
         return "\n".join(lines)
-
-
-def pose_fields(pose: Pose) -> dict[str, Any]:
-    """A pose for frame.js."""
-    fields: dict[str, Any] = {"rotation": pose.rotation}
-    return fields | (
-        {"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {}
-    )
 
 
 @functools.cache

@@ -22,7 +22,6 @@ from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.style import DARK, color_scale
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
-from skysim.dynamics.multibody import Shape
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -82,12 +81,15 @@ class Scene3D:
         self.canvas.run_method(
             "build",
             {
-                "shapes": [shape_fields(shape) for shape in lab.shapes],
+                "shapes": [
+                    shape._asdict() | {"vertices_m": shape.vertices_m.round(DIGITS)}
+                    for shape in lab.shapes
+                ],
                 "lights": {
-                    "id": lab.ids.tolist(),
-                    "place": lab.lights_m.round(DIGITS).ravel().tolist(),
-                    "radius": lab.radius_m.round(DIGITS).tolist(),
-                    "lit": lab.lit.tolist(),
+                    "id": lab.ids,
+                    "place": lab.lights_m.round(DIGITS).ravel(),
+                    "radius": lab.radius_m.round(DIGITS),
+                    "lit": lab.lit,
                 },
                 "views": {name: view._asdict() for name, view in lab.views.items()},
                 "background": DARK["ground"],
@@ -99,7 +101,7 @@ class Scene3D:
     def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""
         colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
-        self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
+        self.canvas.run_method("color", list(zip(ids, colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
         """Send the attitude after a delay, so that of many frames in a short time only the last one is sent."""
@@ -120,7 +122,7 @@ class Scene3D:
             return
         found = view.result.detections if view.result else ()
         identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
-        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
+        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
 
@@ -216,18 +218,3 @@ class PushControl:
         self.stop()
         if before:
             await self.page.show_live("point", before, self.page.solving)
-
-
-def shape_fields(shape: Shape) -> dict[str, Any]:
-    """A shape for space.js."""
-    return {
-        "name": shape.name,
-        "kind": shape.kind,
-        "size": shape.size_m,
-        "position": shape.position_m,
-        "wxyz": shape.parent_from_shape_wxyz,
-        "rgba": shape.rgba,
-        "on_vehicle": shape.on_vehicle,
-        "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
-        "faces": shape.faces.ravel().tolist(),
-    }

@@ -67,20 +67,11 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     north = np.array([0.0, 1.0, 0.0])
     ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     return {
-        "outside": look_from(model.eye_m, model.target_m, up, FOVY_DEG),
-        "camera": look_from(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
-        "bearing": look_from(np.zeros(3), up, north, WIDE_DEG),
-        "top": look_from(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
+        "outside": LookFrom(model.eye_m, model.target_m, up, FOVY_DEG),
+        "camera": LookFrom(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
+        "bearing": LookFrom(np.zeros(3), up, north, WIDE_DEG),
+        "top": LookFrom(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
     }
-
-
-def look_from(
-    eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
-) -> LookFrom:
-    eye, target, upwards = (
-        (float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up)
-    )
-    return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
 
 
 # Directions of a frame's pixels, for the browser.
@@ -94,7 +85,7 @@ def lens_of(camera: Camera) -> Lens:
     x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
     y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
     tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    return Lens(NODES, *(tuple(column.tolist()) for column in tangents.T))
+    return Lens(NODES, *tangents.T.copy())
 
 
 def scene_lens(lab: Lab) -> Lens:
@@ -105,7 +96,7 @@ def scene_lens(lab: Lab) -> Lens:
 def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
     lab_from_cam = truth.cam_from_lab.inv()
-    rotation = tuple(lab_from_cam.as_matrix().ravel().tolist())
+    rotation = lab_from_cam.as_matrix().ravel()
     if not isinstance(lab.scene.light, DomeConfig):
         return Pose(rotation)
     place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
@@ -113,11 +104,9 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     length = np.linalg.norm(rays_cam, axis=1)
     dome = surface.build_surface(lab.scene.light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
-    # Depths along the boresight; NaN where a ray meets nothing.
+    # Depths along the boresight, to 0.01 mm; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
-    # To 0.01 mm; None for such a ray.
-    depths_m = (None if math.isnan(depth) else round(depth, 5) for depth in depth_m.tolist())
-    return Pose(rotation, tuple(place_m.tolist()), tuple(depths_m))
+    return Pose(rotation, place_m, depth_m.round(5))
 
 
 # Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity.

@@ -170,6 +170,6 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     photo = Photo((width, height), result, solution, statistics)
     if attitude.cam_from_ref is not None:
         lens = lenses.lens_of(attitude.camera or tracker.camera)
-        pose = Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
+        pose = Pose(attitude.cam_from_ref.inv().as_matrix().ravel())
         photo = replace(photo, lens=lens, pose=pose)
     return replace(photo, saturation_dn=saturation_dn), image

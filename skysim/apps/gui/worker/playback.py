@@ -134,7 +134,7 @@ class Playback:
         bench = self.bench
         self.shown = index
         bench.frame = None
-        bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
+        bench.lab_from_body = quaternion.to_rotation(kept.view.body_wxyz)
         if kept.place is None:
             self.render()
             assert bench.frame is not None
@@ -184,8 +184,9 @@ def curves(log: Telemetry) -> MotionLog:
     values["momentum"] = np.linalg.norm(log.momentum_nms, axis=1)
     values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
     every = max(len(log.t_s) // MAX_POINTS, 1)
-    thinned = {name: tuple(curve[::every].tolist()) for name, curve in values.items()}
-    return MotionLog(tuple(log.t_s[::every].tolist()), thinned)
+    return MotionLog(
+        log.t_s[::every], {name: curve[::every] for name, curve in values.items()}
+    )
 
 
 def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameView:

@@ -234,8 +234,8 @@ def survey_plan(
     shown
         (F, N) whether an attitude shows an LED
     """
-    angles = tuple(tuple(row) for row in euler_deg(lab_from_body).tolist())
-    return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
+    angles = euler_deg(lab_from_body).tolist()
+    return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
 
 
 def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:

@@ -171,7 +171,7 @@ class Workbench:
             frame.saturation_dn,
             (width, height),
             scoring.true_angles_deg(self.lab.camera, truth),
-            tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
+            quaternion.from_rotation(truth.lab_from_body),
             frame.exposure_s,
             plots.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
