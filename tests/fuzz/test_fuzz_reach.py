@@ -59,7 +59,6 @@ OUT_OF_REACH = {
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.load_study": OURS,
     "skysim.apps.gui.page.history.History.read": "the page's address, which `View.from_query` checks",
-    "skysim.apps.gui.worker.pixels.levels_from": "frames that the worker has written to a file of its own",
     "skysim.apps.gui.worker.survey_flight.Survey.map_file": "the map that it has just written",
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
     "skysim.core.fits_tiles.decode": GUARDED,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import tempfile
 import time
 from collections.abc import Iterator
@@ -42,13 +43,13 @@ class KeptFrame:
     Attributes
     ----------
     place
-        Place of the pixels in the file, and their number of bytes; None if they are rendered
-        again, which gives the same bits
+        Place of the pixels in the file; None if they are rendered again, which gives the same
+        bits
     """
 
     view: FrameView
     report: Report
-    place: tuple[int, int] | None
+    place: int | None
 
 
 class Playback:
@@ -119,14 +120,14 @@ class Playback:
             KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
         )
 
-    def keep(self, frame: Frame) -> tuple[int, int] | None:
+    def keep(self, frame: Frame) -> int | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
-        data = pixels.levels_of(frame.image_dn).data()
-        begin = self.file.seek(0, 2)
-        if begin + len(data) > KEPT_BYTES:
+        levels = pixels.levels_of(frame.image_dn)
+        place = self.file.seek(0, 2)
+        if place + levels.integers.nbytes > KEPT_BYTES:
             return None
-        self.file.write(data)
-        return begin, len(data)
+        pickle.dump(levels, self.file)
+        return place
 
     def show(self, index: int) -> tuple[FrameView, pixels.PixelLevels]:
         """The view of a kept frame and its pixels; its attitude becomes that of the workbench."""
@@ -139,8 +140,8 @@ class Playback:
             self.render()
             assert bench.frame is not None
             return kept.view, pixels.levels_of(bench.frame.image_dn)
-        self.file.seek(kept.place[0])
-        return kept.view, pixels.levels_from(self.file.read(kept.place[1]), kept.view.size_px)
+        self.file.seek(kept.place)
+        return kept.view, pickle.load(self.file)
 
     def render(self) -> None:
         """Render the shown frame with its truth, unless a later frame of the scene has been rendered."""
