@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from skysim.core.types import Floats
 from skysim.dynamics.multibody import Shape
 from skysim.results import plots
+from skysim.scene.scene import Scene
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
@@ -269,9 +270,7 @@ class SceneInfo:
         Whether a survey of the dome has begun
     """
 
-    scene: str
-    title: str
-    under_stars: bool
+    scene: Scene
     names: tuple[str, str, str]
     prefix: str
     field_deg: float

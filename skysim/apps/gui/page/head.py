@@ -83,8 +83,9 @@ class Head:
     def set_scene(self, info: SceneInfo) -> None:
         """Show the name, the title and the noise of a newly opened scene."""
         self.picker.set_value(self.page.state.scene)
-        self.title.props["title"] = info.title  # tooltip with the full title
-        self.title.set_text(info.title)
+        title = info.scene.title
+        self.title.props["title"] = title  # tooltip with the full title
+        self.title.set_text(title)
         self.noise.set_value(info.noise)
 
     def set_state(self, state: PageView) -> None:

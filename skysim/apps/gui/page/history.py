@@ -12,7 +12,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.views.context import Shown
+from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.state import PageView
 
 SETTLED = (
@@ -72,7 +72,7 @@ class History:
 
     def __init__(
         self,
-        page: Shown,
+        page: PageContext,
         home: str,
         show_query: Callable[[str], Awaitable[None]],
         is_settling: Callable[[], bool],

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
 from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import Shown
+from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.views.live import csv_table
 
 MAX_LINES = 500
@@ -47,7 +47,7 @@ class LogPanel:
         Identifications as values of COLUMNS
     """
 
-    def __init__(self, page: Shown) -> None:
+    def __init__(self, page: PageContext) -> None:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
@@ -100,7 +100,7 @@ def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
     )
     counts = len(result.detections), result.identified
     names = (
-        info.scene,
+        info.scene.name,
         info.noise,
         info.stages["detector"],
         info.stages["identifier"],

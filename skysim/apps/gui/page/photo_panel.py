@@ -11,6 +11,7 @@ from nicegui import ui
 from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
+from skysim.scene.sections.light import StarsConfig
 
 LIMIT_BYTES = 64 * 2**20
 
@@ -101,7 +102,7 @@ class PhotoPanel:
     def stages(self) -> Stages:
         """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
         info = self.page.scene_info
-        chosen = info.stages if info and info.under_stars else {}
+        chosen = info.stages if info and isinstance(info.scene.light, StarsConfig) else {}
         return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:

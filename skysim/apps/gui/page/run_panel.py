@@ -12,7 +12,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
+from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import widgets
 from skysim.apps.gui.views.context import PageContext
@@ -37,7 +37,7 @@ class RunPanel:
     contents
         Contents of the tab's live fields
     feedback
-        Feedback of the scene's controller; None without a controller
+        Feedback of the scene's controller; empty without a controller
     rows, log
         Rows of the computed frames, and curves of the motion
     residuals
@@ -67,7 +67,7 @@ class RunPanel:
         self.page = page
         self.contents = contents
         self.sensor = sensor
-        self.feedback: str | None = None
+        self.feedback = ""
         self.rows: list[FlightRow] = []
         self.log = MotionLog()
         self.times_s: list[float] = []
@@ -143,23 +143,18 @@ class RunPanel:
             else ""
         )
 
-    def set_scene(self, feedback: str | None) -> None:
-        """Set up the panel for a new scene, which has no flight yet.
-
-        Parameters
-        ----------
-        feedback
-            Feedback of its controller; None without a controller
-        """
+    def set_scene(self, info: SceneInfo) -> None:
+        """Set up the panel for a new scene, which has no flight yet."""
         self.pause()
         self.clear()
-        self.feedback = feedback
+        control = info.scene.motion.control
+        self.feedback = control.feedback if control else ""
         state = self.page.state
-        if feedback:
+        if self.feedback:
             self.closed_scene = state.scene
             self.closed_overrides = dict(state.overrides)
         offered = FEEDBACKS if self.closed_scene == state.scene else {"": FEEDBACKS[""]}
-        self.loop.set_options(offered, value=feedback or "")
+        self.loop.set_options(offered, value=self.feedback)
 
     def clear(self) -> None:
         self.rows = []
@@ -177,7 +172,7 @@ class RunPanel:
         """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
         state = self.page.state
         feedback = str(self.loop.value or "")
-        if self.closed_scene != state.scene or feedback == (self.feedback or ""):
+        if self.closed_scene != state.scene or feedback == self.feedback:
             return
         others = {
             key: value
@@ -196,7 +191,7 @@ class RunPanel:
         await self.page.open(state.scene, others | maneuver | control)
         if self.page.is_open:
             # The old value, if the scene refused the change.
-            self.loop.set_value(self.feedback or "")
+            self.loop.set_value(self.feedback)
             self.loop.enable()
 
     # Computing.

@@ -265,7 +265,7 @@ class ScenePanel:
     async def save(self) -> None:
         name = (self.name.value or "").strip()
         info = self.page.scene_info
-        title_before = info.title.removesuffix(", changed") if info else ""
+        title_before = info.scene.title.removesuffix(", changed") if info else ""
         title = f"{title_before}, changed" if title_before else name
         state = self.page.state
         path = await self.page.run_here(

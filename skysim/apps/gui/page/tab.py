@@ -35,7 +35,6 @@ from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
-from skysim.scene.loader import load
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
@@ -59,7 +58,7 @@ class Tab:
     user
         Its browser, by `server.user_of`
     state, scene_info, view, is_open
-        As in `Shown`
+        As in `PageContext`
     contents
         Contents of the fields that change with every frame
     editing, filling
@@ -346,9 +345,8 @@ class Tab:
                 )
             return False
         self.scene_info, view = result
-        control = (await asyncio.to_thread(load, path, overrides)).motion.control
         self.set_state(scene=scene, overrides=overrides)
-        self.set_scene(self.scene_info, control.feedback if control else None)
+        self.set_scene(self.scene_info)
         self.show_live_view(view)
         self.scene_panel.shown = self.tracker_panel.shown = (
             None  # the file of this name may have changed
@@ -357,19 +355,13 @@ class Tab:
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
 
-    def set_scene(self, info: SceneInfo, feedback: str | None) -> None:
-        """Show a new scene in all parts of the page.
-
-        Parameters
-        ----------
-        feedback
-            Feedback of its controller; None without a controller
-        """
+    def set_scene(self, info: SceneInfo) -> None:
+        """Show a new scene in all parts of the page."""
         self.head.set_scene(info)
         self.attitude.set_scene(info)
         self.scene_3d.set_scene(info)
         self.sensor.clear_zoom()
-        self.run_panel.set_scene(feedback)
+        self.run_panel.set_scene(info)
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
 

@@ -113,7 +113,6 @@ class SensorView:
                 self.wait_label = ui.label().mark("wait")
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
-        self.canvas.on("choose", self.light_chosen)
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
         self.canvas.on("drawn", self.drawn)
         self.update_display()
@@ -267,15 +266,11 @@ class SensorView:
         return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     def hover_changed(self, event: Any) -> None:
-        """Handle a move of the mouse to another light, or to none."""
-        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
-        self.update_text()
+        """Handle a move of the mouse to another light, or to none, or a click.
 
-    def light_chosen(self, event: Any) -> None:
-        """Handle a click: the data of the light stay on the page until the mouse is on another one."""
-        self.hover_px = (
-            (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
-        )
+        After a click the data of the light stay on the page until the mouse is on another one.
+        """
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:

@@ -33,7 +33,6 @@ from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
@@ -118,11 +117,9 @@ class Workbench:
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
         scene = self.scene
-        camera = self.scene.camera
+        camera = scene.camera
         return SceneInfo(
-            scene.name,
-            scene.title,
-            isinstance(scene.light, StarsConfig),
+            scene,
             scoring.angle_names(scene),
             id_prefix(self.lab),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
