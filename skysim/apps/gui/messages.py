@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats
-from skysim.dynamics.multibody import Shape
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
@@ -266,6 +265,8 @@ class SceneInfo:
         Duration of the motion
     noise
         Whether the camera has noise; without it a frame is the expected value
+    geometry
+        See `worker.geometry.lab_geometry`
     surveyed
         Whether a survey of the dome has begun
     """
@@ -278,48 +279,9 @@ class SceneInfo:
     stages: dict[str, str]
     duration_s: float
     noise: bool
-    geometry: LabGeometry
+    geometry: dict[str, Any]
     lens: Lens
     surveyed: bool = False
-
-
-class LookFrom(NamedTuple):
-    """A place to look from and a target, m, in the lab frame, or in body axes if the place is on the vehicle.
-
-    Attributes
-    ----------
-    fov_deg
-        Vertical field of view
-    """
-
-    eye_m: Floats
-    target_m: Floats
-    up: Floats
-    fov_deg: float
-    on_vehicle: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class LabGeometry:
-    """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
-
-    Attributes
-    ----------
-    shapes
-        Shapes of the MJCF file that `skysim scenes export` writes, without the lights
-    ids, lights_m, radius_m, lit
-        (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
-        stars are on a sphere
-    views
-        Places to look from, by name
-    """
-
-    shapes: tuple[Shape, ...]
-    ids: NDArray[np.int64]
-    lights_m: Floats
-    radius_m: Floats
-    lit: NDArray[np.bool_]
-    views: dict[str, LookFrom]
 
 
 @dataclass(frozen=True, slots=True)

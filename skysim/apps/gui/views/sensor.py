@@ -7,7 +7,6 @@ import base64
 import functools
 import math
 from collections.abc import Collection
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -226,7 +225,7 @@ class SensorView:
         is_new_lens = lens is not self.lens
         if is_new_lens:
             self.lens = lens
-            self.canvas.run_method("setLens", asdict(lens) if lens else None)
+            self.canvas.run_method("setLens", lens)
         self.update_text()
         self.display_image(view.pixels, alone=is_new_lens)
 
@@ -241,7 +240,7 @@ class SensorView:
     def fields(self) -> dict[str, Any]:
         """Further data for frame.js: pointing and marks."""
         view = {
-            "pose": asdict(self.pose) if self.pose else None,
+            "pose": self.pose,
             "label": self.description(),
         }
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)

@@ -6,7 +6,6 @@ A drag pulls at a point of the vehicle; frames show the motion.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -30,9 +29,6 @@ VIEWS = {
     "top": "from above",
 }
 UPDATE_S = 0.1
-AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
-MOST_AXIS_M = 1.2
-DIGITS = 5  # decimals of lengths in meters
 COAST_S = 60.0  # time after a drag until the vehicle is stopped
 
 
@@ -75,28 +71,8 @@ class Scene3D:
         self.canvas.run_method("look", name)
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        lab = scene_info.geometry
-        outside = lab.views["outside"]
-        distance_m = math.dist(outside.eye_m, outside.target_m)
-        self.canvas.run_method(
-            "build",
-            {
-                "shapes": [
-                    shape._asdict() | {"vertices_m": shape.vertices_m.round(DIGITS)}
-                    for shape in lab.shapes
-                ],
-                "lights": {
-                    "id": lab.ids,
-                    "place": lab.lights_m.round(DIGITS).ravel(),
-                    "radius": lab.radius_m.round(DIGITS),
-                    "lit": lab.lit,
-                },
-                "views": {name: view._asdict() for name, view in lab.views.items()},
-                "background": DARK["ground"],
-                "prefix": scene_info.prefix,
-                "axis": min(AXIS * distance_m, MOST_AXIS_M),
-            },
-        )
+        fields = {"background": DARK["ground"], "prefix": scene_info.prefix}
+        self.canvas.run_method("build", scene_info.geometry | fields)
 
     def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""

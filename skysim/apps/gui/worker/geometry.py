@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
+from skysim.apps.gui.messages import Lens, Pose
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
@@ -28,12 +28,33 @@ from skysim.tracking.onboard_model import calibration
 MAX_STARS = 600
 MAX_LEDS = 4000
 WIDE_DEG = 100.0  # field of the view from the bearing
+AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
+MOST_AXIS_M = 1.2
+DIGITS = 5  # decimals of lengths in meters
 
 
-def lab_geometry(lab: Lab) -> LabGeometry:
-    """Geometry of a lab: the shapes of its MJCF file, its lights, and the places to look from."""
+def lab_geometry(lab: Lab) -> dict[str, Any]:
+    """Geometry of a lab for space.js; meters in the lab frame unless stated otherwise.
+
+    It has the shapes of the MJCF file that `skysim scenes export` writes, without the lights; the lights, stars on a
+    sphere; the places to look from, by name; and the length of the drawn axes.
+    """
     model = multibody.laboratory(lab.export_mjcf())
-    return LabGeometry(model.shapes, *lights(lab.camera.sources), views(lab, model))
+    ids, place_m, radius_m, lit = lights(lab.camera.sources)
+    return {
+        "shapes": [
+            shape._asdict() | {"vertices_m": shape.vertices_m.round(DIGITS)}
+            for shape in model.shapes
+        ],
+        "lights": {
+            "id": ids,
+            "place": place_m.round(DIGITS).ravel(),
+            "radius": radius_m.round(DIGITS),
+            "lit": lit,
+        },
+        "views": views(lab, model),
+        "axis": min(AXIS * math.dist(model.eye_m, model.target_m), MOST_AXIS_M),
+    }
 
 
 def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
@@ -55,8 +76,12 @@ def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray
     return sources.id[rows], position_m, radius_m, power[rows] > 0
 
 
-def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
-    """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above."""
+def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
+    """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above.
+
+    Each is a place, a target and the direction up, in the lab frame, or in body axes if the place is on the vehicle;
+    the vertical field of view, deg; and whether it is on the vehicle.
+    """
     camera = lab.scene.camera
     mount = lab.camera.mount
     body_from_cam = mount.cam_from_body.inv()
@@ -65,12 +90,13 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
     up = np.array([0.0, 0.0, 1.0])
     north = np.array([0.0, 1.0, 0.0])
-    ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    ahead = body_from_cam.apply([0.0, 0.0, 1.0])
+    above = body_from_cam.apply([0.0, -1.0, 0.0])
     return {
-        "outside": LookFrom(model.eye_m, model.target_m, up, FOVY_DEG),
-        "camera": LookFrom(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
-        "bearing": LookFrom(np.zeros(3), up, north, WIDE_DEG),
-        "top": LookFrom(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
+        "outside": (model.eye_m, model.target_m, up, FOVY_DEG, False),
+        "camera": (pupil_m, pupil_m + ahead, above, field_deg, True),
+        "bearing": (np.zeros(3), up, north, WIDE_DEG, False),
+        "top": (model.target_m + height_m * up, model.target_m, north, FOVY_DEG, False),
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from skysim.apps.gui.messages import (
     AmbiguityMap,
     Detection,
     FrameView,
-    LabGeometry,
     Lens,
     LightColumns,
     SceneInfo,
@@ -63,7 +63,7 @@ class Workbench:
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
-    geometry: LabGeometry
+    geometry: dict[str, Any]
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
