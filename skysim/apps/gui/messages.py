@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
@@ -378,8 +378,8 @@ class SurveyPlan(NamedTuple):
         (None if not determined)
     """
 
-    angles_deg: list[list[float]]
-    shown: list[int]
+    angles_deg: Sequence[Sequence[float]]
+    shown: Sequence[int]
     leds: int
     steps: tuple[tuple[int, int, float | None], ...]
 
@@ -389,19 +389,13 @@ class SurveyFound(NamedTuple):
 
     Attributes
     ----------
-    frames, connected
-        Numbers of frames so far, and of those that share enough LEDs with others
-    missed
-        Number of attitudes of the last flight without a frame at which the vehicle rested
-    measured, seen_once, unseen
-        Numbers of LEDs, by the connected frames
-    renamed
-        Number of measured LEDs with another one's number
-    sigma_mm
-        Estimated rms error of the measured LEDs along each axis
-    before_mm, error_mm
-        True rms error before the survey and now. None, with the reason in `refusal`, if the
-        frames do not determine the LEDs
+    statistics
+        `frames` so far, `connected` ones, which share enough LEDs with others, and `missed`
+        attitudes of the last flight without a frame at which the vehicle rested; by the connected
+        frames, LEDs `measured`, `seen_once` and `unseen`; those `renamed` that have another one's
+        number; estimated rms error `sigma_mm` along each axis, and true ones before the survey and
+        now, `led_mm_before` and `led_mm_after`. If the frames do not determine the LEDs, the
+        reason is in `refusal`, and there are no errors
     faults
         Faults of the dome, a line each
     ids, known
@@ -409,18 +403,8 @@ class SurveyFound(NamedTuple):
         empty after a refusal
     """
 
-    frames: int
-    missed: int
-    seen_once: int
-    unseen: int
-    refusal: str
+    statistics: Record
+    faults: list[str]
     ids: NDArray[np.int64]
     known: Floats
     plan: SurveyPlan
-    connected: int = 0
-    measured: int = 0
-    renamed: int = 0
-    sigma_mm: float | None = None
-    before_mm: float | None = None
-    error_mm: float | None = None
-    faults: tuple[str, ...] = ()

@@ -215,11 +215,11 @@ class PlanPanel:
             )
             if found is None:
                 return
-            self.taken = found.frames
+            self.taken = found.statistics["frames"]
             lines = survey_lines(found)
             self.show_survey([*lines, prediction_text(found.plan)], found.plan)
             self.page.log(f"survey of {Path(self.page.state.scene).name}: {lines[0]}")
-            if not found.refusal:
+            if not found.statistics["refusal"]:
                 self.save_map.set_enabled(True)
                 self.colored = found.ids, found.known
             if self.colored:
@@ -314,21 +314,22 @@ def prediction_text(plan: SurveyPlan) -> str:
 
 def survey_lines(found: SurveyFound) -> list[str]:
     """The results of a survey's frames, and the faults of the dome."""
+    of = found.statistics
     missed = []
-    if found.missed:
-        missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
-    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
-    if found.refusal:
+    if of["missed"]:
+        missed = [f"{of['missed']} attitudes have no frame: the vehicle did not rest there."]
+    unmeasured = f"{of['seen_once']} seen once, {of['unseen']} not seen"
+    if of["refusal"]:
         return [
-            f"{found.frames} frames: no LED measured; {unmeasured}.",
+            f"{of['frames']} frames: no LED measured; {unmeasured}.",
             *missed,
-            f"Not determined yet: {found.refusal}.",
+            f"Not determined yet: {of['refusal']}.",
         ]
-    renamed = f"; {found.renamed} have the number of another one" if found.renamed else ""
+    renamed = f"; {of['renamed']} have the number of another one" if of["renamed"] else ""
     return [
-        f"{found.frames} frames, {found.connected} of them connected: {found.measured} of {len(found.ids)} LEDs"
-        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true"
-        f" error is {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before{renamed}.",
+        f"{of['frames']} frames, {of['connected']} of them connected: {of['measured']} of {of['leds']} LEDs measured"
+        f" to {of['sigma_mm']:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true error is"
+        f" {of['led_mm_after']:.2g} mm, {of['led_mm_before']:.2g} mm before{renamed}.",
         *missed,
         *found.faults,
     ]

@@ -99,32 +99,19 @@ class Survey:
             so_far = survey_findings.coverage_before(
                 frames, self.before, UNCERTAINTY, self.noise_px
             )
-        counts = survey_findings.coverage_statistics(so_far)
-        found = SurveyFound(
-            frames=len(taken),
-            missed=missed,
-            seen_once=counts["seen_once"],
-            unseen=counts["unseen"],
-            refusal=refusal,
-            ids=so_far.model.leds.id,
-            known=known_share(run),
-            plan=self.next_plan(so_far, len(taken), count),
-        )
+        statistics = survey_findings.coverage_statistics(so_far)
+        del statistics["by_led"]
+        statistics |= {"frames": len(taken), "missed": missed, "refusal": refusal}
+        faults: list[str] = []
         if run:
-            truth = survey_report.truth_statistics(run, self.before, self.lab)
-            faults = survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
-            found = found._replace(
-                connected=int(run.survey.tied.sum()),
-                measured=counts["measured"],
-                renamed=truth["renamed"],
-                sigma_mm=1e3 * run.accuracy.led_rms_m,
-                before_mm=truth["led_mm_before"],
-                error_mm=truth["led_mm_after"],
-                faults=tuple(faults),
-            )
+            statistics |= survey_report.truth_statistics(run, self.before, self.lab)
+            statistics["connected"] = int(run.survey.tied.sum())
+            statistics["sigma_mm"] = 1e3 * run.accuracy.led_rms_m
+            faults += survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
+        plan = self.next_plan(so_far, len(taken), count)
         self.taken = taken
         self.run = run or self.run
-        return found
+        return SurveyFound(statistics, faults, so_far.model.leds.id, known_share(run), plan)
 
     def new_frames(
         self, flight: Flight, views: Sequence[FrameView]
@@ -153,7 +140,7 @@ class Survey:
         new = []
         for row in (row for row in rows if row not in known):
             frame, _ = flight.render(row)
-            lab_from_body = quaternion.to_rotation(np.array(views[row].body_wxyz))
+            lab_from_body = quaternion.to_rotation(views[row].body_wxyz)
             lights = survey_frames.detect_lights(settings, camera, frame.image_dn)
             new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
