@@ -422,7 +422,8 @@ class Tab:
         """
         self.set_state(**state)
         self.view = view
-        self.attitude.show(view)
+        assert self.scene_info is not None
+        self.attitude.show(view, self.scene_info)
         self.scene_3d.show(view)
         self.sensor.show(view, self.scene_info)
 
@@ -438,8 +439,8 @@ class Tab:
             Changes of the fields of `PageView`
         """
         self.set_state(**state)
-        self.attitude.show_photo(photo)
-        self.sensor.show_photo(photo)
+        self.attitude.show(photo, photo)
+        self.sensor.show(photo, photo)
 
     def show_panel(self, name: str) -> None:
         """Open one of PANELS."""

@@ -202,32 +202,20 @@ class SensorView:
             except TimeoutError:
                 return
 
-    def show(self, view: FrameView, info: SceneInfo | None) -> None:
-        """Show a frame of the scene."""
-        self.prefix = info.prefix if info else "HIP"
-        self.statistics = statistics_text(
-            view.size_px, view.statistics, view.result, view, info
-        )
-        self.take(view, info.lens if info else None)
-
-    def show_photo(self, photo: Photo) -> None:
-        """Show a user's image or the frame of a study's trial."""
-        self.prefix = photo.prefix
-        self.statistics = statistics_text(photo.size_px, photo.statistics, photo.result)
-        self.take(photo, photo.lens)
-
-    def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
-        """Store lights, solution and pointing of a new image, and display it."""
-        self.lights = view.lights
-        self.result = view.result
-        self.size_px = view.size_px
-        self.pose = view.pose
-        is_new_lens = lens is not self.lens
+    def show(self, image: FrameView | Photo, of: SceneInfo | Photo) -> None:
+        """Show a frame of a scene, or another image: a user's, or the frame of a study's trial."""
+        self.prefix = of.prefix
+        self.statistics = statistics_text(image, of)
+        self.lights = image.lights
+        self.result = image.result
+        self.size_px = image.size_px
+        self.pose = image.pose
+        is_new_lens = of.lens is not self.lens
         if is_new_lens:
-            self.lens = lens
-            self.canvas.run_method("setLens", lens)
+            self.lens = of.lens
+            self.canvas.run_method("setLens", of.lens)
         self.update_text()
-        self.display_image(view.pixels, alone=is_new_lens)
+        self.display_image(image.pixels, alone=is_new_lens)
 
     def update_text(self) -> None:
         """Show data on the light under the mouse, or else the frame's numbers."""
@@ -329,20 +317,17 @@ def color_table(name: str) -> str:
     return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
 
 
-def statistics_text(
-    size_px: tuple[int, int],
-    statistics: plots.FrameStatistics,
-    result: TrackerResult | None,
-    view: FrameView | None = None,
-    scene_info: SceneInfo | None = None,
-) -> str:
-    """A frame's numbers in two columns; fewer if the image is not of the scene (view is None)."""
-    field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
-    rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
-    if view:
-        rows += [
-            ("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")
-        ]
+def statistics_text(image: FrameView | Photo, of: SceneInfo | Photo) -> str:
+    """An image's numbers in two columns; fewer if it is not of a scene."""
+    statistics = image.statistics
+    result = image.result
+    field = ("field", f"{of.field_deg:.4g}°") if isinstance(of, SceneInfo) else ("", "")
+    rows = [("frame", f"{image.size_px[0]} × {image.size_px[1]} px", *field)]
+    lights: tuple[str, ...] = ()
+    if isinstance(image, FrameView):
+        lights = ("lights", f"{len(image.lights)} in the field")
+        exposure = f"{1e3 * image.exposure_s:.4g} ms"
+        rows += [("exposure", exposure, "rendering", f"{image.ms:.0f} ms")]
     rows += [
         ("sky", f"{statistics.sky_dn:.5g} DN", "scatter", f"{statistics.scatter_dn:.3g} DN"),
         (
@@ -352,7 +337,6 @@ def statistics_text(
             f"{statistics.saturated} px",
         ),
     ]
-    lights = ("lights", f"{len(view.lights)} in the field") if view else ()
     detected = (
         ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     )

@@ -54,7 +54,7 @@ class Photo:
         As in `FrameView`
     lens
         Lens for the pose; both are None if the image was not solved
-    names, true_deg
+    names, angles_deg
         Names of the three angles, and their true values if known
     lights, prefix
         True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
@@ -71,7 +71,7 @@ class Photo:
     lens: Lens | None = None
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
-    true_deg: Triple | None = None
+    angles_deg: Triple | None = None
     lights: LightColumns = NO_LIGHTS
     prefix: str = "HIP"
     hint: str = ""
@@ -130,7 +130,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        true_deg=scoring.true_angles_deg(setup.lab.camera, truth),
+        angles_deg=scoring.true_angles_deg(setup.lab.camera, truth),
         lights=true_lights(truth, magnitude_by_id(setup.lab)),
         prefix=id_prefix(setup.lab),
         saturation_dn=frame.saturation_dn,
