@@ -195,21 +195,18 @@ def rows(
     """
     found = list(detections)
     found_px = places_px(found)
-    left = set(range(len(found)))
+    left = dict(enumerate(found))
     for light in lights:
         distance_px = np.hypot(*(found_px - (light.x, light.y)).T)
-        n = int(distance_px.argmin()) if len(found) else -1
-        near = n in left and distance_px[n] < NEAR_PX
-        spot = found[n] if near else None
-        left -= {n} if near else set()
+        is_near = distance_px.min(initial=np.inf) < NEAR_PX
+        spot = left.pop(int(distance_px.argmin()), None) if is_near else None
         yield {
             "key": f"light {light.id}",
             "id": light.id,
             "state": state(light, spot),
             "cells": cells(light, spot, name),
         }
-    for n in sorted(left):
-        spot = found[n]
+    for n, spot in left.items():
         taken = name(spot.id) if spot.id >= 0 else ""
         texts = [
             "no light",

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
 from skysim.apps.gui.messages import Lens, Pose
+from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
@@ -233,6 +234,8 @@ class Push:
     simulation
         Dynamics with gravity, drag, cable, tilt stop and the rotors' momentum, without
         disturbances and controller
+    start_s, end_s
+        Times between which frame 0 shows the motion
     lab_from_body
         The present attitude
     torque_nm
@@ -242,18 +245,15 @@ class Push:
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
         require_vehicle(lab.scene)
         self.lab = lab
-        kept_s = self.exposure_s + MAX_ADVANCE_S
+        window = exposure_window(lab.scene, 0)
+        self.start_s = window.open_s - MARGIN_S
+        self.end_s = window.close_s(lab.scene.camera.height_px) + MARGIN_S
+        kept_s = self.end_s - self.start_s + MAX_ADVANCE_S
         self.simulation = multibody.Simulation(
             lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s
         )
         self.lab_from_body = lab_from_body
         self.torque_nm = np.zeros(3)
-
-    @property
-    def exposure_s(self) -> float:
-        """Duration of the motion that a frame shows."""
-        window = exposure_window(self.lab.scene, 0)
-        return window.close_s(self.lab.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
 
     def advance(self, grip: Grip | None, elapsed_s: float) -> None:
         """Integrate for a time with a torque that follows the vehicle; without a grip there is none."""
@@ -261,31 +261,24 @@ class Push:
         period = round(PERIOD_S / simulation.step_s)
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
-            lab_from_body = Rotation.from_quat(
-                simulation.lab_from_body_wxyz, scalar_first=True
-            )
             self.torque_nm = pull_torque_nm(
-                grip, lab_from_body, self.lab.vehicle.inertia_kg_m2
+                grip, self.lab_from_body, self.lab.vehicle.inertia_kg_m2
             )
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
-        self.lab_from_body = Rotation.from_quat(
-            simulation.lab_from_body_wxyz, scalar_first=True
-        )
+            self.lab_from_body = quaternion.to_rotation(simulation.lab_from_body_wxyz)
 
     def seen(self) -> Trajectory:
         """A trajectory whose frame 0 ends now; before the motion the vehicle is at rest."""
-        window = exposure_window(self.lab.scene, 0)
-        end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
-        begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
+        shown_s = self.end_s - self.start_s
+        begin = self.simulation.step - math.ceil(shown_s / self.simulation.step_s)
         motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
-        t_s = motion.t_s + end_s - self.simulation.now_s
+        t_s = motion.t_s + self.end_s - self.simulation.now_s
         attitudes = motion.lab_from_body
         rates = motion.rate_body_rad_s
-        start_s = window.open_s - MARGIN_S
-        if t_s[0] > start_s:
-            t_s = np.append(start_s, t_s)
+        if t_s[0] > self.start_s:
+            t_s = np.append(self.start_s, t_s)
             rates = np.concatenate([np.zeros((1, 3)), rates])
             attitudes = Rotation.concatenate([attitudes[:1], attitudes])
         return Trajectory(t_s, attitudes, rates)
