@@ -27,10 +27,9 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker.workbench import (
-    detection_views,
+    detections_of,
     id_prefix,
     magnitude_by_id,
-    matches_by_row,
     tracker_result,
     true_lights,
 )
@@ -154,15 +153,15 @@ def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> P
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
     """The photo for the page of an image that a tracker has solved or refused."""
     attitude = report.attitude
-    detections = detection_views(
-        report, matches_by_row(tracker, attitude, report.centroids.xy_px)
-    )
     solution = plate_solver.solution_fields(report) if attitude.solved else {}
     angles: Triple | None = (
         (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
     )
     result = TrackerResult(
-        attitude.status, detections, 1e3 * sum(report.seconds.values()), angles
+        attitude.status,
+        detections_of(tracker, report),
+        1e3 * sum(report.seconds.values()),
+        angles,
     )
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf

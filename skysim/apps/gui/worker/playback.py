@@ -21,7 +21,7 @@ from skysim.apps.gui.messages import (
     TrackerResult,
 )
 from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.workbench import Workbench, tracker_result
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
@@ -111,10 +111,8 @@ class Playback:
         """Keep a shot, and its pixels if the file has room."""
         bench = self.bench
         assert shot.report is not None
-        solved = tracker_result(
-            bench.lab, bench.estimator, shot.frame, shot.truth, shot.report
-        )
-        view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
+        seconds = sum(shot.seconds.values())
+        view = bench.frame_view(shot.frame, shot.truth, shot.report, seconds)
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(
             KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
