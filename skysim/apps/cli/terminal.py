@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skysim.core.errors import printable
+from skysim.core.paths import shipped_files, title_of
 from skysim.results.report import print_blocks, print_table, print_wrapped
 from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
 
@@ -80,10 +81,8 @@ def trial_progress(
 
     If stderr is not a terminal, print a line after every tenth of the trials instead.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
     what = printable(what)
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.0f}/s  {task.fields[faults]}"
     tenth = 0
@@ -94,7 +93,7 @@ def trial_progress(
             nonlocal tenth
             faults = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
             shown.update(task, completed=done.done, rate=done.rate, faults=faults)
-            if not console.is_terminal and 10 * done.done // total > tenth:
+            if not shown.console.is_terminal and 10 * done.done // total > tenth:
                 tenth = 10 * done.done // total
                 line = f"{what}: {done.done} of {total}, {done.rate:.0f} {unit}/s, {faults}"
                 print(line, file=sys.stderr, flush=True)
@@ -230,8 +229,6 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.paths import shipped_files, title_of
-
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
         for path in shipped_files(folder).values()

@@ -11,7 +11,7 @@ import typer
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, print_titles, progress
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import DATA
+from skysim.core.paths import DATA, SCENES
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 
@@ -30,8 +30,6 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     """List the scenes that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.paths import SCENES
-
     print_titles(SCENES, json)
 
 
@@ -78,16 +76,17 @@ def scenes_export(
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
     lab = build_lab(loaded)
+    ending = path.suffix.lower()
     use = f"python -m mujoco.viewer --mjcf={path}"
-    if path.suffix.lower() == ".pdf":
+    if ending == ".pdf":
         files.make_folder(path.parent)
         count = gore_pages.write_pdf(path, templates.dome_of(lab), paper)
         print(f"{path}: {count} pages; print them at 100 %")
         return
-    if path.suffix.lower() == ".csv":
+    if ending == ".csv":
         text, cap_deg = lab.export_leds()
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
-    elif (ending := path.suffix.lower()) in templates.TEMPLATES:
+    elif ending in templates.TEMPLATES:
         text = templates.template(lab, ending)
         use = "print it at 100 %" if ending == ".svg" else "in mm"
     else:

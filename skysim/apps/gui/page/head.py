@@ -22,14 +22,11 @@ class Head:
     ----------
     folder
         Folder in which scenes are saved
-    message_text
-        Text of the message
     """
 
     def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
         self.page = page
         self.folder = folder
-        self.message_text = ""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
@@ -94,7 +91,6 @@ class Head:
         self.live_button.set_visibility(state.kind != "live")
 
     def set_message(self, text: str, color: str) -> None:
-        self.message_text = text
         self.message.props["title"] = text  # tooltip with the full text
         self.message.set_text(text)
         self.message.classes(remove="good warn quiet", add=color)

@@ -89,29 +89,22 @@ def line(view: FrameView, info: SceneInfo) -> str:
 
 
 def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
-    """An identification as values of COLUMNS; None where there is no solution."""
+    """An identification as values of COLUMNS; None or NaN where there is no solution."""
     result = view.result
     assert result is not None
-    found = result.angles_deg or (None,) * 3
-    errors = (
-        (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec)
-        if result.solved
-        else (None,) * 4
-    )
-    counts = len(result.detections), result.identified
-    names = (
+    return (
+        time.strftime("%H:%M:%S"),
         info.scene.name,
         info.noise,
         info.stages["detector"],
         info.stages["identifier"],
         result.status,
-    )
-    return (
-        time.strftime("%H:%M:%S"),
-        *names,
-        *counts,
+        len(result.detections),
+        result.identified,
         *view.angles_deg,
-        *found,
-        *errors,
+        *(result.angles_deg or (None,) * 3),
+        result.cross_arcsec,
+        result.roll_arcsec,
+        *result.sigma_arcsec,
         result.wrong,
     )

@@ -57,7 +57,7 @@ class Tab:
         Live cameras that it may watch
     user
         Its browser, by `server.user_of`
-    state, scene_info, view, is_open
+    state, scene_info, view, is_open, message_text
         As in `PageContext`
     contents
         Contents of the fields that change with every frame
@@ -80,6 +80,7 @@ class Tab:
         self.scene_info: SceneInfo | None = None
         self.view: FrameView | None = None
         self.is_open = True
+        self.message_text = ""
         self.restarting = False
         self.contents = Contents()
         self.editing = asyncio.Lock()
@@ -402,11 +403,6 @@ class Tab:
         """Whether every frame is solved."""
         return bool(self.head.identify.value)
 
-    @property
-    def message_text(self) -> str:
-        """The message in the page header."""
-        return self.head.message_text
-
     def set_state(self, **changes: Any) -> None:
         """Change fields of the page's view, and the banner."""
         self.state = replace(self.state, **changes)
@@ -456,6 +452,7 @@ class Tab:
         """Show a message in the page header until the next action; warnings are also logged."""
         if text == self.message_text:
             return
+        self.message_text = text
         self.head.set_message(text, color)
         if text and color == "warn":
             self.log(text)

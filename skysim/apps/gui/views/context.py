@@ -35,9 +35,8 @@ class PageContext(Protocol):
     scene_info: SceneInfo | None
     view: FrameView | None
     is_open: bool
+    message_text: str
 
-    @property
-    def message_text(self) -> str: ...
     @property
     def solving(self) -> bool: ...
 

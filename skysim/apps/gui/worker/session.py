@@ -32,7 +32,7 @@ class WorkerLost(Exception):
 def serve(pipe: Connection) -> None:
     """Main loop of the worker, until the pipe closes.
 
-    It receives (task, arguments, display), and sends ("ok", result) or ("error", InputError).
+    It receives (task, arguments, display), and sends the result or an InputError.
     """
     worker = importlib.import_module(TEMPLATE).WORKER
     signal.signal(
@@ -44,15 +44,15 @@ def serve(pipe: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            pipe.send(("ok", getattr(worker, task)(*arguments)))
+            pipe.send(getattr(worker, task)(*arguments))
         except InputError as error:
-            pipe.send(("error", error))
+            pipe.send(error)
         except ImageError as error:
-            pipe.send(("error", InputError("", error)))
+            pipe.send(InputError("", error))
         except MemoryError:
-            pipe.send(("error", InputError("", "not enough memory")))
+            pipe.send(InputError("", "not enough memory"))
         except Exception as error:  # a bug in one task must not end the worker
-            pipe.send(("error", InputError("", f"{type(error).__name__}: {error}")))
+            pipe.send(InputError("", f"{type(error).__name__}: {error}"))
 
 
 class Session:
@@ -98,10 +98,10 @@ class Session:
         """Send a task and wait for its result; runs in the session's thread."""
         try:
             self.pipe.send((task, arguments, self.display))
-            status, reply = self.pipe.recv()
+            reply = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise WorkerLost(STOPPED) from error
-        if status == "error":
+        if isinstance(reply, InputError):
             raise reply
         return reply
 
