@@ -15,7 +15,14 @@ import numpy as np
 from nicegui import json
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, TrackerResult
+from skysim.apps.gui.messages import (
+    LIMITS,
+    Display,
+    LightColumns,
+    Pixels,
+    TrackerResult,
+    places_px,
+)
 from skysim.apps.gui.worker.session import WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
@@ -62,15 +69,17 @@ def marks(
     """
     detections = result.detections if result else ()
     ids = [one.id for one in detections]
-    found_px = np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
+    found_px = places_px(detections)
     is_identified = np.array(ids, np.int64) >= 0
     visible = lights[:MAX_TRUTH_MARKS]
     offset_px = np.abs(
         lights.xy_px[:, None] - found_px
     )  # of each true light and each detection
-    near = (offset_px < NEAR_PX).all(axis=2)
+    near = np.all(offset_px < NEAR_PX, axis=2)
     bright = bright_count(visible, ids, near[: len(visible)])
-    is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
+    is_false = ~np.any(near, axis=0) & bool(
+        len(lights)
+    )  # without true lights it is not known
     true = rounded(visible.xy_px)
     found = rounded(found_px)
     points: Mapping[str, Points] = {

@@ -83,7 +83,9 @@ def pixels_for(
     (height, width) = integers.shape
     limits = limits_of(levels, display.limits)
     saturation = (saturation_dn - levels.offset) / levels.step
-    columns = columns_for(display, width, height)
+    # The columns of the screen that the image fills; 0 if all pixels are needed.
+    scale = min(display.screen_px[0] / width, display.screen_px[1] / height)
+    columns = math.floor(width * scale + 0.5)
     shaded = 0 < columns < WORTHWHILE * width
     drawn = (
         shades(integers, columns, limits, saturation, display.curve) if shaded else integers
@@ -104,13 +106,6 @@ def pixels_for(
             "levels": integers[y:, x:][:LOUPE_PX, :LOUPE_PX].tolist(),
         }
     return Pixels(levels._replace(integers=drawn).data(), fields, display, number)
-
-
-def columns_for(display: Display, width: int, height: int) -> int:
-    """The columns of the screen that an image fills; 0 if all pixels are needed."""
-    return math.floor(
-        width * min(display.screen_px[0] / width, display.screen_px[1] / height) + 0.5
-    )
 
 
 def shades(

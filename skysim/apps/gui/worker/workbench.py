@@ -108,23 +108,18 @@ class Workbench:
         )
 
     @property
-    def stages(self) -> dict[str, str]:
-        """The tracker's algorithms by stage."""
-        settings = factory.assumed_settings(self.scene)
-        return {name: getattr(settings, name) for name in STAGES}
-
-    @property
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
         scene = self.scene
         camera = scene.camera
+        settings = factory.assumed_settings(scene)
         return SceneInfo(
             scene,
             scoring.angle_names(scene),
             id_prefix(self.lab),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             1 / camera.focal_px / ARCSEC_RAD,
-            self.stages,
+            {name: getattr(settings, name) for name in STAGES},
             self.lab.duration_s,
             camera.detector.noise,
             self.geometry,
