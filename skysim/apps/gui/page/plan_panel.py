@@ -66,9 +66,6 @@ class PlanPanel:
         self.page = page
         self.scene_3d = scene_3d
         self.run_panel = run_panel
-        self.plan: SurveyPlan | None = None
-        self.taken = 0
-        self.colored: tuple[NDArray[np.int64], Floats] | None = None
         self.legends = dict[str, ui.element]()
         with self.part():
             widgets.button("Check", self.check, "check")
@@ -122,7 +119,8 @@ class PlanPanel:
 
     def clear_survey(self) -> None:
         """Discard the survey, and show what a survey does."""
-        self.plan = self.colored = None
+        self.plan: SurveyPlan | None = None
+        self.colored: tuple[NDArray[np.int64], Floats] | None = None
         self.taken = 0
         self.legends.pop("survey", None)
         self.enable()

@@ -7,6 +7,7 @@ import bisect
 import time
 from collections.abc import Callable
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
 from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
+TIME_S = attrgetter("t_s")  # time of a row
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
 LOOK_S = 0.05  # interval of checks whether the flight still plays
@@ -68,19 +70,13 @@ class RunPanel:
         self.contents = contents
         self.sensor = sensor
         self.feedback = ""
-        self.rows: list[FlightRow] = []
-        self.log = MotionLog()
-        self.times_s: list[float] = []
-        self.residuals: list[tuple[float, int, float]] = []
         self.computing = self.stopping = self.playing = self.showing = False
         self.wanted_s: float | None = None
         self.when_shown: Callable[[], None] | None = None
         self.sought: int | None = None
         self.plays_when_done = False
-        self.index = 0
         self.factor = SPEEDS["real time"]
         self.started_s = 0.0
-        self.from_s = 0.0
         self.drawn_s = 0.0
         self.closed_scene = ""
         self.closed_overrides: dict[str, str] = {}
@@ -119,7 +115,7 @@ class RunPanel:
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
         self.strips = StripChart(self.contents)
-        self.enable()
+        self.clear()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
         button = ui.button(icon=icon, on_click=action).props(
@@ -157,10 +153,10 @@ class RunPanel:
         self.loop.set_options(offered, value=self.feedback)
 
     def clear(self) -> None:
-        self.rows = []
+        """Forget the flight."""
+        self.rows: list[FlightRow] = []
         self.log = MotionLog()
-        self.times_s = []
-        self.residuals = []
+        self.residuals: list[tuple[float, int, float]] = []
         self.index = 0
         self.from_s = 0.0
         self.seek.set_value(0)
@@ -244,7 +240,6 @@ class RunPanel:
         """Add new rows, residuals and curves of the flight."""
         self.rows += step.rows
         self.residuals += step.residuals
-        self.times_s += [row.t_s for row in step.rows]
         self.log = step.log or self.log
         self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
         self.summary.set_text(
@@ -256,7 +251,7 @@ class RunPanel:
     def draw(self) -> None:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
-        ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
+        ends = [*self.log.t_s[-1:], *(row.t_s for row in self.rows[-1:])]
         lights = (
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once
@@ -298,9 +293,8 @@ class RunPanel:
         if self.playing:
             self.pause()
         elif self.rows and not self.computing:
-            self.from_s = (
-                0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
-            )
+            is_over = self.index >= len(self.rows) - 1
+            self.from_s = 0.0 if is_over else self.rows[self.index].t_s
             self.start()
 
     def pause(self) -> None:
@@ -336,7 +330,7 @@ class RunPanel:
         if self.rows and not self.computing:
             self.pause()
             await self.show_index(
-                min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s))
+                min(range(len(self.rows)), key=lambda n: abs(self.rows[n].t_s - t_s))
             )
 
     async def slid(self, event: Any) -> None:
@@ -346,7 +340,7 @@ class RunPanel:
         while not is_showing and self.sought is not None:
             index = self.sought
             if 0 <= index < len(self.rows):
-                self.from_s = self.times_s[index]
+                self.from_s = self.rows[index].t_s
                 self.started_s = time.monotonic()
                 await self.show_index(index)
             if self.sought == index:
@@ -359,13 +353,13 @@ class RunPanel:
         self.showing = True
         try:
             while self.playing and self.rows and self.page.is_open:
-                index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
+                index = max(bisect.bisect_right(self.rows, self.now_s, key=TIME_S) - 1, 0)
                 if index != self.index or self.page.state.kind != "flight":
                     await self.show_index(index)
                 if self.index >= len(self.rows) - 1:
                     self.pause()
                 elif self.playing:
-                    wait_s = (self.times_s[self.index + 1] - self.now_s) / self.factor
+                    wait_s = (self.rows[self.index + 1].t_s - self.now_s) / self.factor
                     await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
         except Exception:
             self.pause()
