@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA, SCENES
@@ -91,8 +91,7 @@ def scenes_export(
         use = "print it at 100 %" if ending == ".svg" else "in mm"
     else:
         text = lab.export_mjcf()
-    files.make_folder(path.parent)
-    files.write_text(path, text)
+    write_file(path, text)
     print(f"{path}: {use}")
 
 
@@ -112,15 +111,13 @@ def scenes_parts(
     json: Json = False,
 ) -> None:
     """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
-    from skysim.core import files
     from skysim.results.files import parts
     from skysim.results.files.parts import find_prices, read_prices
 
     loaded = load(scene, None, seed, set_)
     found = parts.parts_list(loaded, read_prices(find_prices(prices)))
     if out:
-        files.make_folder(out.parent)
-        files.write_text(out, parts.to_csv(found, loaded.name))
+        write_file(out, parts.to_csv(found, loaded.name))
     if json:
         lines = [line._asdict() for line in found.lines]
         print_json({"parts": lines, "groups": found.groups(), "total": found.total})
@@ -159,8 +156,6 @@ def new(
 
     Its first lines say which commands use it. A vehicle is two files: its model, and a scene that flies it.
     """
-    from skysim.core import files
-
     if kind not in KINDS:
         raise InputError("", *unknown_name("kind", kind, KINDS))
     if not re.fullmatch(r"[A-Za-z]\w*", name):
@@ -173,10 +168,9 @@ def new(
             raise InputError(
                 target, "exists; choose another name, or another folder with --out"
             )
-    files.make_folder(out)
     for target, template in templates.items():
         text = template.read_text(encoding="utf-8")
-        files.write_text(target, text.replace("NAME", name))
+        write_file(target, text.replace("NAME", name))
         print(target)
         for use in re.findall("^#   (skysim.*)", text, re.MULTILINE):
             print(
