@@ -10,8 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.views import keys, widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, keys, widgets
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import geometry
 
@@ -136,7 +135,7 @@ class Actions:
 
     def __init__(
         self,
-        page: PageContext,
+        page: context.PageContext,
         sensor: SensorView,
         step: Callable[[int], Awaitable[None]],
         performers: Mapping[str, Action],

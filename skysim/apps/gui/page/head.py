@@ -7,9 +7,7 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import forms, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import Contents, LiveText
+from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.core.paths import SCENES, shipped_files
@@ -24,7 +22,9 @@ class Head:
         Folder in which scenes are saved
     """
 
-    def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
+    def __init__(
+        self, page: context.PageContext, contents: live.Contents, folder: Path
+    ) -> None:
         self.page = page
         self.folder = folder
         with ui.element("div").classes("lab-head"):
@@ -36,7 +36,7 @@ class Head:
                 on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
-            self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
+            self.banner = live.LiveText(contents, "live").classes("lab-banner").mark("banner")
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
@@ -46,7 +46,7 @@ class Head:
             self.busy = (
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
-            self.latency = LiveText(contents).classes("lab-rate mono quiet").mark("rate")
+            self.latency = live.LiveText(contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
                 "dense size=xs"

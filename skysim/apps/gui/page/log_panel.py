@@ -9,9 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import csv_table
+from skysim.apps.gui.views import context, live, widgets
 
 MAX_LINES = 500
 MAX_ROWS = 10_000
@@ -47,7 +45,7 @@ class LogPanel:
         Identifications as values of COLUMNS
     """
 
-    def __init__(self, page: PageContext) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
@@ -69,7 +67,7 @@ class LogPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
+            live.csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
         )
 
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, widgets
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
 from skysim.scene.sections.light import StarsConfig
 
@@ -40,7 +39,7 @@ class PhotoPanel:
         Status that was logged last
     """
 
-    def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:
+    def __init__(self, page: context.PageContext, cameras: Sequence[str]) -> None:
         self.page = page
         self.cameras = cameras
         self.live = False

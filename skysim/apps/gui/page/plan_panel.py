@@ -16,10 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
-from skysim.apps.gui.views import forms, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.space import Scene3D
-from skysim.apps.gui.views.style import color_scale
+from skysim.apps.gui.views import context, forms, space, style, widgets
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
@@ -62,7 +59,9 @@ class PlanPanel:
         one is shown
     """
 
-    def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
+    def __init__(
+        self, page: context.PageContext, scene_3d: space.Scene3D, run_panel: RunPanel
+    ) -> None:
         self.page = page
         self.scene_3d = scene_3d
         self.run_panel = run_panel
@@ -180,7 +179,7 @@ class PlanPanel:
             ui.label(ambiguity_text(found))
             with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
                 widgets.quiet(f"{100 * found.least:.0f} % or less")
-                scale = 255 * color_scale(np.linspace(0, 1, 8))
+                scale = 255 * style.color_scale(np.linspace(0, 1, 8))
                 colors = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in scale)
                 ui.element("div").style(
                     f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"

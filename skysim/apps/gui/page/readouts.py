@@ -17,10 +17,8 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
-from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
 
@@ -38,7 +36,7 @@ class AttitudeCard:
         Contents of the tab's live fields
     """
 
-    def __init__(self, page: PageContext, contents: Contents) -> None:
+    def __init__(self, page: context.PageContext, contents: Contents) -> None:
         self.page = page
         self.contents = contents
         with ui.element("div").classes("lab-card"):
@@ -176,7 +174,7 @@ class LightsPanel:
         self.table.run_method(
             "show",
             HEADS,
-            list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name)),
+            list(rows(sensor.lights[: overlay.MAX_TRUTH_MARKS], detections, sensor.name)),
         )
 
 
@@ -198,7 +196,7 @@ def rows(
     left = dict(enumerate(found))
     for light in lights:
         distance_px = np.hypot(*(found_px - (light.x, light.y)).T)
-        is_near = distance_px.min(initial=np.inf) < NEAR_PX
+        is_near = distance_px.min(initial=np.inf) < overlay.NEAR_PX
         spot = left.pop(int(distance_px.argmin()), None) if is_near else None
         yield {
             "key": f"light {light.id}",

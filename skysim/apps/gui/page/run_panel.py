@@ -15,10 +15,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
-from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
+from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
@@ -65,7 +62,9 @@ class RunPanel:
         again
     """
 
-    def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
+    def __init__(
+        self, page: context.PageContext, contents: live.Contents, sensor: SensorView
+    ) -> None:
         self.page = page
         self.contents = contents
         self.sensor = sensor
@@ -104,13 +103,13 @@ class RunPanel:
             "instant-feedback"
         )
         with widgets.row(3):
-            self.seek = LiveInput(self.contents, "range").props(
+            self.seek = live.LiveInput(self.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
             )
             self.seek.classes("lab-seek").on(
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
-            self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
+            self.clock = live.LiveText(self.contents).classes("mono flex-none").mark("clock")
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
@@ -149,7 +148,9 @@ class RunPanel:
         if self.feedback:
             self.closed_scene = state.scene
             self.closed_overrides = dict(state.overrides)
-        offered = FEEDBACKS if self.closed_scene == state.scene else {"": FEEDBACKS[""]}
+        offered = (
+            forms.FEEDBACKS if self.closed_scene == state.scene else {"": forms.FEEDBACKS[""]}
+        )
         self.loop.set_options(offered, value=self.feedback)
 
     def clear(self) -> None:
@@ -182,7 +183,7 @@ class RunPanel:
                 controls[key] = value
             if feedback and key.startswith("motion.maneuver"):
                 maneuver[key] = value
-        control = loop_overrides(state.scene, others | controls, feedback)
+        control = forms.loop_overrides(state.scene, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
         await self.page.open(state.scene, others | maneuver | control)
         if self.page.is_open:
@@ -381,6 +382,6 @@ class RunPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(FlightRow._fields, self.rows),
+            live.csv_table(FlightRow._fields, self.rows),
             f"{Path(self.page.state.scene).stem}_flight.csv",
         )

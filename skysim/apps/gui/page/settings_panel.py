@@ -10,9 +10,8 @@ from pathlib import Path
 from nicegui import run, ui
 
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.views import forms, keys, widgets
+from skysim.apps.gui.views import forms, keys, live, widgets
 from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import for_page
 from skysim.core.errors import InputError
 
 SENSOR = "sensor, F6"
@@ -181,7 +180,7 @@ class KeyForm:
                 forms.with_value, self.page.state.scene, before, key, value
             )
         except InputError as error:
-            self.show_error(key, error.fault if error.key == key else for_page(error))
+            self.show_error(key, error.fault if error.key == key else live.for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())

@@ -14,22 +14,20 @@ from typing import Any
 from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.page import monte_carlo_panel, readouts
+from skysim.apps.gui.page import (
+    history,
+    log_panel,
+    monte_carlo_panel,
+    photo_panel,
+    plan_panel,
+    readouts,
+    run_panel,
+)
 from skysim.apps.gui.page.actions import Action, Actions, Command
 from skysim.apps.gui.page.head import Arrangement, Head
-from skysim.apps.gui.page.history import History
-from skysim.apps.gui.page.log_panel import LogPanel
-from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.page.photo_panel import PhotoPanel
-from skysim.apps.gui.page.plan_panel import PlanPanel
-from skysim.apps.gui.page.readouts import AttitudeCard, LightsPanel
-from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.page.settings_panel import ScenePanel, TrackerPanel
-from skysim.apps.gui.views import forms, keys, style
+from skysim.apps.gui.views import forms, keys, overlay, sensor, space, style
 from skysim.apps.gui.views.live import Contents, for_page
-from skysim.apps.gui.views.overlay import FRAMES
-from skysim.apps.gui.views.sensor import SensorView
-from skysim.apps.gui.views.space import Scene3D
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
@@ -89,7 +87,7 @@ class Tab:
     async def close(self) -> None:
         """Release frames, study and worker of the tab after its browser has gone."""
         self.is_open = False
-        FRAMES.pop(self.id, None)
+        overlay.FRAMES.pop(self.id, None)
         self.study_panel.close()
         if hasattr(self, "session"):
             await asyncio.to_thread(self.session.close)
@@ -129,12 +127,12 @@ class Tab:
         )
         with ui.element("div").classes("lab"):
             self.head = Head(self, self.contents, self.folder)
-            self.sensor = SensorView(self.id, self.contents)
+            self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
                 Arrangement.splitter("side", "vertical", "Width of the panels")
-                self.attitude = AttitudeCard(self, self.contents)
+                self.attitude = readouts.AttitudeCard(self, self.contents)
                 await self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
@@ -144,7 +142,9 @@ class Tab:
                             sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
-        self.history = History(self, self.state.scene, self.show_query, self.is_settling)
+        self.history = history.History(
+            self, self.state.scene, self.show_query, self.is_settling
+        )
         self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
         self.actions = Actions(
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
@@ -156,7 +156,7 @@ class Tab:
     async def build_panels(self) -> None:
         with ui.element("div").classes("lab-panes"):
             with ui.element("div").classes("lab-space-pane"):
-                self.scene_3d = Scene3D(self, self.sensor)
+                self.scene_3d = space.Scene3D(self, self.sensor)
             Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
                 "dense align=left no-caps indicator-color=primary"
@@ -169,24 +169,28 @@ class Tab:
                 self.tabs, value=PANELS[0], animated=False, keep_alive=True
             ).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
-                    self.lights = LightsPanel(self.sensor)
+                    self.lights = readouts.LightsPanel(self.sensor)
                 with ui.tab_panel("Scene"):
                     self.scene_panel = ScenePanel(self, self.folder, self.head.update_scenes)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.run_panel = RunPanel(self, self.contents, self.sensor)
+                    self.run_panel = run_panel.RunPanel(self, self.contents, self.sensor)
                 with ui.tab_panel("Plan"):
-                    self.plan_panel = PlanPanel(self, self.scene_3d, self.run_panel)
+                    self.plan_panel = plan_panel.PlanPanel(
+                        self, self.scene_3d, self.run_panel
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Monte Carlo"):
-                    self.study_panel = MonteCarloPanel(self, self.out, self.user, self.id)
+                    self.study_panel = monte_carlo_panel.MonteCarloPanel(
+                        self, self.out, self.user, self.id
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
                     self.tracker_panel = TrackerPanel(self, self.study_panel)
                 with ui.tab_panel("Image"):
-                    self.photo = PhotoPanel(self, self.cameras)
+                    self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
-                    self.log_panel = LogPanel(self)
+                    self.log_panel = log_panel.LogPanel(self)
         self.tabs.on_value_change(self.fill_form)
 
     def update_lights(self) -> None:

@@ -29,16 +29,7 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import overlay, widgets
-from skysim.apps.gui.views.live import Contents, LiveText
-from skysim.apps.gui.views.overlay import (
-    FRAMES,
-    NAMES,
-    ServedFrame,
-    Source,
-    TabFrames,
-    display_of,
-)
+from skysim.apps.gui.views import live, overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Floats
 from skysim.results import plots
@@ -47,7 +38,7 @@ from skysim.sources.bodies import NAMES as BODIES
 FIRST_START = (
     "The first frame on a machine takes up to a minute, because the code is compiled."
 )
-LABELS = NAMES | BODIES  # names of lights by number
+LABELS = overlay.NAMES | BODIES  # names of lights by number
 STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
     "gray": None,
@@ -82,9 +73,9 @@ class SensorView:
         The newest frames
     """
 
-    source: Source
+    source: overlay.Source
 
-    def __init__(self, id: str, contents: Contents) -> None:
+    def __init__(self, id: str, contents: live.Contents) -> None:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
@@ -97,12 +88,12 @@ class SensorView:
         self.statistics = ""  # numbers of the frame, shown while no light is under the mouse
         self.hover_px: tuple[float, float] | None = None
         self.sent_number = 0
-        self.frames = TabFrames(self.announce)
+        self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
-                self.hover = LiveText(contents).classes("mono").mark("hover")
+                self.hover = live.LiveText(contents).classes("mono").mark("hover")
             with (
                 self.canvas.add_slot("wait"),
                 ui.element("div").classes("lab-wait") as self.wait,
@@ -178,8 +169,10 @@ class SensorView:
             self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
         fields = self.fields() | {"contents": self.contents.take()}
-        FRAMES[self.id] = self.frames
-        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.source), alone)
+        overlay.FRAMES[self.id] = self.frames
+        self.frames.add(
+            self.sent_number, overlay.ServedFrame(pixels, fields, self.source), alone
+        )
 
     def announce(self, number: int) -> None:
         """Let the browser request a frame."""
@@ -189,7 +182,7 @@ class SensorView:
         """Handle the browser's report of a drawn frame, and of its display for the next ones."""
         self.frames.drawn = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
-        display = display_of(dict(parse_qsl(str(event.args["display"]))))
+        display = overlay.display_of(dict(parse_qsl(str(event.args["display"]))))
         if display:
             self.source.display = display
 

@@ -26,20 +26,11 @@ from skysim.apps.gui.messages import (
     Triple,
 )
 from skysim.apps.gui.worker import geometry as lenses
-from skysim.apps.gui.worker.workbench import (
-    detections_of,
-    id_prefix,
-    magnitude_by_id,
-    tracker_result,
-    true_lights,
-)
+from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import runner, store
-from skysim.experiments.study.execution.setups import prepared_setup
-from skysim.experiments.study.execution.store import STORE
-from skysim.experiments.study.execution.trials import run_trial
+from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.results import plots, scoring
 
 
@@ -111,12 +102,12 @@ def photo_from_file(
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
     plan = study_file.load(study)
-    with store.open_store(folder / STORE) as stored:
+    with store.open_store(folder / store.STORE) as stored:
         segment = runner.segment_of(plan, stored, trial)
-    row = run_trial(plan.spec, segment, trial, segment.replicates[0])
-    setup = prepared_setup(plan.spec, segment.settings)
+    row = trials.run_trial(plan.spec, segment, trial, segment.replicates[0])
+    setup = setups.prepared_setup(plan.spec, segment.settings)
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
+    result = workbench.tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(
             row.error.strip().splitlines()[-1], result.detections, result.ms
@@ -130,8 +121,8 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
         angles_deg=scoring.true_angles_deg(setup.lab.camera, truth),
-        lights=true_lights(truth, magnitude_by_id(setup.lab)),
-        prefix=id_prefix(setup.lab),
+        lights=workbench.true_lights(truth, workbench.magnitude_by_id(setup.lab)),
+        prefix=workbench.id_prefix(setup.lab),
         saturation_dn=frame.saturation_dn,
         lens=(lens := lenses.scene_lens(setup.lab)),
         pose=lenses.scene_pose(setup.lab, lens, truth),
@@ -159,7 +150,7 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     )
     result = TrackerResult(
         attitude.status,
-        detections_of(tracker, report),
+        workbench.detections_of(tracker, report),
         1e3 * sum(report.seconds.values()),
         angles,
     )

@@ -20,8 +20,7 @@ from skysim.apps.gui.messages import (
     MotionLog,
     TrackerResult,
 )
-from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.workbench import Workbench
+from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
@@ -67,7 +66,7 @@ class Playback:
         Number of frames reported by `advance`
     """
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: workbench.Workbench) -> None:
         self.bench = bench
         self.frames = list[KeptFrame]()
         self.file = tempfile.TemporaryFile()  # noqa: SIM115

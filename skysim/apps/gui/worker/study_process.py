@@ -17,7 +17,6 @@ from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution import store
-from skysim.experiments.study.execution.store import STORE
 from skysim.results import metrics
 
 RESPONSES = {  # label on the page by response
@@ -137,7 +136,7 @@ class StudyProcess:
 
     def results(self) -> StudyResults | None:
         """Results in the store so far; None before the first trial is done."""
-        path = self.folder / STORE
+        path = self.folder / store.STORE
         if not path.is_file():
             return None
         try:
@@ -202,7 +201,9 @@ def finished(folder: Path, user: str) -> list[Path]:
     """Folders of the studies that have a report and are shown to a user, newest first."""
     folders = (path.parent for path in folder.glob("*/report.html"))
     shown = [
-        path for path in folders if (path / STORE).is_file() and is_shown(path.name, user)
+        path
+        for path in folders
+        if (path / store.STORE).is_file() and is_shown(path.name, user)
     ]
     return sorted(shown, key=lambda path: -(path / "report.html").stat().st_mtime)
 

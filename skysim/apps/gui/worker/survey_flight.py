@@ -25,9 +25,6 @@ from skysim.experiments.dome_survey import (
     survey_procedure,
     survey_report,
 )
-from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
@@ -60,10 +57,10 @@ class Survey:
 
     scene: Scene
     lab: Lab
-    before: CalibrationPrior
+    before: survey_prior.CalibrationPrior
     noise_px: float
     taken: list[TakenFrame] = field(default_factory=list)
-    run: SurveyRun | None = None
+    run: survey_findings.SurveyRun | None = None
 
     def is_of(self, scene: Scene) -> bool:
         """Whether a scene is the surveyed one, apart from its sections `motion` and `exposure`."""
@@ -145,18 +142,20 @@ class Survey:
             new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
 
-    def with_imu(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
+    def with_imu(self, taken: Sequence[TakenFrame]) -> list[survey_frames.SurveyFrame]:
         """Frames with the IMU's attitudes."""
         lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
         measured = survey_frames.imu_attitudes(
             self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad
         )
         return [
-            SurveyFrame(frame.lights, at, frame.row)
+            survey_frames.SurveyFrame(frame.lights, at, frame.row)
             for frame, at in zip(taken, measured, strict=True)
         ]
 
-    def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
+    def next_plan(
+        self, so_far: survey_findings.Coverage, taken: int, count: int
+    ) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
         margin_px = self.before.margin_px
         further = survey_findings.next_stops(
@@ -231,7 +230,7 @@ def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, fl
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
 
 
-def known_share(run: SurveyRun | None) -> Floats:
+def known_share(run: survey_findings.SurveyRun | None) -> Floats:
     """(N,) reduction of each LED's uncertainty by a survey, from 0 (not measured) to 1; (0,) without a survey."""
     if run is None:
         return np.zeros(0)
