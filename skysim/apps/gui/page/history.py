@@ -70,6 +70,12 @@ class History:
         Number of timer calls since the last change
     """
 
+    written: PageView | None = None
+    showing = False
+    moving = False
+    unchanged = 0
+    pending: str | None = None
+
     def __init__(
         self,
         page: PageContext,
@@ -81,11 +87,6 @@ class History:
         self.home = home
         self.show_query = show_query
         self.is_settling = is_settling
-        self.written: PageView | None = None
-        self.showing = False
-        self.moving = False
-        self.unchanged = 0
-        self.pending: str | None = None
         ui.add_body_html(f"<script>{JS}</script>")
         ui.on("view", self.asked)
         ui.timer(WRITE_S, self.write)

@@ -57,16 +57,17 @@ class MonteCarloPanel:
         Whether its process is being started
     """
 
+    run_number = 0
+    stopped = False
+    starting = False
+
     def __init__(self, page: context.PageContext, out: Path, user: str, tab: str) -> None:
         self.page = page
         self.out = out
         self.user = user
         self.tab = tab
         self.process = StudyProcess(Path())
-        self.run_number = 0
         self.failed: tuple[tuple[int, str], ...] = ()
-        self.stopped = False
-        self.starting = False
         with widgets.row():
             self.study_select = (
                 widgets.select({}).props('aria-label="Study"').classes("flex-grow")

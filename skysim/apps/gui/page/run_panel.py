@@ -62,22 +62,23 @@ class RunPanel:
         again
     """
 
+    feedback = ""
+    computing = stopping = playing = showing = False
+    wanted_s: float | None = None
+    sought: int | None = None
+    plays_when_done = False
+    started_s = 0.0
+    drawn_s = 0.0
+    closed_scene = ""
+
     def __init__(
         self, page: context.PageContext, contents: live.Contents, sensor: SensorView
     ) -> None:
         self.page = page
         self.contents = contents
         self.sensor = sensor
-        self.feedback = ""
-        self.computing = self.stopping = self.playing = self.showing = False
-        self.wanted_s: float | None = None
         self.when_shown: Callable[[], None] | None = None
-        self.sought: int | None = None
-        self.plays_when_done = False
         self.factor = SPEEDS["real time"]
-        self.started_s = 0.0
-        self.drawn_s = 0.0
-        self.closed_scene = ""
         self.closed_overrides: dict[str, str] = {}
         self.slot = ui.context.slot
         self.build()

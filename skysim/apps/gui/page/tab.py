@@ -66,6 +66,12 @@ class Tab:
     session: Session
     new_session: Callable[[], Session | None]
 
+    scene_info: SceneInfo | None = None
+    view: FrameView | None = None
+    is_open = True
+    message_text = ""
+    restarting = False
+
     def __init__(
         self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = ""
     ) -> None:
@@ -75,11 +81,6 @@ class Tab:
         self.out = out
         self.cameras = cameras
         self.state = PageView(scene)
-        self.scene_info: SceneInfo | None = None
-        self.view: FrameView | None = None
-        self.is_open = True
-        self.message_text = ""
-        self.restarting = False
         self.contents = Contents()
         self.editing = asyncio.Lock()
         self.filling = asyncio.Lock()

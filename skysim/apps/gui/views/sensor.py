@@ -75,19 +75,20 @@ class SensorView:
 
     source: overlay.Source
 
+    result: TrackerResult | None = None
+    prefix = "HIP"
+    lens: Lens | None = None
+    pose: Pose | None = None
+    statistics = ""  # numbers of the frame, shown while no light is under the mouse
+    hover_px: tuple[float, float] | None = None
+    sent_number = 0
+
     def __init__(self, id: str, contents: live.Contents) -> None:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
         self.lights: LightColumns = NO_LIGHTS
-        self.result: TrackerResult | None = None
         self.size_px = (4, 3)
-        self.prefix = "HIP"
-        self.lens: Lens | None = None
-        self.pose: Pose | None = None
-        self.statistics = ""  # numbers of the frame, shown while no light is under the mouse
-        self.hover_px: tuple[float, float] | None = None
-        self.sent_number = 0
         self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):

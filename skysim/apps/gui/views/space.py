@@ -119,6 +119,11 @@ class PushControl:
         Token of the motion whose frames are being computed; None if there is none
     """
 
+    grip: Grip | None = None
+    before: Triple | None = None
+    motion: object | None = None
+    held_s = 0.0
+
     def __init__(
         self,
         page: PageContext,
@@ -129,10 +134,6 @@ class PushControl:
         self.page = page
         self.sensor = sensor
         self.moved = moved
-        self.grip: Grip | None = None
-        self.before: Triple | None = None
-        self.motion: object | None = None
-        self.held_s = 0.0
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
         with ui.element("div").classes("lab-push") as self.bar:
