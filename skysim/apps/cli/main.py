@@ -27,7 +27,6 @@ from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
-from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 # Commands by the job that they do, as `skysim --help` lists them.
@@ -94,7 +93,7 @@ def main() -> None:
     errors.handle_signals()
     try:
         code = app(standalone_mode=False)
-    except InputError as error:
+    except errors.InputError as error:
         code = print_error(str(as_typed(error)))
     except ImageError as error:
         code = print_error(str(error))

@@ -112,10 +112,9 @@ def scenes_parts(
 ) -> None:
     """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
     from skysim.results.files import parts
-    from skysim.results.files.parts import find_prices, read_prices
 
     loaded = load(scene, None, seed, set_)
-    found = parts.parts_list(loaded, read_prices(find_prices(prices)))
+    found = parts.parts_list(loaded, parts.read_prices(parts.find_prices(prices)))
     if out:
         write_file(out, parts.to_csv(found, loaded.name))
     if json:

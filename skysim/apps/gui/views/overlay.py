@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from nicegui import json
@@ -46,6 +46,7 @@ UNSOLVED_TICKS = 60  # number of brightest true lights with marks in a frame wit
 NAMES: dict[Any, str] = read_yaml(DATA / "star_names.yaml")[0]
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
+T = TypeVar("T")
 Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
@@ -270,34 +271,28 @@ def display_of(query: Mapping[str, str]) -> Display | None:
     near
         Column and row
     limits
-        A name or two values in DN
+        A name or two finite values in DN, the lower one first
     curve
         A name
     """
     try:
-        screen_px = pair(query.get("screen", "0,0"))
-        near_px = pair(query["near"]) if query.get("near") else None
-        limits = limits_from(query.get("limits", LIMITS[0]))
-        curve = query.get("curve", next(iter(CURVES)))
+        screen_px = two(int, query.get("screen", "0,0"))
+        near_px = two(int, query["near"]) if query.get("near") else None
+        limits: Any = query.get("limits", LIMITS[0])
+        if limits not in LIMITS:
+            limits = two(float, limits)
     except ValueError:
         return None
-    return Display(screen_px, limits, curve, near_px) if limits and curve in CURVES else None
+    curve = query.get("curve", next(iter(CURVES)))
+    is_allowed = (
+        all(0 <= px <= MAX_SCREEN_PX for px in (*screen_px, *(near_px or ())))
+        and (limits in LIMITS or -math.inf < limits[0] < limits[1] < math.inf)
+        and curve in CURVES
+    )
+    return Display(screen_px, limits, curve, near_px) if is_allowed else None
 
 
-def pair(text: str) -> tuple[int, int]:
-    """Two numbers of pixels. Raises ValueError."""
-    first, second = (int(word) for word in text.split(","))
-    if not (0 <= first <= MAX_SCREEN_PX and 0 <= second <= MAX_SCREEN_PX):
-        raise ValueError
+def two(kind: Callable[[str], T], text: str) -> tuple[T, T]:
+    """Two numbers separated by a comma. Raises ValueError."""
+    first, second = map(kind, text.split(","))
     return first, second
-
-
-def limits_from(text: str) -> str | tuple[float, float] | None:
-    """Parse the limits of the display: a name in LIMITS, or two numbers separated by a comma.
-
-    Returns None if the numbers are not finite or do not increase. Raises ValueError for any other text.
-    """
-    if text in LIMITS:
-        return text
-    low, high = (float(word) for word in text.split(","))
-    return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None

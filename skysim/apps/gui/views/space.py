@@ -44,7 +44,7 @@ class Scene3D:
     newest_view
         Newest frame, which is not sent yet
     waits
-        Whether `send_newest` will be called
+        Whether `update` will be called
     """
 
     def __init__(self, page: PageContext, sensor: SensorView) -> None:
@@ -84,16 +84,13 @@ class Scene3D:
         self.newest_view = view
         if not self.waits:
             self.waits = True
-            asyncio.get_running_loop().call_later(UPDATE_S, self.send_newest)
-
-    def send_newest(self) -> None:
-        self.waits = False
-        self.update()
+            asyncio.get_running_loop().call_later(UPDATE_S, self.update)
 
     def update(self) -> None:
         """Send the vehicle's attitude, and the lights that are in the frame or identified."""
         view = self.newest_view
         self.newest_view = None
+        self.waits = False
         if view is None or not self.page.is_open:
             return
         found = view.result.detections if view.result else ()
