@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from nicegui import json
@@ -23,7 +23,7 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.worker.session import WorkerLost
+from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
@@ -139,15 +139,6 @@ FRAMES: dict[str, TabFrames] = {}  # frames by tab
 IDLE_S = 2.0  # time without a frame after which a stream ends: a browser has six connections for all tabs
 
 
-class Source(Protocol):
-    """The session of a tab, whose worker has all pixels of its newest images."""
-
-    display: Display | None
-
-    async def run(self, task: str, *arguments: Any) -> Any:
-        """Run a task of the worker."""
-
-
 @dataclass(frozen=True)
 class ServedFrame:
     """A frame of a tab.
@@ -156,11 +147,13 @@ class ServedFrame:
     ----------
     fields
         Further data for frame.js: pointing, marks, contents of live fields
+    source
+        Session of the tab, whose worker has all pixels of its newest images
     """
 
     pixels: Pixels
     fields: Mapping[str, Any]
-    source: Source
+    source: Session
 
     async def response(self, display: Display, whole: bool) -> bytes | None:
         """Header, pixels, fields as JSON, and the length of the fields as an unsigned integer of 32 bits.

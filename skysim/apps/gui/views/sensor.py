@@ -31,6 +31,7 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.views import live, overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.session import Session
 from skysim.core.types import Floats
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
@@ -73,7 +74,7 @@ class SensorView:
         The newest frames
     """
 
-    source: overlay.Source
+    source: Session
 
     result: TrackerResult | None = None
     prefix = "HIP"

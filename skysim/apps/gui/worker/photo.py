@@ -157,9 +157,12 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)
-    photo = Photo((width, height), result, solution, statistics)
+    lens: Lens | None = None
+    pose: Pose | None = None
     if attitude.cam_from_ref is not None:
         lens = lenses.lens_of(attitude.camera or tracker.camera)
         pose = Pose(attitude.cam_from_ref.inv().as_matrix().ravel())
-        photo = replace(photo, lens=lens, pose=pose)
-    return replace(photo, saturation_dn=saturation_dn), image
+    size_px = width, height
+    return Photo(
+        size_px, result, solution, statistics, NO_PIXELS, saturation_dn, lens, pose
+    ), image
