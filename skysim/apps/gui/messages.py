@@ -5,7 +5,7 @@ NiceGUI writes arrays as JSON, with null for NaN."""
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -284,12 +284,9 @@ class SceneInfo:
     surveyed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class MotionLog:
-    """Curves of a simulated motion against time, decimated for display."""
-
-    t_s: Floats = field(default_factory=lambda: np.empty(0))
-    curves: dict[str, Floats] = field(default_factory=dict)
+Curves = dict[
+    str, Floats
+]  # curves of a simulated motion and their times `t_s`, decimated for display
 
 
 class FlightRow(NamedTuple):
@@ -338,7 +335,7 @@ class FlightStep:
     t_s: float
     duration_s: float
     rows: tuple[FlightRow, ...] = ()
-    log: MotionLog | None = None
+    log: Curves | None = None
     residuals: tuple[tuple[float, int, float], ...] = ()
 
 

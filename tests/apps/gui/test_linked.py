@@ -29,7 +29,7 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, LightColumns, MotionLog, TrackerResult
+from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
 from skysim.apps.gui.page import readouts, strips
 from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
@@ -93,7 +93,7 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
     assert list(playback.light_residuals(SimpleNamespace(t_s=0.5, result=None))) == []
     residuals = [(0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)]
-    (strip,) = strips.strips([], MotionLog(), residuals)
+    (strip,) = strips.strips([], {}, residuals)
     assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]
     assert strips.y_axis(strip, 0)["max"] == 0.2
     fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)

@@ -27,11 +27,11 @@ document.addEventListener("keydown", event => {
 
 
 class Command(NamedTuple):
-    """An entry: its name, the label of its key if it has one, and its action."""
+    """An entry: its name, its action, and the label of its key if it has one."""
 
     name: str
-    key: str
     action: Action
+    key: str = ""
 
 
 async def perform(action: Action) -> None:
@@ -156,7 +156,7 @@ class Actions:
         """Every action with its key."""
         by_key = [key for key in keys.KEYS if key.action in self.performers]
         return [
-            Command(key.help, key.label, partial(self.perform, key.action)) for key in by_key
+            Command(key.help, partial(self.perform, key.action), key.label) for key in by_key
         ] + [*self.others]
 
     async def key(self, event: KeyEventArguments) -> None:

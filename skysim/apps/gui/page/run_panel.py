@@ -13,7 +13,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog, SceneInfo
+from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.sensor import SensorView
@@ -157,7 +157,7 @@ class RunPanel:
     def clear(self) -> None:
         """Forget the flight."""
         self.rows: list[FlightRow] = []
-        self.log = MotionLog()
+        self.log: Curves = {}
         self.residuals: list[tuple[float, int, float]] = []
         self.index = 0
         self.from_s = 0.0
@@ -253,7 +253,7 @@ class RunPanel:
     def draw(self) -> None:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
-        ends = [*self.log.t_s[-1:], *(row.t_s for row in self.rows[-1:])]
+        ends = [*self.log.get("t_s", ())[-1:], *(row.t_s for row in self.rows[-1:])]
         lights = (
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightRow, MotionLog
+from skysim.apps.gui.messages import Curves, FlightRow
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 from skysim.core.types import Floats
@@ -105,7 +105,7 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 def strips(
     rows: Sequence[FlightRow],
-    log: MotionLog,
+    log: Curves,
     residuals: Sequence[tuple[float, int, float]] = (),
 ) -> list[Strip]:
     """Return the strips for which a flight has data.
@@ -124,7 +124,7 @@ def strips(
         return StripCurve(name, [*map(point, of["t_s"][known], values[known])], kind)
 
     def of_motion(name: str) -> StripCurve:
-        return StripCurve(name, [*map(point, log.t_s, log.curves.get(name, ()))])
+        return StripCurve(name, [*map(point, log.get("t_s", ()), log.get(name, ()))])
 
     found = [
         Strip(

@@ -220,30 +220,21 @@ class Tab:
         """Further commands: flight, history, arrangement, panels and exports."""
         return [
             Command(
-                "show the next frame of the flight", ".", partial(self.run_panel.step, 1)
+                "show the next frame of the flight", partial(self.run_panel.step, 1), "."
             ),
             Command(
-                "show the previous frame of the flight", ",", partial(self.run_panel.step, -1)
+                "show the previous frame of the flight", partial(self.run_panel.step, -1), ","
             ),
-            Command("undo the last change", "Ctrl Z", self.history.undo),
-            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
+            Command("undo the last change", self.history.undo, "Ctrl Z"),
+            Command("redo the change that was undone", self.history.redo, "Ctrl Shift Z"),
+            Command("compute the flight of the scene, or stop that", self.run_panel.simulate),
+            Command("change between the dark and the light theme", self.arrangement.toggle),
             Command(
-                "compute the flight of the scene, or stop that", "", self.run_panel.simulate
+                "give frame, 3-D view and panels their first sizes", self.arrangement.reset
             ),
-            Command(
-                "change between the dark and the light theme", "", self.arrangement.toggle
-            ),
-            Command(
-                "give frame, 3-D view and panels their first sizes",
-                "",
-                self.arrangement.reset,
-            ),
+            *(Command(f"panel: {name}", partial(self.show_panel, name)) for name in PANELS),
             *(
-                Command(f"panel: {name}", "", partial(self.show_panel, name))
-                for name in PANELS
-            ),
-            *(
-                Command(f"export: {name}", "", partial(self.head.export, name))
+                Command(f"export: {name}", partial(self.head.export, name))
                 for name in image_export.FILE_BY_ITEM
             ),
         ]

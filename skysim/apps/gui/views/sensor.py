@@ -23,7 +23,6 @@ from skysim.apps.gui.messages import (
     Lens,
     LightColumns,
     LightRow,
-    Pixels,
     Pose,
     SceneInfo,
     TrackerResult,
@@ -156,24 +155,13 @@ class SensorView:
         self.canvas.run_method("fit")
 
     def toggle(self, kind: str, on: bool) -> None:
-        self.shown = self.shown | {kind} if on else self.shown - {kind}
-        self.update_marks()
+        """Show a kind of marks, or no more: send the marks of the newest frame again.
 
-    def display_image(self, pixels: Pixels, alone: bool) -> None:
-        """Display a new image, as large as the window allows.
-
-        Parameters
-        ----------
-        alone
-            As in `TabFrames.add`
+        It is a message, since NiceGUI sends all properties if one changes.
         """
-        if not self.sent_number:
-            self.wait.set_visibility(False)
-        self.sent_number += 1  # so that each frame has its own address
-        fields = self.fields() | {"contents": self.contents.take()}
-        overlay.FRAMES[self.id] = self.frames
-        self.frames.add(
-            self.sent_number, overlay.ServedFrame(pixels, fields, self.source), alone
+        self.shown = self.shown | {kind} if on else self.shown - {kind}
+        self.canvas.run_method(
+            "show", {"src": self.address(self.sent_number)} | self.fields()
         )
 
     def announce(self, number: int) -> None:
@@ -210,7 +198,13 @@ class SensorView:
             self.lens = of.lens
             self.canvas.run_method("setLens", of.lens)
         self.update_text()
-        self.display_image(image.pixels, alone=is_new_lens)
+        if not self.sent_number:
+            self.wait.set_visibility(False)
+        self.sent_number += 1  # so that each frame has its own address
+        fields = self.fields() | {"contents": self.contents.take()}
+        overlay.FRAMES[self.id] = self.frames
+        served = overlay.ServedFrame(image.pixels, fields, self.source)
+        self.frames.add(self.sent_number, served, alone=is_new_lens)
 
     def update_text(self) -> None:
         """Show data on the light under the mouse, or else the frame's numbers."""
@@ -227,12 +221,6 @@ class SensorView:
             "label": self.description(),
         }
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
-
-    def update_marks(self) -> None:
-        """Send the marks of the newest frame again, as a message: NiceGUI sends all properties if one changes."""
-        self.canvas.run_method(
-            "show", {"src": self.address(self.sent_number)} | self.fields()
-        )
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""

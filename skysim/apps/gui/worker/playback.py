@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import (
+    Curves,
     FlightRow,
     FlightStep,
     FrameView,
-    MotionLog,
     TrackerResult,
 )
 from skysim.apps.gui.worker import pixels, workbench
@@ -166,7 +166,7 @@ def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
             yield view.t_s, spot.id, spot.residual_px
 
 
-def curves(log: Telemetry) -> MotionLog:
+def curves(log: Telemetry) -> Curves:
     """Curves of true and estimated attitude errors (arcsec), momentum (N m s) and rate (deg/s), decimated."""
     attitudes = {
         "pointing": log.lab_from_ref,
@@ -179,12 +179,11 @@ def curves(log: Telemetry) -> MotionLog:
         if (error_deg := telemetry_report.attitude_error_deg(attitude, log.lab_from_body))
         is not None
     }
+    values["t_s"] = log.t_s
     values["momentum"] = np.linalg.norm(log.momentum_nms, axis=1)
     values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
     every = max(len(log.t_s) // MAX_POINTS, 1)
-    return MotionLog(
-        log.t_s[::every], {name: curve[::every] for name, curve in values.items()}
-    )
+    return {name: curve[::every] for name, curve in values.items()}
 
 
 def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameView:
