@@ -223,7 +223,6 @@ class FrameView:
 
     pose: Pose
     saturation_dn: float
-    size_px: tuple[int, int]
     angles_deg: Triple
     body_wxyz: Floats
     exposure_s: float

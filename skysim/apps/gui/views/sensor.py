@@ -191,7 +191,7 @@ class SensorView:
         self.statistics = statistics_text(image, of)
         self.lights = image.lights
         self.result = image.result
-        self.size_px = image.size_px
+        self.size_px = image.pixels.fields["size"]
         self.pose = image.pose
         is_new_lens = of.lens is not self.lens
         if is_new_lens:
@@ -305,7 +305,8 @@ def statistics_text(image: FrameView | Photo, of: SceneInfo | Photo) -> str:
     statistics = image.statistics
     result = image.result
     field = ("field", f"{of.field_deg:.4g}°") if isinstance(of, SceneInfo) else ("", "")
-    rows = [("frame", f"{image.size_px[0]} × {image.size_px[1]} px", *field)]
+    width, height = image.pixels.fields["size"]
+    rows = [("frame", f"{width} × {height} px", *field)]
     lights: tuple[str, ...] = ()
     if isinstance(image, FrameView):
         lights = ("lights", f"{len(image.lights)} in the field")

@@ -145,7 +145,7 @@ class PushControl:
 
     async def gripped(self, event: Any) -> None:
         """Handle a drag of the vehicle."""
-        grip = Grip(tuple(event.args["held"]), tuple(event.args["wanted"]))
+        grip = Grip(event.args["held"], event.args["wanted"])
         view = self.page.view
         if self.motion is None and view:
             self.page.stop_playback()  # forgets grip and attitude of an earlier push

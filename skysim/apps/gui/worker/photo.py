@@ -52,7 +52,6 @@ class Photo:
         Likely cause of a refusal, or assumption about a solved file
     """
 
-    size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
     statistics: plots.FrameStatistics
@@ -113,9 +112,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
             row.error.strip().splitlines()[-1], result.detections, result.ms
         )
     scene = setup.lab.scene
-    (height, width) = frame.image_dn.shape
     photo = Photo(
-        (width, height),
         result,
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
@@ -154,7 +151,6 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
         1e3 * sum(report.seconds.values()),
         angles,
     )
-    height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)
     lens: Lens | None = None
@@ -162,7 +158,4 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     if attitude.cam_from_ref is not None:
         lens = lenses.lens_of(attitude.camera or tracker.camera)
         pose = Pose(attitude.cam_from_ref.inv().as_matrix().ravel())
-    size_px = width, height
-    return Photo(
-        size_px, result, solution, statistics, NO_PIXELS, saturation_dn, lens, pose
-    ), image
+    return Photo(result, solution, statistics, NO_PIXELS, saturation_dn, lens, pose), image

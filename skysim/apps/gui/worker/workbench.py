@@ -157,11 +157,9 @@ class Workbench:
         self, frame: Frame, truth: Truth, report: Report | None, seconds: float
     ) -> FrameView:
         """The view of a frame of this scene for the page, without its pixels."""
-        height, width = frame.image_dn.shape
         return FrameView(
             geometry.scene_pose(self.lab, self.lens, truth),
             frame.saturation_dn,
-            (width, height),
             scoring.true_angles_deg(self.lab.camera, truth),
             quaternion.from_rotation(truth.lab_from_body),
             frame.exposure_s,
