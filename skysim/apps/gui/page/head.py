@@ -229,13 +229,10 @@ class Arrangement:
         kind
             `side` (the column of panels) or `space` (the 3-D view)
         """
-        line = (
-            ui.element("div")
-            .classes(f"lab-split {orientation}")
-            .props(f'role="separator" data-split="{kind}"')
+        ui.element("div").classes(f"lab-split {orientation}").props(
+            f'role="separator" data-split="{kind}" aria-orientation="{orientation}" tabindex="0"'
+            f' aria-label="{label}" title="{label}: drag, or arrow keys; double-click: as at first"'
         )
-        line.props(f'aria-orientation="{orientation}" tabindex="0" aria-label="{label}"')
-        line.props(f'title="{label}: drag, or arrow keys; double-click: as at first"')
 
     async def restore(self) -> None:
         """Apply the theme that the browser remembers."""

@@ -221,7 +221,7 @@ class TabFrames:
         """
         self.newest[number] = frame
         self.added_s = time.monotonic()
-        self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
+        self.newest.pop(number - KEPT_FRAMES, None)
         self.alone = number if alone else self.alone
         if self.waiting is None or self.drawn < self.alone:
             self.announce(number)

@@ -58,8 +58,9 @@ class Scene3D:
                 button = ui.button(
                     name, color=None, on_click=lambda name=name: self.look(name)
                 )
-                button.props("dense outline size=xs")
-                button.props(f'title="look {text}"').mark(f"look-{name}")
+                button.props(f'dense outline size=xs title="look {text}"').mark(
+                    f"look-{name}"
+                )
         hint = ui.label(
             "drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom"
         )
@@ -135,12 +136,9 @@ class PushControl:
         canvas.on("release", self.released)
         with ui.element("div").classes("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
-            button = (
-                ui.button("reset", color=None, on_click=self.reset)
-                .props("dense outline size=xs")
-                .mark("push-reset")
-            )
-            button.props('title="back to the attitude before the push"')
+            ui.button("reset", color=None, on_click=self.reset).props(
+                'dense outline size=xs title="back to the attitude before the push"'
+            ).mark("push-reset")
         self.bar.set_visibility(False)
 
     async def gripped(self, event: Any) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
     from skysim.apps.gui.messages import Display
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload([TEMPLATE])
 SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
 STOPPED = "the worker of this page has stopped"
 QUEUE_S = 0.2  # interval of looking for a free worker
@@ -70,10 +72,8 @@ class Session:
     alive: ClassVar[set[Session]] = set()
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([TEMPLATE])
-        self.pipe, self.worker_pipe = context.Pipe()
-        self.process = context.Process(target=serve, args=(self.worker_pipe,), daemon=True)
+        self.pipe, self.worker_pipe = CONTEXT.Pipe()
+        self.process = CONTEXT.Process(target=serve, args=(self.worker_pipe,), daemon=True)
         self.thread = ThreadPoolExecutor(1, "session")
         self.thread.submit(self.start)
         Session.alive.add(self)
@@ -140,7 +140,6 @@ class Workers:
             File of the scene that it sets up
         """
         os.environ[SCENE] = scene
-        multiprocessing.get_context("forkserver").set_forkserver_preload([TEMPLATE])
         forkserver.ensure_running()
 
     def take(self) -> Session | None:
