@@ -215,10 +215,6 @@ class FrameView:
         lab_from_body
     t_s
         Time in the motion that is played; 0 otherwise
-    filter_arcsec
-        Error of the filter during the motion
-    innovation_arcsec
-        Angle between the star tracker's attitude and the filter's
     """
 
     pose: Pose
@@ -231,8 +227,6 @@ class FrameView:
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0
-    filter_arcsec: float = NAN
-    innovation_arcsec: float = NAN
     pixels: Pixels = NO_PIXELS
 
 
@@ -299,8 +293,10 @@ class FlightRow(NamedTuple):
         Error and standard error of the tracker, arcsec
     lights, identified
         Numbers of lights in the field, and of identified ones
-    filter_arcsec, innovation_arcsec
-        As in `FrameView`
+    filter_arcsec
+        Error of the filter
+    innovation_arcsec
+        Angle between the star tracker's attitude and the filter's
     """
 
     t_s: float
@@ -333,9 +329,9 @@ class FlightStep:
     is_done: bool
     t_s: float
     duration_s: float
-    rows: tuple[FlightRow, ...] = ()
+    rows: Sequence[FlightRow] = ()
     log: Curves | None = None
-    residuals: tuple[tuple[float, int, float], ...] = ()
+    residuals: Sequence[tuple[float, int, float]] = ()
 
 
 class AmbiguityMap(NamedTuple):

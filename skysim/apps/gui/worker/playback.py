@@ -92,19 +92,15 @@ class Playback:
                     self.add(shot)
         new = self.frames[self.reported :]
         self.reported = len(self.frames)
-        log = self.flight.telemetry() if is_done or new else None
-        if log is not None:
-            for frame in new:
-                frame.view = with_filter_errors(frame, log, self.bench.lab.camera.mount)
-        views = [frame.view for frame in new]
-        return FlightStep(
-            is_done,
-            self.flight.now_s,
-            self.flight.duration_s,
-            tuple(map(frame_row, views)),
-            curves(log) if log is not None else None,
-            tuple(row for view in views for row in light_residuals(view)),
-        )
+        rows: list[FlightRow] = []
+        drawn: Curves | None = None
+        if is_done or new:
+            log = self.flight.telemetry()
+            rows = [frame_row(frame, log, self.bench.lab.camera.mount) for frame in new]
+            drawn = curves(log)
+        residuals = [one for frame in new for one in light_residuals(frame.view)]
+        flight = self.flight
+        return FlightStep(is_done, flight.now_s, flight.duration_s, rows, drawn, residuals)
 
     def add(self, shot: Shot) -> None:
         """Keep a shot, and its pixels if the file has room."""
@@ -150,13 +146,23 @@ class Playback:
         bench.report = kept.report
 
 
-def frame_row(view: FrameView) -> FlightRow:
-    """A frame of a flight in numbers."""
+def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
+    """A frame of a flight in numbers, with those of the attitude filter from the flight's telemetry."""
+    view = kept.view
     result = view.result or NO_RESULT
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
+    filter_arcsec = innovation_arcsec = math.nan
+    if log.lab_from_filter is not None:
+        n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
+        lab_from_filter = log.lab_from_filter[n]
+        filter_arcsec = angle_arcsec(lab_from_filter, log.lab_from_body[n])
+        cam_from_lab = kept.report.attitude.cam_from_ref
+        if cam_from_lab is not None:
+            lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+            innovation_arcsec = angle_arcsec(lab_from_body, lab_from_filter)
     counts = len(view.lights), result.identified
-    return FlightRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
+    return FlightRow(view.t_s, *errors, *counts, filter_arcsec, innovation_arcsec)
 
 
 def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
@@ -184,21 +190,6 @@ def curves(log: Telemetry) -> Curves:
     values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
     every = max(len(log.t_s) // MAX_POINTS, 1)
     return {name: curve[::every] for name, curve in values.items()}
-
-
-def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameView:
-    """A frame's view with the error of the filter, and the angle between the tracker's attitude and the filter's."""
-    view = kept.view
-    if log.lab_from_filter is None:
-        return view
-    n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
-    lab_from_filter = log.lab_from_filter[n]
-    view = replace(view, filter_arcsec=angle_arcsec(lab_from_filter, log.lab_from_body[n]))
-    cam_from_lab = kept.report.attitude.cam_from_ref
-    if cam_from_lab is None:
-        return view
-    lab_from_body = cam_from_lab.inv() * mount.cam_from_body
-    return replace(view, innovation_arcsec=angle_arcsec(lab_from_body, lab_from_filter))
 
 
 def angle_arcsec(first: Rotation, second: Rotation) -> float:
