@@ -293,11 +293,10 @@ def color_table(name: str) -> str:
     ramp = np.arange(256, dtype=np.uint8)[:, None]
     kind = COLOR_MAPS[name]
     if kind is None:
-        table = np.repeat(ramp, 3, axis=1)
-        return base64.b64encode(
-            (255 - table if "inverted" in name else table).tobytes()
-        ).decode()
-    return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
+        table = np.repeat(255 - ramp if "inverted" in name else ramp, 3, axis=1)
+    else:
+        table = cv2.applyColorMap(ramp, kind)[:, 0, ::-1]
+    return base64.b64encode(table.tobytes()).decode()
 
 
 def statistics_text(image: FrameView | Photo, of: SceneInfo | Photo) -> str:
