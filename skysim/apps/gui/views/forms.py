@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.units import SI_SUFFIX, si_unit
+from skysim.core.units import si_unit
 from skysim.core.yaml_reader import read_yaml
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
@@ -158,7 +158,7 @@ def section_fields(
         Kinds that the section could have instead of its own
     """
     for name, info in type(model).model_fields.items():
-        file_key = info.alias or SI_SUFFIX.sub("", name)
+        file_key = info.alias or name
         key = f"{prefix}{file_key}"
         value = getattr(model, name)
         is_set = isinstance(tree, dict) and file_key in tree

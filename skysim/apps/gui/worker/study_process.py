@@ -51,7 +51,6 @@ class StudyResults(NamedTuple):
     """
 
     done: int
-    wrong: int
     statistics: dict[str, tuple[float, float, float]]
     bins: tuple[float, ...]
     counts: tuple[int, ...]
@@ -152,9 +151,7 @@ class StudyProcess:
         error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
         bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
         failed = (*raised, *unsolved(columns))[:MAX_FAILED]
-        return StudyResults(
-            counts["done"], counts["wrong"], statistics, bins, heights, failed
-        )
+        return StudyResults(counts["done"], statistics, bins, heights, failed)
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
