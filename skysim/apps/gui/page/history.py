@@ -12,8 +12,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.views import context, state
 
 SETTLED = (
     3  # number of timer calls without a change after which the next change is a new step
@@ -70,7 +69,7 @@ class History:
         Number of timer calls since the last change
     """
 
-    written: PageView | None = None
+    written: state.PageView | None = None
     showing = False
     moving = False
     unchanged = 0
@@ -78,7 +77,7 @@ class History:
 
     def __init__(
         self,
-        page: PageContext,
+        page: context.PageContext,
         home: str,
         show_query: Callable[[str], Awaitable[None]],
         is_settling: Callable[[], bool],

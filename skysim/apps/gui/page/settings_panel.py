@@ -10,8 +10,7 @@ from pathlib import Path
 from nicegui import run, ui
 
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.views import forms, keys, live, widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, forms, keys, live, widgets
 from skysim.core.errors import InputError
 
 SENSOR = "sensor, F6"
@@ -79,7 +78,10 @@ class KeyForm:
     """
 
     def __init__(
-        self, page: PageContext, label: Callable[[forms.FormField], str], opens: str = ""
+        self,
+        page: context.PageContext,
+        label: Callable[[forms.FormField], str],
+        opens: str = "",
     ) -> None:
         self.page = page
         self.label = label
@@ -215,7 +217,9 @@ class ScenePanel:
         Scene and overrides in the form
     """
 
-    def __init__(self, page: PageContext, folder: Path, saved: Callable[[], None]) -> None:
+    def __init__(
+        self, page: context.PageContext, folder: Path, saved: Callable[[], None]
+    ) -> None:
         self.page = page
         self.folder = folder
         self.saved = saved
@@ -303,7 +307,7 @@ class TrackerPanel:
         Scene and overrides in the form
     """
 
-    def __init__(self, page: PageContext, study: MonteCarloPanel) -> None:
+    def __init__(self, page: context.PageContext, study: MonteCarloPanel) -> None:
         self.page = page
         self.study = study
         self.shown: tuple[str, Mapping[str, str]] | None = None

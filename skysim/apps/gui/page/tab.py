@@ -15,6 +15,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import (
+    head,
     history,
     log_panel,
     monte_carlo_panel,
@@ -22,12 +23,10 @@ from skysim.apps.gui.page import (
     plan_panel,
     readouts,
     run_panel,
+    settings_panel,
 )
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.page.head import Arrangement, Head
-from skysim.apps.gui.page.settings_panel import ScenePanel, TrackerPanel
-from skysim.apps.gui.views import forms, keys, overlay, sensor, space, style
-from skysim.apps.gui.views.live import Contents, for_page
+from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
@@ -81,7 +80,7 @@ class Tab:
         self.out = out
         self.cameras = cameras
         self.state = PageView(scene)
-        self.contents = Contents()
+        self.contents = live.Contents()
         self.editing = asyncio.Lock()
         self.filling = asyncio.Lock()
 
@@ -127,12 +126,12 @@ class Tab:
             dark_page=style.DARK["ground"],
         )
         with ui.element("div").classes("lab"):
-            self.head = Head(self, self.contents, self.folder)
+            self.head = head.Head(self, self.contents, self.folder)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
-                Arrangement.splitter("side", "vertical", "Width of the panels")
+                head.Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = readouts.AttitudeCard(self, self.contents)
                 await self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
@@ -146,7 +145,9 @@ class Tab:
         self.history = history.History(
             self, self.state.scene, self.show_query, self.is_settling
         )
-        self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
+        self.arrangement = head.Arrangement(
+            [self.run_panel.strips.chart, self.study_panel.chart]
+        )
         self.actions = Actions(
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
@@ -158,7 +159,7 @@ class Tab:
         with ui.element("div").classes("lab-panes"):
             with ui.element("div").classes("lab-space-pane"):
                 self.scene_3d = space.Scene3D(self, self.sensor)
-            Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
+            head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
                 "dense align=left no-caps indicator-color=primary"
             ) as self.tabs:
@@ -172,7 +173,9 @@ class Tab:
                 with ui.tab_panel("Lights"):
                     self.lights = readouts.LightsPanel(self.sensor)
                 with ui.tab_panel("Scene"):
-                    self.scene_panel = ScenePanel(self, self.folder, self.head.update_scenes)
+                    self.scene_panel = settings_panel.ScenePanel(
+                        self, self.folder, self.head.update_scenes
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = run_panel.RunPanel(self, self.contents, self.sensor)
@@ -187,7 +190,7 @@ class Tab:
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
-                    self.tracker_panel = TrackerPanel(self, self.study_panel)
+                    self.tracker_panel = settings_panel.TrackerPanel(self, self.study_panel)
                 with ui.tab_panel("Image"):
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
@@ -281,7 +284,7 @@ class Tab:
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
         except InputError as error:
-            self.show_message(for_page(error))
+            self.show_message(live.for_page(error))
             return
         if wanted:
             await self.restore(wanted)
@@ -374,7 +377,7 @@ class Tab:
 
     async def fill_form(self) -> None:
         """Show the keys of the current scene in the panel of keys that is open; not in others, as it takes a while."""
-        panels: dict[str, ScenePanel | TrackerPanel] = {
+        panels: dict[str, settings_panel.ScenePanel | settings_panel.TrackerPanel] = {
             "Scene": self.scene_panel,
             "Tracker": self.tracker_panel,
         }
@@ -465,7 +468,7 @@ class Tab:
             result = await self.session.run(task, *arguments)
         except InputError as error:
             if self.is_open:
-                self.show_message(for_page(error))
+                self.show_message(live.for_page(error))
             return None
         except WorkerLost as error:
             if self.is_open and not self.restarting:
@@ -483,7 +486,7 @@ class Tab:
         try:
             return await run.io_bound(function, *arguments)
         except InputError as error:
-            self.show_message(for_page(error))
+            self.show_message(live.for_page(error))
             return None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:

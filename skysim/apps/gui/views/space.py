@@ -16,9 +16,8 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, style
 from skysim.apps.gui.views.sensor import SensorView
-from skysim.apps.gui.views.style import DARK, color_scale
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
 
@@ -47,7 +46,7 @@ class Scene3D:
         Whether `update` will be called
     """
 
-    def __init__(self, page: PageContext, sensor: SensorView) -> None:
+    def __init__(self, page: context.PageContext, sensor: SensorView) -> None:
         self.page = page
         self.sensor = sensor
         self.newest_view: FrameView | None = None
@@ -72,12 +71,14 @@ class Scene3D:
         self.canvas.run_method("look", name)
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        fields = {"background": DARK["ground"], "prefix": scene_info.prefix}
+        fields = {"background": style.DARK["ground"], "prefix": scene_info.prefix}
         self.canvas.run_method("build", scene_info.geometry | fields)
 
     def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""
-        colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
+        colors = (
+            f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * style.color_scale(values)
+        )
         self.canvas.run_method("color", list(zip(ids, colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
@@ -124,7 +125,7 @@ class PushControl:
 
     def __init__(
         self,
-        page: PageContext,
+        page: context.PageContext,
         sensor: SensorView,
         canvas: ui.element,
         moved: Callable[[], None],
