@@ -52,6 +52,7 @@ OUT_OF_REACH = {
     "skysim.apps.plate_solver.solver.read_catalog": "hands the file on to the estimator's `catalog.read`",
     "skysim.apps.cli.options.load": "hands a scene's name on to `loader.load`",
     "skysim.scene.loader.load_scene": "the same",
+    "skysim.apps.cli.commands.resources.new": SHIPPED,
     "skysim.apps.cli.examples.read_examples": "a file of ours",
     "skysim.sources.catalog.write_selection": "hands the file on to the estimator's `catalog.read`",
     "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
