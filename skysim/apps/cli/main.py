@@ -9,41 +9,59 @@ from typing import Annotated
 import typer
 
 from estimator.core.errors import ImageError
-from skysim.apps.cli.commands.availability import availability
-from skysim.apps.cli.commands.camera import app as cameras
-from skysim.apps.cli.commands.dataset import dataset
-from skysim.apps.cli.commands.datasheet import datasheet
-from skysim.apps.cli.commands.measure import balance, calibrate, characterize
-from skysim.apps.cli.commands.reproduce import reproduce
-from skysim.apps.cli.commands.resources import export, new, scenes_app
-from skysim.apps.cli.commands.run import compare, render, run, trackers
-from skysim.apps.cli.commands.serve import gui, stream
-from skysim.apps.cli.commands.solve import solve
-from skysim.apps.cli.commands.star_catalogs import app as catalogs
-from skysim.apps.cli.commands.study import app as studies
-from skysim.apps.cli.commands.survey import survey
-from skysim.apps.cli.commands.validate import check, validate
+from skysim.apps.cli.commands import (
+    availability,
+    camera,
+    dataset,
+    datasheet,
+    measure,
+    reproduce,
+    resources,
+    run,
+    serve,
+    solve,
+    star_catalogs,
+    study,
+    survey,
+    validate,
+)
 from skysim.apps.cli.examples import add_examples
 from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
-from skysim.core.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 # Commands by the job that they do, as `skysim --help` lists them.
 JOBS = {
-    "Simulate": (new, run, render, stream, gui),
-    "Plan": (check, validate, datasheet, availability),
-    "Measure": (solve, survey, characterize, calibrate, balance),
-    "Exchange": (export, dataset, compare, trackers, reproduce),
+    "Simulate": (resources.new, run.run, run.render, serve.stream, serve.gui),
+    "Plan": (
+        validate.check,
+        validate.validate,
+        datasheet.datasheet,
+        availability.availability,
+    ),
+    "Measure": (
+        solve.solve,
+        survey.survey,
+        measure.characterize,
+        measure.calibrate,
+        measure.balance,
+    ),
+    "Exchange": (
+        resources.export,
+        dataset.dataset,
+        run.compare,
+        run.trackers,
+        reproduce.reproduce,
+    ),
 }
 for job, commands in JOBS.items():
     for command in commands:
         app.command(rich_help_panel=job)(command)
-app.add_typer(scenes_app, name="scenes", rich_help_panel="Simulate")
-app.add_typer(studies, name="study", rich_help_panel="Plan")
-app.add_typer(cameras, name="camera", rich_help_panel="Measure")
-app.add_typer(catalogs, name="catalog", rich_help_panel="Exchange")
+app.add_typer(resources.scenes_app, name="scenes", rich_help_panel="Simulate")
+app.add_typer(study.app, name="study", rich_help_panel="Plan")
+app.add_typer(camera.app, name="camera", rich_help_panel="Measure")
+app.add_typer(star_catalogs.app, name="catalog", rich_help_panel="Exchange")
 add_examples(app)
 
 
@@ -94,7 +112,7 @@ def main() -> None:
     errors.handle_signals()
     try:
         code = app(standalone_mode=False)
-    except InputError as error:
+    except errors.InputError as error:
         code = print_error(str(as_typed(error)))
     except ImageError as error:
         code = print_error(str(error))

@@ -194,6 +194,14 @@ def output_folder(out: Path | None, name: str) -> Path:
     return out or Path("out") / name
 
 
+def write_file(path: Path, text: str) -> None:
+    """Write a text file, and make its folder if there is none. Raises InputError."""
+    from skysim.core import files
+
+    files.make_folder(path.parent)
+    files.write_text(path, text)
+
+
 def command_line() -> str:
     """The command that the user has typed."""
     return shlex.join(["skysim", *sys.argv[1:]])

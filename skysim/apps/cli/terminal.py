@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skysim.core.errors import printable
+from skysim.core.paths import shipped_files, title_of
 from skysim.results.report import print_blocks, print_table, print_wrapped
 from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
 
@@ -82,17 +83,15 @@ def trial_progress(
 
     If stderr is not a terminal, print a line at the beginning, after every tenth of the trials, and once a minute.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
     what = printable(what)
     text = "{task.completed:.0f}/{task.total:.0f}  {task.fields[rate]:.2g}/s  {task.fields[faults]}"
     tenth = 0
     shown_s = time.monotonic()
-    if not console.is_terminal:
-        print(f"{what}: {total} {unit}", file=sys.stderr, flush=True)
     with bar(BarColumn(), TextColumn(text), TimeRemainingColumn()) as shown:
+        if not shown.console.is_terminal:
+            print(f"{what}: {total} {unit}", file=sys.stderr, flush=True)
         task = shown.add_task(what, total=total, rate=0.0, faults="")
 
         def update(done: Progress) -> None:
@@ -100,7 +99,7 @@ def trial_progress(
             faults = f"{done.failed} failed" + (f", {done.wrong} wrong" if done.wrong else "")
             shown.update(task, completed=done.done, rate=done.rate, faults=faults)
             late = time.monotonic() - shown_s > LINE_S
-            if not console.is_terminal and (late or 10 * done.done // total > tenth):
+            if not shown.console.is_terminal and (late or 10 * done.done // total > tenth):
                 tenth = 10 * done.done // total
                 shown_s = time.monotonic()
                 line = f"{what}: {done.done} of {total}, {done.rate:.2g} {unit}/s, {faults}"
@@ -238,8 +237,6 @@ def print_catalog(catalog: dict[str, Any], json: bool) -> None:
 
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
-    from skysim.core.paths import shipped_files, title_of
-
     listed = [
         {"name": path.stem, "title": title_of(path), "file": str(path)}
         for path in shipped_files(folder).values()

@@ -1,17 +1,19 @@
-"""Messages from a worker to its page: plain numbers, arrays, strings and bytes, so that they can be pickled."""
+"""Messages from a worker to its page: plain numbers, arrays, strings and bytes, so that they can be pickled.
+
+NiceGUI writes arrays as JSON, with null for NaN."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.types import Floats
-from skysim.dynamics.multibody import Shape
+from skysim.core.types import Floats, Record
 from skysim.results import plots
+from skysim.scene.scene import Scene
 
 Triple = tuple[float, float, float]
 NAN = float("nan")
@@ -179,8 +181,8 @@ class Lens:
     """
 
     n: int
-    x: tuple[float, ...]
-    y: tuple[float, ...]
+    x: Floats
+    y: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,12 +193,12 @@ class Pose:
     ----------
     place_m, depth_m
         Under a dome, the camera's place in the lab frame, and for each point of the lens's tables
-        the depth along the boresight at which its ray meets the surface (None if it does not)
+        the depth along the boresight at which its ray meets the surface (NaN if it does not)
     """
 
-    rotation: tuple[float, ...]
-    place_m: tuple[float, ...] = ()
-    depth_m: tuple[float | None, ...] = ()
+    rotation: Floats
+    place_m: Floats | None = None
+    depth_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,25 +215,18 @@ class FrameView:
         lab_from_body
     t_s
         Time in the motion that is played; 0 otherwise
-    filter_arcsec
-        Error of the filter during the motion
-    innovation_arcsec
-        Angle between the star tracker's attitude and the filter's
     """
 
     pose: Pose
     saturation_dn: float
-    size_px: tuple[int, int]
     angles_deg: Triple
-    body_wxyz: tuple[float, ...]
+    body_wxyz: Floats
     exposure_s: float
     statistics: plots.FrameStatistics
     lights: LightColumns
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0
-    filter_arcsec: float = NAN
-    innovation_arcsec: float = NAN
     pixels: Pixels = NO_PIXELS
 
 
@@ -263,13 +258,13 @@ class SceneInfo:
         Duration of the motion
     noise
         Whether the camera has noise; without it a frame is the expected value
+    geometry
+        See `worker.geometry.lab_geometry`
     surveyed
         Whether a survey of the dome has begun
     """
 
-    scene: str
-    title: str
-    under_stars: bool
+    scene: Scene
     names: tuple[str, str, str]
     prefix: str
     field_deg: float
@@ -277,56 +272,14 @@ class SceneInfo:
     stages: dict[str, str]
     duration_s: float
     noise: bool
-    geometry: LabGeometry
+    geometry: dict[str, Any]
     lens: Lens
     surveyed: bool = False
 
 
-class LookFrom(NamedTuple):
-    """A place to look from and a target, m, in the lab frame, or in body axes if the place is on the vehicle.
-
-    Attributes
-    ----------
-    fov_deg
-        Vertical field of view
-    """
-
-    eye_m: Triple
-    target_m: Triple
-    up: Triple
-    fov_deg: float
-    on_vehicle: bool
-
-
-@dataclass(frozen=True, slots=True)
-class LabGeometry:
-    """3-D geometry of the laboratory; meters in the lab frame unless stated otherwise.
-
-    Attributes
-    ----------
-    shapes
-        Shapes of the MJCF file that `skysim scenes export` writes, without the lights
-    ids, lights_m, radius_m, lit
-        (N,) the lights, (N, 3) their positions, (N,) drawn radii, (N,) whether they shine;
-        stars are on a sphere
-    views
-        Places to look from, by name
-    """
-
-    shapes: tuple[Shape, ...]
-    ids: NDArray[np.int64]
-    lights_m: Floats
-    radius_m: Floats
-    lit: NDArray[np.bool_]
-    views: dict[str, LookFrom]
-
-
-@dataclass(frozen=True, slots=True)
-class MotionLog:
-    """Curves of a simulated motion against time, decimated for display."""
-
-    t_s: tuple[float, ...]
-    curves: dict[str, tuple[float, ...]] = field(default_factory=dict)
+Curves = dict[
+    str, Floats
+]  # curves of a simulated motion and their times `t_s`, decimated for display
 
 
 class FlightRow(NamedTuple):
@@ -340,8 +293,10 @@ class FlightRow(NamedTuple):
         Error and standard error of the tracker, arcsec
     lights, identified
         Numbers of lights in the field, and of identified ones
-    filter_arcsec, innovation_arcsec
-        As in `FrameView`
+    filter_arcsec
+        Error of the filter
+    innovation_arcsec
+        Angle between the star tracker's attitude and the filter's
     """
 
     t_s: float
@@ -374,9 +329,9 @@ class FlightStep:
     is_done: bool
     t_s: float
     duration_s: float
-    rows: tuple[FlightRow, ...] = ()
-    log: MotionLog | None = None
-    residuals: tuple[tuple[float, int, float], ...] = ()
+    rows: Sequence[FlightRow] = ()
+    log: Curves | None = None
+    residuals: Sequence[tuple[float, int, float]] = ()
 
 
 class AmbiguityMap(NamedTuple):
@@ -415,8 +370,8 @@ class SurveyPlan(NamedTuple):
         (None if not determined)
     """
 
-    angles_deg: tuple[tuple[float, ...], ...]
-    shown: tuple[int, ...]
+    angles_deg: Sequence[Sequence[float]]
+    shown: Sequence[int]
     leds: int
     steps: tuple[tuple[int, int, float | None], ...]
 
@@ -426,19 +381,13 @@ class SurveyFound(NamedTuple):
 
     Attributes
     ----------
-    frames, connected
-        Numbers of frames so far, and of those that share enough LEDs with others
-    missed
-        Number of attitudes of the last flight without a frame at which the vehicle rested
-    measured, seen_once, unseen
-        Numbers of LEDs, by the connected frames
-    renamed
-        Number of measured LEDs with another one's number
-    sigma_mm
-        Estimated rms error of the measured LEDs along each axis
-    before_mm, error_mm
-        True rms error before the survey and now. None, with the reason in `refusal`, if the
-        frames do not determine the LEDs
+    statistics
+        `frames` so far, `connected` ones, which share enough LEDs with others, and `missed`
+        attitudes of the last flight without a frame at which the vehicle rested; by the connected
+        frames, LEDs `measured`, `seen_once` and `unseen`; those `renamed` that have another one's
+        number; estimated rms error `sigma_mm` along each axis, and true ones before the survey and
+        now, `led_mm_before` and `led_mm_after`. If the frames do not determine the LEDs, the
+        reason is in `refusal`, and there are no errors
     faults
         Faults of the dome, a line each
     ids, known
@@ -446,18 +395,8 @@ class SurveyFound(NamedTuple):
         empty after a refusal
     """
 
-    frames: int
-    missed: int
-    seen_once: int
-    unseen: int
-    refusal: str
+    statistics: Record
+    faults: list[str]
     ids: NDArray[np.int64]
     known: Floats
     plan: SurveyPlan
-    connected: int = 0
-    measured: int = 0
-    renamed: int = 0
-    sigma_mm: float | None = None
-    before_mm: float | None = None
-    error_mm: float | None = None
-    faults: tuple[str, ...] = ()

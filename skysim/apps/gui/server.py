@@ -331,12 +331,6 @@ def stop_studies() -> None:
         process.stop(signal.SIGTERM)
 
 
-async def close(tab: Tab, closed_pages: ClosedPages) -> None:
-    """Release the resources of a tab."""
-    await tab.close()
-    closed_pages.collect_soon()
-
-
 def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers: int) -> None:
     """Register all routes, and prepare the workers of tabs."""
     pool = Workers(workers)
@@ -362,7 +356,13 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
         await tab.build()
         client = ui.context.client
-        client.on_delete(partial(close, tab, closed_pages))
+
+        async def close() -> None:
+            """Release the resources of the tab."""
+            await tab.close()
+            closed_pages.collect_soon()
+
+        client.on_delete(close)
         try:
             await client.connected(timeout=CONNECT_TIMEOUT_S)
         except TimeoutError:  # no browser has connected: start no worker

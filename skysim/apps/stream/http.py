@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -57,7 +57,7 @@ class FrameHub:
         self.changed = threading.Condition()
         self.clients: list[Client] = []
         self.disconnected: deque[Client] = deque()
-        self.earlier = {"clients": 0, "sent": 0, "dropped": 0}
+        self.earlier = Counter(clients=0, sent=0, dropped=0)
 
     def connect(self) -> Client:
         with self.changed:
@@ -72,9 +72,7 @@ class FrameHub:
             if len(self.disconnected) > KEPT_DISCONNECTED:
                 old = self.disconnected.popleft()
                 self.clients.remove(old)
-                self.earlier["clients"] += 1
-                self.earlier["sent"] += old.sent
-                self.earlier["dropped"] += old.dropped
+                self.earlier.update(clients=1, **asdict(old))
 
     def counters(self) -> dict[str, Any]:
         """Counters of each client, and the sums of the earlier ones."""

@@ -62,8 +62,8 @@ DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
 
 
 @dataclass
-class SenderStats:
-    """Counters of the sender.
+class Sender:
+    """Sends the frames of the main camera of a flight, and counts them.
 
     Attributes
     ----------
@@ -74,24 +74,56 @@ class SenderStats:
         frames
     """
 
+    flight: Flight
+    pace: Pace
+    sinks: list[Sink]
     rendered: int = 0
     dropped: int = 0
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
 
-    def record(self, late_ms: float, dropped: int) -> None:
-        """Record a rendered frame.
+    def run(self, publish: Callable[[Packet], None] | None = None) -> None:
+        """Fly and send each frame when it is due, until the last one or until all sinks have failed.
+
+        Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
 
         Parameters
         ----------
-        dropped
-            Number of frames dropped so far
+        publish
+            Function that is also called with each packet
         """
-        self.rendered = self.rendered + 1
-        self.dropped = dropped
-        if self.rendered > 1:  # the first frame starts the clock, so it has no delay
-            self.late_ms.append(late_ms)
+        pace = self.pace
+        scene = self.flight.lab.scene
+        may_drop = scene.filter is None
+        for shot in self.flight.shots(
+            cameras=[0], solves=False, selects=pace.is_on_time if may_drop else None
+        ):
+            frame = shot.frame
+            window = exposure_window(scene, frame.index, frame.exposure_s)
+            end_s = window.close_s(
+                scene.camera.height_px
+            )  # with a rolling shutter, the end of the last row's exposure
+            if pace.zero_s is None:
+                pace.start(end_s)  # so that the first frame has no delay
+            pace.wait(end_s)
+            due_s = pace.due_s(end_s)
+            now_s = time.monotonic()
+            self.dropped = frame.index - self.rendered
+            packet = build_packet(
+                shot, due_s + pace.offset_s, now_s + pace.offset_s, self.dropped
+            )
+            for sink in self.sinks:
+                sink.offer(packet, patient=not pace.speed)
+            if publish:
+                publish(packet)
+            self.rendered += 1
+            if self.rendered > 1:  # the first frame starts the clock, so it has no delay
+                self.late_ms.append(1e3 * (now_s - due_s))
+            if self.sinks and not publish and all(sink.fault for sink in self.sinks):
+                return
+        # Including those after the last rendered one.
+        self.dropped = scene.exposure.frames - self.rendered
 
-    def statistics(self, sinks: list[Sink]) -> dict[str, Any]:
+    def statistics(self) -> dict[str, Any]:
         """Counts, delay statistics in ms, and the counters of each sink."""
         late = np.array(self.late_ms or [np.nan])
         return {
@@ -102,51 +134,6 @@ class SenderStats:
             "late_ms_worst": float(late.max()),
             "sinks": {
                 sink.name: {"sent": sink.sent, "dropped": sink.dropped, "fault": sink.fault}
-                for sink in sinks
+                for sink in self.sinks
             },
         }
-
-
-def send(
-    flight: Flight,
-    pace: Pace,
-    sinks: list[Sink],
-    stats: SenderStats,
-    publish: Callable[[Packet], None] | None = None,
-) -> None:
-    """Fly and send each frame of the main camera when it is due, until the last one or until all sinks have failed.
-
-    Late frames are dropped, unless pacing is off or the scene has a filter: then the loop needs every frame.
-
-    Parameters
-    ----------
-    publish
-        Function that is also called with each packet
-    """
-    scene = flight.lab.scene
-    may_drop = scene.filter is None
-    for shot in flight.shots(
-        cameras=[0], solves=False, selects=pace.is_on_time if may_drop else None
-    ):
-        frame = shot.frame
-        window = exposure_window(scene, frame.index, frame.exposure_s)
-        end_s = window.close_s(
-            scene.camera.height_px
-        )  # with a rolling shutter, the end of the last row's exposure
-        if pace.zero_s is None:
-            pace.start(end_s)  # so that the first frame has no delay
-        pace.wait(end_s)
-        due_s = pace.due_s(end_s)
-        now_s = time.monotonic()
-        dropped = frame.index - stats.rendered
-        packet = build_packet(shot, due_s + pace.offset_s, now_s + pace.offset_s, dropped)
-        for sink in sinks:
-            sink.offer(packet, patient=not pace.speed)
-        if publish:
-            publish(packet)
-        stats.record(1e3 * (now_s - due_s), dropped)
-        if sinks and not publish and all(sink.fault for sink in sinks):
-            return
-    stats.dropped = (
-        scene.exposure.frames - stats.rendered
-    )  # including those after the last rendered one

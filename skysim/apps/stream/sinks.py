@@ -149,14 +149,13 @@ class Sink:
         Error that stopped it, or ""
     """
 
+    sent = dropped = 0
+    busy = False  # writing a packet that is counted neither as sent nor as dropped yet
+    fault = ""
+
     def __init__(self, name: str, write: Callable[[Packet], None]) -> None:
         self.name = name
         self.write = write
-        self.sent = self.dropped = 0
-        self.busy = (
-            False  # writing a packet that is counted neither as sent nor as dropped yet
-        )
-        self.fault = ""
         self.packets: queue.Queue[Packet | None] = queue.Queue(QUEUE_LENGTH)
         self.thread = threading.Thread(target=self.run, name=f"sink {name}", daemon=True)
         self.thread.start()

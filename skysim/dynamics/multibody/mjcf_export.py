@@ -289,11 +289,15 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
         rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
-    # 2. The first and the last ray in each direction that meets the surface.
-    lowest_rad = cap_rad if inside.rim.unbounded else np.radians(80)
-    polar = np.broadcast_to(np.linspace(1e-3, lowest_rad, 400)[:, None], (400, len(around)))
-    height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
-    on_surface = height_m > 0.35 * height_m.max()
+    # 2. The first and the last ray in each direction that meets the surface. A wall that begins below the cap has none.
+    for lowest_rad in (
+        (cap_rad, np.radians(80)) if inside.rim.unbounded else (np.radians(80),)
+    ):
+        polar = np.linspace(1e-3, lowest_rad, 400)[:, None] * np.ones(len(around))
+        height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
+        on_surface = height_m > 0.35 * height_m.max()
+        if on_surface.any(axis=0).all():
+            break
     first = on_surface.argmax(axis=0)
     last = 399 - on_surface[::-1].argmax(axis=0)
     # 3. Rings of equal steps between the two.

@@ -41,7 +41,6 @@ from skysim.apps.gui.views.overlay import (
 )
 from skysim.apps.gui.worker.pixels import (
     BINS,
-    HEADER_BYTES,
     SATURATED,
     SHADES,
     levels_of,
@@ -53,6 +52,7 @@ from skysim.apps.gui.worker.session import WorkerLost
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.results import plots
 
+HEADER_BYTES = 16  # offset and step before the pixels
 SCREEN = (77, 200)  # narrower than the frames
 
 

@@ -29,7 +29,7 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, LightColumns, MotionLog, TrackerResult
+from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
 from skysim.apps.gui.page import readouts, strips
 from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
@@ -73,14 +73,13 @@ def test_an_led_without_current_is_dark_and_the_views_have_their_directions() ->
     assert ids[~lit].tolist() == [dark]
     assert radius_m[lit].min() > 0
     np.testing.assert_array_equal(places_m[ids == dark][0], sources.place[5, :3])
-    views = geometry.lab_geometry(lab).views
+    views = geometry.lab_geometry(lab)["views"]
     boresight = lab.camera.mount.cam_from_body.inv().apply([0.0, 0.0, 1.0])
-    eye = np.array(views["camera"].eye_m)
-    target = np.array(views["camera"].target_m)
+    eye, target, *_ = views["camera"]
     np.testing.assert_allclose(eye, lab.camera.mount.camera_body_m, rtol=0, atol=1e-12)
     np.testing.assert_allclose(target - eye, boresight, rtol=0, atol=1e-12)
-    assert views["top"].eye_m[2] > places_m[:, 2].max()
-    assert views["outside"].eye_m[2] < places_m[:, 2].max()
+    assert views["top"][0][2] > places_m[:, 2].max()
+    assert views["outside"][0][2] < places_m[:, 2].max()
 
 
 def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() -> None:
@@ -94,7 +93,7 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
     assert list(playback.light_residuals(SimpleNamespace(t_s=0.5, result=None))) == []
     residuals = [(0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)]
-    (strip,) = strips.strips([], MotionLog(()), residuals)
+    (strip,) = strips.strips([], {}, residuals)
     assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]
     assert strips.y_axis(strip, 0)["max"] == 0.2
     fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)

@@ -63,8 +63,8 @@ def test_every_parameter_of_a_photo_has_a_label() -> None:
 
 def test_actions_are_found_by_words_in_any_order() -> None:
     commands = [
-        Command("show the log", "F10", lambda: None),
-        Command("show the next frame", ".", lambda: None),
+        Command("show the log", lambda: None, "F10"),
+        Command("show the next frame", lambda: None, "."),
     ]
     assert matching(commands, "FRAME show") == commands[1:]
     assert matching(commands, "") == commands

@@ -135,8 +135,8 @@ def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
         def is_on_time(self, index: int, t_s: float) -> bool:
             return index % 2 == 0
 
-    stats = sender.SenderStats()
-    sender.send(streamed_flight(), Slow(0.0, 10.0), [], stats, packets.append)
+    stats = sender.Sender(streamed_flight(), Slow(0.0, 10.0), [])
+    stats.run(packets.append)
     assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
     assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
     # With the last, after which none came.

@@ -10,7 +10,7 @@ import typer
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load
 from skysim.apps.cli.terminal import print_json, progress_callback
-from skysim.core.constants import DAY_S, HOUR_S, JULIAN_YEAR_DAY
+from skysim.core.constants import DAY_S, EARTH_MU_M3_S2, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
@@ -132,12 +132,9 @@ def computed(
     """The angles over the span; without one, over one revolution."""
     import numpy as np
 
-    from skysim.core.constants import EARTH_MU_M3_S2
-    from skysim.sources import catalog, stars
-    from skysim.sources.camera_orbit import build_orbit
-    from skysim.sources.orbit_availability import sample
+    from skysim.sources import camera_orbit, catalog, orbit_availability, stars
 
-    orbit = build_orbit(scene.orbit, scene.start_time)
+    orbit = camera_orbit.build_orbit(scene.orbit, scene.start_time)
     assert orbit is not None
     if span_s is None:
         first = orbit.states(np.zeros(1))
@@ -154,7 +151,7 @@ def computed(
     camera = scene.camera
     area_px = camera.width_px * camera.height_px
     field_rad = math.atan(math.sqrt(area_px / math.pi) / camera.focal_px)
-    return sample(
+    return orbit_availability.sample(
         orbit,
         scene.start_time,
         t_s,

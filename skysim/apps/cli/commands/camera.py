@@ -11,9 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from skysim.apps.cli.options import OPTIONS, Json, Overrides, as_typed, complete_scene
+from skysim.apps.cli.options import (
+    OPTIONS,
+    Json,
+    Overrides,
+    as_typed,
+    complete_scene,
+    write_file,
+)
 from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.paths import DATA, shipped_files
 from skysim.results.report import terminal_width
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
@@ -24,14 +32,8 @@ if TYPE_CHECKING:
 
 def complete_camera(incomplete: str) -> list[str]:
     """Names of camera presets, scenes and YAML files that begin with what was typed."""
-    from skysim.core.paths import DATA
-
-    names = {
-        path.stem
-        for path in (DATA / "cameras").glob("*.yaml")
-        if path.stem.startswith(incomplete)
-    }
-    return sorted(names | set(complete_scene(incomplete)))
+    names = [name for name in shipped_files(DATA / "cameras") if name.startswith(incomplete)]
+    return sorted({*names, *complete_scene(incomplete)})
 
 
 class CameraGroup(TyperGroup):
@@ -121,7 +123,6 @@ def camera_show(
     """
     import dataclasses
 
-    from skysim.core import files
     from skysim.scene import opencv_calibration
 
     lens, body = read_camera(file, set_)
@@ -130,8 +131,7 @@ def camera_show(
             f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'"
         )
     if lens is not None and out:
-        files.make_folder(out.parent)
-        files.write_text(out, opencv_calibration.text(lens))
+        write_file(out, opencv_calibration.text(lens))
     if json:
         known = (
             dataclasses.asdict(lens)
@@ -238,7 +238,6 @@ def camera_new(
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
     """
-    from skysim.core import files
     from skysim.scene import camera_sheet
 
     if out.suffix not in (".yaml", ".yml") or out.exists():
@@ -247,8 +246,7 @@ def camera_new(
         )
     given = {key: text for key in QUESTIONS if (text := answers[key]) is not None}
     filled = camera_sheet.fill(given or ask_all())
-    files.make_folder(out.parent)
-    files.write_text(out, camera_sheet.text(filled, name or out.stem))
+    write_file(out, camera_sheet.text(filled, name or out.stem))
     if json:
         print_json({"file": str(out), "missing": [one._asdict() for one in filled.missing]})
     else:

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
 from skysim.core.errors import InputError, unknown_name
-from skysim.core.paths import DATA
+from skysim.core.paths import DATA, SCENES
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 
@@ -30,8 +30,6 @@ def scenes(context: typer.Context, json: Json = False) -> None:
     """List the scenes that come with skysim."""
     if context.invoked_subcommand:
         return
-    from skysim.core.paths import SCENES
-
     print_titles(SCENES, json)
 
 
@@ -78,22 +76,22 @@ def scenes_export(
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
     lab = build_lab(loaded)
+    ending = path.suffix.lower()
     use = f"python -m mujoco.viewer --mjcf={path}"
-    if path.suffix.lower() == ".pdf":
+    if ending == ".pdf":
         files.make_folder(path.parent)
         count = gore_pages.write_pdf(path, templates.dome_of(lab), paper)
         print(f"{path}: {count} pages; print them at 100 %")
         return
-    if path.suffix.lower() == ".csv":
+    if ending == ".csv":
         text, cap_deg = lab.export_leds()
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
-    elif (ending := path.suffix.lower()) in templates.TEMPLATES:
+    elif ending in templates.TEMPLATES:
         text = templates.template(lab, ending)
         use = "print it at 100 %" if ending == ".svg" else "in mm"
     else:
         text = lab.export_mjcf()
-    files.make_folder(path.parent)
-    files.write_text(path, text)
+    write_file(path, text)
     print(f"{path}: {use}")
 
 
@@ -113,15 +111,12 @@ def scenes_parts(
     json: Json = False,
 ) -> None:
     """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
-    from skysim.core import files
     from skysim.results.files import parts
-    from skysim.results.files.parts import find_prices, read_prices
 
     loaded = load(scene, None, seed, set_)
-    found = parts.parts_list(loaded, read_prices(find_prices(prices)))
+    found = parts.parts_list(loaded, parts.read_prices(parts.find_prices(prices)))
     if out:
-        files.make_folder(out.parent)
-        files.write_text(out, parts.to_csv(found, loaded.name))
+        write_file(out, parts.to_csv(found, loaded.name))
     if json:
         lines = [line._asdict() for line in found.lines]
         print_json({"parts": lines, "groups": found.groups(), "total": found.total})
@@ -160,8 +155,6 @@ def new(
 
     Its first lines say which commands use it. A vehicle is two files: its model, and a scene that flies it.
     """
-    from skysim.core import files
-
     if kind not in KINDS:
         raise InputError("", *unknown_name("kind", kind, KINDS))
     if not re.fullmatch(r"[A-Za-z]\w*", name):
@@ -174,10 +167,9 @@ def new(
             raise InputError(
                 target, "exists; choose another name, or another folder with --out"
             )
-    files.make_folder(out)
     for target, template in templates.items():
         text = template.read_text(encoding="utf-8")
-        files.write_text(target, text.replace("NAME", name))
+        write_file(target, text.replace("NAME", name))
         print(target)
         for use in re.findall("^#   (skysim.*)", text, re.MULTILINE):
             print(

@@ -104,20 +104,19 @@ def send_all(
 
     Ctrl-C ends the stream. Flight and sinks are closed at its end.
     """
-    from skysim.apps.stream import sender
+    from skysim.apps.stream.sender import Pace, Sender
 
-    stats = sender.SenderStats()
-    pace = sender.Pace(speed, flight.lab.scene.exposure.rate_hz)
-    with serving(port, host, lambda: stats.statistics(sinks)) as hub:
+    sender = Sender(flight, Pace(speed, flight.lab.scene.exposure.rate_hz), sinks)
+    with serving(port, host, sender.statistics) as hub:
         try:
-            sender.send(flight, pace, sinks, stats, hub.publish if hub else None)
+            sender.run(hub.publish if hub else None)
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:
             flight.close()
             for sink in sinks:
                 sink.close()
-    return stats.statistics(sinks) | (hub.counters() if hub else {})
+    return sender.statistics() | (hub.counters() if hub else {})
 
 
 @contextmanager

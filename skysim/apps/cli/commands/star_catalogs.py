@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from skysim.apps.cli.options import Json
+from skysim.apps.cli.options import Json, write_file
 from skysim.apps.cli.terminal import print_catalog, print_json
 from skysim.core.errors import InputError
 
@@ -167,12 +167,11 @@ def catalog_proc_cat(
 ) -> None:
     """Merge close stars of a .cat file and sort by magnitude, with a log beside it: PTASE's PROC_CAT."""
     from estimator.catalog import cat_file, published_catalogs
-    from skysim.core import files
     from skysim.core.constants import ARCSEC_RAD
 
     stars = published_catalogs.proc_cat(cat_file.read(source), closer * ARCSEC_RAD)
     write_cat(stars, out, json)
-    files.write_text(out.with_suffix(".log"), published_catalogs.log(stars))
+    write_file(out.with_suffix(".log"), published_catalogs.log(stars))
 
 
 def write_cat(stars: OnBoard, path: Path, json: bool) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.events import KeyEventArguments
 
-from skysim.apps.gui.views import keys, widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, keys, widgets
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import geometry
 
@@ -28,11 +27,11 @@ document.addEventListener("keydown", event => {
 
 
 class Command(NamedTuple):
-    """An entry: its name, the label of its key if it has one, and its action."""
+    """An entry: its name, its action, and the label of its key if it has one."""
 
     name: str
-    key: str
     action: Action
+    key: str = ""
 
 
 async def perform(action: Action) -> None:
@@ -136,7 +135,7 @@ class Actions:
 
     def __init__(
         self,
-        page: PageContext,
+        page: context.PageContext,
         sensor: SensorView,
         step: Callable[[int], Awaitable[None]],
         performers: Mapping[str, Action],
@@ -157,7 +156,7 @@ class Actions:
         """Every action with its key."""
         by_key = [key for key in keys.KEYS if key.action in self.performers]
         return [
-            Command(key.help, key.label, partial(self.perform, key.action)) for key in by_key
+            Command(key.help, partial(self.perform, key.action), key.label) for key in by_key
         ] + [*self.others]
 
     async def key(self, event: KeyEventArguments) -> None:

@@ -7,9 +7,7 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import forms, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import Contents, LiveText
+from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.core.paths import SCENES, shipped_files
@@ -22,14 +20,13 @@ class Head:
     ----------
     folder
         Folder in which scenes are saved
-    message_text
-        Text of the message
     """
 
-    def __init__(self, page: PageContext, contents: Contents, folder: Path) -> None:
+    def __init__(
+        self, page: context.PageContext, contents: live.Contents, folder: Path
+    ) -> None:
         self.page = page
         self.folder = folder
-        self.message_text = ""
         with ui.element("div").classes("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
@@ -39,7 +36,7 @@ class Head:
                 on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
-            self.banner = LiveText(contents, "live").classes("lab-banner").mark("banner")
+            self.banner = live.LiveText(contents, "live").classes("lab-banner").mark("banner")
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
@@ -49,7 +46,7 @@ class Head:
             self.busy = (
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
-            self.latency = LiveText(contents).classes("lab-rate mono quiet").mark("rate")
+            self.latency = live.LiveText(contents).classes("lab-rate mono quiet").mark("rate")
             self.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
                 "dense size=xs"
@@ -83,8 +80,9 @@ class Head:
     def set_scene(self, info: SceneInfo) -> None:
         """Show the name, the title and the noise of a newly opened scene."""
         self.picker.set_value(self.page.state.scene)
-        self.title.props["title"] = info.title  # tooltip with the full title
-        self.title.set_text(info.title)
+        title = info.scene.title
+        self.title.props["title"] = title  # tooltip with the full title
+        self.title.set_text(title)
         self.noise.set_value(info.noise)
 
     def set_state(self, state: PageView) -> None:
@@ -93,7 +91,6 @@ class Head:
         self.live_button.set_visibility(state.kind != "live")
 
     def set_message(self, text: str, color: str) -> None:
-        self.message_text = text
         self.message.props["title"] = text  # tooltip with the full text
         self.message.set_text(text)
         self.message.classes(remove="good warn quiet", add=color)
@@ -232,13 +229,10 @@ class Arrangement:
         kind
             `side` (the column of panels) or `space` (the 3-D view)
         """
-        line = (
-            ui.element("div")
-            .classes(f"lab-split {orientation}")
-            .props(f'role="separator" data-split="{kind}"')
+        ui.element("div").classes(f"lab-split {orientation}").props(
+            f'role="separator" data-split="{kind}" aria-orientation="{orientation}" tabindex="0"'
+            f' aria-label="{label}" title="{label}: drag, or arrow keys; double-click: as at first"'
         )
-        line.props(f'aria-orientation="{orientation}" tabindex="0" aria-label="{label}"')
-        line.props(f'title="{label}: drag, or arrow keys; double-click: as at first"')
 
     async def restore(self) -> None:
         """Apply the theme that the browser remembers."""

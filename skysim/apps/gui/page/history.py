@@ -12,8 +12,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.views.context import Shown
-from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.views import context, state
 
 SETTLED = (
     3  # number of timer calls without a change after which the next change is a new step
@@ -70,9 +69,15 @@ class History:
         Number of timer calls since the last change
     """
 
+    written: state.PageView | None = None
+    showing = False
+    moving = False
+    unchanged = 0
+    pending: str | None = None
+
     def __init__(
         self,
-        page: Shown,
+        page: context.PageContext,
         home: str,
         show_query: Callable[[str], Awaitable[None]],
         is_settling: Callable[[], bool],
@@ -81,11 +86,6 @@ class History:
         self.home = home
         self.show_query = show_query
         self.is_settling = is_settling
-        self.written: PageView | None = None
-        self.showing = False
-        self.moving = False
-        self.unchanged = 0
-        self.pending: str | None = None
         ui.add_body_html(f"<script>{JS}</script>")
         ui.on("view", self.asked)
         ui.timer(WRITE_S, self.write)

@@ -9,9 +9,7 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import Shown
-from skysim.apps.gui.views.live import csv_table
+from skysim.apps.gui.views import context, live, widgets
 
 MAX_LINES = 500
 MAX_ROWS = 10_000
@@ -47,7 +45,7 @@ class LogPanel:
         Identifications as values of COLUMNS
     """
 
-    def __init__(self, page: Shown) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
         self.lines: list[str] = []
         self.rows: list[tuple[Any, ...]] = []
@@ -69,7 +67,7 @@ class LogPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
+            live.csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
         )
 
 
@@ -89,29 +87,22 @@ def line(view: FrameView, info: SceneInfo) -> str:
 
 
 def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
-    """An identification as values of COLUMNS; None where there is no solution."""
+    """An identification as values of COLUMNS; None or NaN where there is no solution."""
     result = view.result
     assert result is not None
-    found = result.angles_deg or (None,) * 3
-    errors = (
-        (result.cross_arcsec, result.roll_arcsec, *result.sigma_arcsec)
-        if result.solved
-        else (None,) * 4
-    )
-    counts = len(result.detections), result.identified
-    names = (
-        info.scene,
+    return (
+        time.strftime("%H:%M:%S"),
+        info.scene.name,
         info.noise,
         info.stages["detector"],
         info.stages["identifier"],
         result.status,
-    )
-    return (
-        time.strftime("%H:%M:%S"),
-        *names,
-        *counts,
+        len(result.detections),
+        result.identified,
         *view.angles_deg,
-        *found,
-        *errors,
+        *(result.angles_deg or (None,) * 3),
+        result.cross_arcsec,
+        result.roll_arcsec,
+        *result.sigma_arcsec,
         result.wrong,
     )

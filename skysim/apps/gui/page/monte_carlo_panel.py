@@ -13,10 +13,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 from pydantic import ValidationError
 
-from skysim.apps.gui.views import forms, keys, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import format_number
-from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.views import context, forms, keys, live, style, widgets
 from skysim.apps.gui.worker.study_process import (
     PAGE_STUDY,
     RESPONSES,
@@ -60,16 +57,17 @@ class MonteCarloPanel:
         Whether its process is being started
     """
 
-    def __init__(self, page: PageContext, out: Path, user: str, tab: str) -> None:
+    run_number = 0
+    stopped = False
+    starting = False
+
+    def __init__(self, page: context.PageContext, out: Path, user: str, tab: str) -> None:
         self.page = page
         self.out = out
         self.user = user
         self.tab = tab
         self.process = StudyProcess(Path())
-        self.run_number = 0
         self.failed: tuple[tuple[int, str], ...] = ()
-        self.stopped = False
-        self.starting = False
         with widgets.row():
             self.study_select = (
                 widgets.select({}).props('aria-label="Study"').classes("flex-grow")
@@ -325,7 +323,7 @@ class MonteCarloPanel:
     def show(self, results: StudyResults) -> None:
         self.bar.set_value(results.done / max(self.process.total, 1))
         self.chart.options["xAxis"]["data"] = [
-            format_number(center) for center in results.bins
+            live.format_number(center) for center in results.bins
         ]
         self.chart.options["series"][0]["data"] = list(results.counts)
         self.chart.options["title"]["text"] = "" if results.counts else "no trial solved"
@@ -408,8 +406,8 @@ def format_interval(value: float, low: float, high: float) -> str:
 
 def options() -> dict[str, Any]:
     """ECharts options of the histogram of the error angle."""
-    text = {":color": chart_color("quiet"), "fontSize": 10}
-    rule = {"lineStyle": {":color": chart_color("line")}}
+    text = {":color": style.chart_color("quiet"), "fontSize": 10}
+    rule = {"lineStyle": {":color": style.chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -419,13 +417,13 @@ def options() -> dict[str, Any]:
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
         "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
-        "tooltip": TOOLTIP,
+        "tooltip": style.TOOLTIP,
         "series": [
             {
                 "type": "bar",
                 "data": [],
                 "barCategoryGap": "8%",
-                "itemStyle": {"color": CURVE_COLORS[0]},
+                "itemStyle": {"color": style.CURVE_COLORS[0]},
             }
         ],
     }

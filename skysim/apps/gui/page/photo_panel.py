@@ -8,9 +8,9 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, widgets
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
+from skysim.scene.sections.light import StarsConfig
 
 LIMIT_BYTES = 64 * 2**20
 
@@ -39,7 +39,7 @@ class PhotoPanel:
         Status that was logged last
     """
 
-    def __init__(self, page: PageContext, cameras: Sequence[str]) -> None:
+    def __init__(self, page: context.PageContext, cameras: Sequence[str]) -> None:
         self.page = page
         self.cameras = cameras
         self.live = False
@@ -101,7 +101,7 @@ class PhotoPanel:
     def stages(self) -> Stages:
         """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
         info = self.page.scene_info
-        chosen = info.stages if info and info.under_stars else {}
+        chosen = info.stages if info and isinstance(info.scene.light, StarsConfig) else {}
         return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:

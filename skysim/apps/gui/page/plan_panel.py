@@ -16,10 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
-from skysim.apps.gui.views import forms, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.space import Scene3D
-from skysim.apps.gui.views.style import color_scale
+from skysim.apps.gui.views import context, forms, space, style, widgets
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
@@ -62,13 +59,12 @@ class PlanPanel:
         one is shown
     """
 
-    def __init__(self, page: PageContext, scene_3d: Scene3D, run_panel: RunPanel) -> None:
+    def __init__(
+        self, page: context.PageContext, scene_3d: space.Scene3D, run_panel: RunPanel
+    ) -> None:
         self.page = page
         self.scene_3d = scene_3d
         self.run_panel = run_panel
-        self.plan: SurveyPlan | None = None
-        self.taken = 0
-        self.colored: tuple[NDArray[np.int64], Floats] | None = None
         self.legends = dict[str, ui.element]()
         with self.part():
             widgets.button("Check", self.check, "check")
@@ -122,7 +118,8 @@ class PlanPanel:
 
     def clear_survey(self) -> None:
         """Discard the survey, and show what a survey does."""
-        self.plan = self.colored = None
+        self.plan: SurveyPlan | None = None
+        self.colored: tuple[NDArray[np.int64], Floats] | None = None
         self.taken = 0
         self.legends.pop("survey", None)
         self.enable()
@@ -182,7 +179,7 @@ class PlanPanel:
             ui.label(ambiguity_text(found))
             with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
                 widgets.quiet(f"{100 * found.least:.0f} % or less")
-                scale = 255 * color_scale(np.linspace(0, 1, 8))
+                scale = 255 * style.color_scale(np.linspace(0, 1, 8))
                 colors = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in scale)
                 ui.element("div").style(
                     f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
@@ -215,11 +212,11 @@ class PlanPanel:
             )
             if found is None:
                 return
-            self.taken = found.frames
+            self.taken = found.statistics["frames"]
             lines = survey_lines(found)
             self.show_survey([*lines, prediction_text(found.plan)], found.plan)
             self.page.log(f"survey of {Path(self.page.state.scene).name}: {lines[0]}")
-            if not found.refusal:
+            if not found.statistics["refusal"]:
                 self.save_map.set_enabled(True)
                 self.colored = found.ids, found.known
             if self.colored:
@@ -314,28 +311,29 @@ def prediction_text(plan: SurveyPlan) -> str:
 
 def survey_lines(found: SurveyFound) -> list[str]:
     """The results of a survey's frames, and the faults of the dome."""
+    of = found.statistics
     missed = []
-    if found.missed:
-        missed = [f"{found.missed} attitudes have no frame: the vehicle did not rest there."]
-    unmeasured = f"{found.seen_once} seen once, {found.unseen} not seen"
-    if found.refusal:
+    if of["missed"]:
+        missed = [f"{of['missed']} attitudes have no frame: the vehicle did not rest there."]
+    unmeasured = f"{of['seen_once']} seen once, {of['unseen']} not seen"
+    if of["refusal"]:
         return [
-            f"{found.frames} frames: no LED measured; {unmeasured}.",
+            f"{of['frames']} frames: no LED measured; {unmeasured}.",
             *missed,
-            f"Not determined yet: {found.refusal}.",
+            f"Not determined yet: {of['refusal']}.",
         ]
-    renamed = f"; {found.renamed} have the number of another one" if found.renamed else ""
+    renamed = f"; {of['renamed']} have the number of another one" if of["renamed"] else ""
     return [
-        f"{found.frames} frames, {found.connected} of them connected: {found.measured} of {len(found.ids)} LEDs"
-        f" measured to {found.sigma_mm:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true"
-        f" error is {found.error_mm:.2g} mm, {found.before_mm:.2g} mm before{renamed}.",
+        f"{of['frames']} frames, {of['connected']} of them connected: {of['measured']} of {of['leds']} LEDs measured"
+        f" to {of['sigma_mm']:.2g} mm rms about each axis (1σ), {unmeasured} in the connected ones. Their true error is"
+        f" {of['led_mm_after']:.2g} mm, {of['led_mm_before']:.2g} mm before{renamed}.",
         *missed,
         *found.faults,
     ]
 
 
 def survey_flight(
-    scene: str, overrides: Mapping[str, str], angles_deg: tuple[tuple[float, ...], ...]
+    scene: str, overrides: Mapping[str, str], angles_deg: Sequence[Sequence[float]]
 ) -> dict[str, str]:
     """Overrides with which the vehicle slews to each attitude and holds it, with frames over the whole time.
 

@@ -17,10 +17,8 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
-from skysim.apps.gui.views.overlay import MAX_TRUTH_MARKS, NEAR_PX
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
 
@@ -36,14 +34,11 @@ class AttitudeCard:
     ----------
     contents
         Contents of the tab's live fields
-    shows_photo
-        Whether the card shows an image that is not of the current scene
     """
 
-    def __init__(self, page: PageContext, contents: Contents) -> None:
+    def __init__(self, page: context.PageContext, contents: Contents) -> None:
         self.page = page
         self.contents = contents
-        self.shows_photo = False
         with ui.element("div").classes("lab-card"):
             with ui.element("div").classes("lab-grid"):
                 widgets.quiet("attitude")
@@ -70,16 +65,11 @@ class AttitudeCard:
         )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        """Show angle names and algorithms of a new scene."""
-        self.set_headers(scene_info.names)
+        """Show the algorithms of a new scene."""
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
         self.stages.props["title"] = ", ".join(
             f"{stage} {name}" for stage, name in scene_info.stages.items()
         )
-
-    def set_headers(self, names: tuple[str, str, str]) -> None:
-        for head, name in zip(self.heads, names, strict=True):
-            head.set_text(f"{name}, deg")
 
     async def point(self, event: Any) -> None:
         """Point the camera at the typed angles."""
@@ -98,34 +88,18 @@ class AttitudeCard:
         """Give the first angle the keyboard focus."""
         self.inputs[0].run_method("focus")
 
-    def show(self, view: FrameView) -> None:
-        info = self.page.scene_info
-        if self.shows_photo and info:
-            self.shows_photo = False
-            self.set_headers(info.names)
-            self.set_placeholder("")
-        for field, angle in zip(self.inputs, view.angles_deg, strict=True):
-            field.set_value(format_angle(angle))
-        self.show_result(view.result)
-
-    def show_photo(self, photo: Photo) -> None:
-        """Display the attitudes of an image that is not of the current scene; a user's image has no true attitude."""
-        self.shows_photo = True
-        self.set_headers(photo.names)
-        self.set_placeholder("unknown")
-        texts = (
-            [format_angle(angle) for angle in photo.true_deg]
-            if photo.true_deg
-            else ["", "", ""]
-        )
-        for field, text in zip(self.inputs, texts, strict=True):
-            field.set_value(text)
-        self.show_result(photo.result)
-
-    def set_placeholder(self, text: str) -> None:
-        for field in self.inputs:
-            field.props["placeholder"] = text
-            field.update()
+    def show(self, image: FrameView | Photo, of: SceneInfo | Photo) -> None:
+        """Display the attitudes of a frame of a scene or of another image; a user's image has no true attitude."""
+        for head, name in zip(self.heads, of.names, strict=True):
+            head.set_text(f"{name}, deg")
+        known = image.angles_deg
+        placeholder = "" if known else "unknown"
+        for n, field in enumerate(self.inputs):
+            field.set_value(format_angle(known[n]) if known else "")
+            if field.props.get("placeholder", "") != placeholder:
+                field.props["placeholder"] = placeholder
+                field.update()
+        self.show_result(image.result)
 
     def show_result(self, result: TrackerResult | None) -> None:
         """Display the tracker's angles, errors and status; dashes without a solution."""
@@ -200,7 +174,7 @@ class LightsPanel:
         self.table.run_method(
             "show",
             HEADS,
-            list(rows(sensor.lights[:MAX_TRUTH_MARKS], detections, sensor.name)),
+            list(rows(sensor.lights[: overlay.MAX_TRUTH_MARKS], detections, sensor.name)),
         )
 
 
@@ -219,21 +193,18 @@ def rows(
     """
     found = list(detections)
     found_px = places_px(found)
-    left = set(range(len(found)))
+    left = dict(enumerate(found))
     for light in lights:
         distance_px = np.hypot(*(found_px - (light.x, light.y)).T)
-        n = int(distance_px.argmin()) if len(found) else -1
-        near = n in left and distance_px[n] < NEAR_PX
-        spot = found[n] if near else None
-        left -= {n} if near else set()
+        is_near = distance_px.min(initial=np.inf) < overlay.NEAR_PX
+        spot = left.pop(int(distance_px.argmin()), None) if is_near else None
         yield {
             "key": f"light {light.id}",
             "id": light.id,
             "state": state(light, spot),
             "cells": cells(light, spot, name),
         }
-    for n in sorted(left):
-        spot = found[n]
+    for n, spot in left.items():
         taken = name(spot.id) if spot.id >= 0 else ""
         texts = [
             "no light",

@@ -7,20 +7,19 @@ import bisect
 import time
 from collections.abc import Callable
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightRow, FlightStep, MotionLog
+from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
-from skysim.apps.gui.views import widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.forms import FEEDBACKS, loop_overrides
-from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, csv_table
+from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
+TIME_S = attrgetter("t_s")  # time of a row
 CONTROL_KEYS = ("motion.control", "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
 LOOK_S = 0.05  # interval of checks whether the flight still plays
@@ -37,7 +36,7 @@ class RunPanel:
     contents
         Contents of the tab's live fields
     feedback
-        Feedback of the scene's controller; None without a controller
+        Feedback of the scene's controller; empty without a controller
     rows, log
         Rows of the computed frames, and curves of the motion
     residuals
@@ -63,26 +62,23 @@ class RunPanel:
         again
     """
 
-    def __init__(self, page: PageContext, contents: Contents, sensor: SensorView) -> None:
+    feedback = ""
+    computing = stopping = playing = showing = False
+    wanted_s: float | None = None
+    sought: int | None = None
+    plays_when_done = False
+    started_s = 0.0
+    drawn_s = 0.0
+    closed_scene = ""
+
+    def __init__(
+        self, page: context.PageContext, contents: live.Contents, sensor: SensorView
+    ) -> None:
         self.page = page
         self.contents = contents
         self.sensor = sensor
-        self.feedback: str | None = None
-        self.rows: list[FlightRow] = []
-        self.log = MotionLog(())
-        self.times_s: list[float] = []
-        self.residuals: list[tuple[float, int, float]] = []
-        self.computing = self.stopping = self.playing = self.showing = False
-        self.wanted_s: float | None = None
         self.when_shown: Callable[[], None] | None = None
-        self.sought: int | None = None
-        self.plays_when_done = False
-        self.index = 0
         self.factor = SPEEDS["real time"]
-        self.started_s = 0.0
-        self.from_s = 0.0
-        self.drawn_s = 0.0
-        self.closed_scene = ""
         self.closed_overrides: dict[str, str] = {}
         self.slot = ui.context.slot
         self.build()
@@ -108,18 +104,18 @@ class RunPanel:
             "instant-feedback"
         )
         with widgets.row(3):
-            self.seek = LiveInput(self.contents, "range").props(
+            self.seek = live.LiveInput(self.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
             )
             self.seek.classes("lab-seek").on(
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
-            self.clock = LiveText(self.contents).classes("mono flex-none").mark("clock")
+            self.clock = live.LiveText(self.contents).classes("mono flex-none").mark("clock")
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
         self.strips = StripChart(self.contents)
-        self.enable()
+        self.clear()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
         button = ui.button(icon=icon, on_click=action).props(
@@ -143,29 +139,26 @@ class RunPanel:
             else ""
         )
 
-    def set_scene(self, feedback: str | None) -> None:
-        """Set up the panel for a new scene, which has no flight yet.
-
-        Parameters
-        ----------
-        feedback
-            Feedback of its controller; None without a controller
-        """
+    def set_scene(self, info: SceneInfo) -> None:
+        """Set up the panel for a new scene, which has no flight yet."""
         self.pause()
         self.clear()
-        self.feedback = feedback
+        control = info.scene.motion.control
+        self.feedback = control.feedback if control else ""
         state = self.page.state
-        if feedback:
+        if self.feedback:
             self.closed_scene = state.scene
             self.closed_overrides = dict(state.overrides)
-        offered = FEEDBACKS if self.closed_scene == state.scene else {"": FEEDBACKS[""]}
-        self.loop.set_options(offered, value=feedback or "")
+        offered = (
+            forms.FEEDBACKS if self.closed_scene == state.scene else {"": forms.FEEDBACKS[""]}
+        )
+        self.loop.set_options(offered, value=self.feedback)
 
     def clear(self) -> None:
-        self.rows = []
-        self.log = MotionLog(())
-        self.times_s = []
-        self.residuals = []
+        """Forget the flight."""
+        self.rows: list[FlightRow] = []
+        self.log: Curves = {}
+        self.residuals: list[tuple[float, int, float]] = []
         self.index = 0
         self.from_s = 0.0
         self.seek.set_value(0)
@@ -177,7 +170,7 @@ class RunPanel:
         """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
         state = self.page.state
         feedback = str(self.loop.value or "")
-        if self.closed_scene != state.scene or feedback == (self.feedback or ""):
+        if self.closed_scene != state.scene or feedback == self.feedback:
             return
         others = {
             key: value
@@ -191,12 +184,12 @@ class RunPanel:
                 controls[key] = value
             if feedback and key.startswith("motion.maneuver"):
                 maneuver[key] = value
-        control = loop_overrides(state.scene, others | controls, feedback)
+        control = forms.loop_overrides(state.scene, others | controls, feedback)
         self.loop.disable()  # no second change while this one runs
         await self.page.open(state.scene, others | maneuver | control)
         if self.page.is_open:
             # The old value, if the scene refused the change.
-            self.loop.set_value(self.feedback or "")
+            self.loop.set_value(self.feedback)
             self.loop.enable()
 
     # Computing.
@@ -249,7 +242,6 @@ class RunPanel:
         """Add new rows, residuals and curves of the flight."""
         self.rows += step.rows
         self.residuals += step.residuals
-        self.times_s += [row.t_s for row in step.rows]
         self.log = step.log or self.log
         self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
         self.summary.set_text(
@@ -261,7 +253,7 @@ class RunPanel:
     def draw(self) -> None:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
-        ends = [*self.log.t_s[-1:], *self.times_s[-1:]]
+        ends = [*self.log.get("t_s", ())[-1:], *(row.t_s for row in self.rows[-1:])]
         lights = (
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once
@@ -303,9 +295,8 @@ class RunPanel:
         if self.playing:
             self.pause()
         elif self.rows and not self.computing:
-            self.from_s = (
-                0.0 if self.index >= len(self.rows) - 1 else self.times_s[self.index]
-            )
+            is_over = self.index >= len(self.rows) - 1
+            self.from_s = 0.0 if is_over else self.rows[self.index].t_s
             self.start()
 
     def pause(self) -> None:
@@ -341,7 +332,7 @@ class RunPanel:
         if self.rows and not self.computing:
             self.pause()
             await self.show_index(
-                min(range(len(self.times_s)), key=lambda n: abs(self.times_s[n] - t_s))
+                min(range(len(self.rows)), key=lambda n: abs(self.rows[n].t_s - t_s))
             )
 
     async def slid(self, event: Any) -> None:
@@ -351,7 +342,7 @@ class RunPanel:
         while not is_showing and self.sought is not None:
             index = self.sought
             if 0 <= index < len(self.rows):
-                self.from_s = self.times_s[index]
+                self.from_s = self.rows[index].t_s
                 self.started_s = time.monotonic()
                 await self.show_index(index)
             if self.sought == index:
@@ -364,13 +355,13 @@ class RunPanel:
         self.showing = True
         try:
             while self.playing and self.rows and self.page.is_open:
-                index = max(bisect.bisect_right(self.times_s, self.now_s) - 1, 0)
+                index = max(bisect.bisect_right(self.rows, self.now_s, key=TIME_S) - 1, 0)
                 if index != self.index or self.page.state.kind != "flight":
                     await self.show_index(index)
                 if self.index >= len(self.rows) - 1:
                     self.pause()
                 elif self.playing:
-                    wait_s = (self.times_s[self.index + 1] - self.now_s) / self.factor
+                    wait_s = (self.rows[self.index + 1].t_s - self.now_s) / self.factor
                     await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
         except Exception:
             self.pause()
@@ -392,6 +383,6 @@ class RunPanel:
 
     def download(self) -> None:
         ui.download(
-            csv_table(FlightRow._fields, self.rows),
+            live.csv_table(FlightRow._fields, self.rows),
             f"{Path(self.page.state.scene).stem}_flight.csv",
         )

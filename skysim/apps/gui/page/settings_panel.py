@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from nicegui import run, ui
 
 from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.views import forms, keys, widgets
-from skysim.apps.gui.views.context import PageContext
-from skysim.apps.gui.views.live import for_page
+from skysim.apps.gui.views import context, forms, keys, live, widgets
 from skysim.core.errors import InputError
 
 SENSOR = "sensor, F6"
@@ -42,6 +41,25 @@ FOCUS_S = 0.2  # time until a part that opens is drawn
 MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of the catalog with random errors."
 
 
+@dataclass
+class KeyRow:
+    """The elements of a key.
+
+    Attributes
+    ----------
+    field
+        The key as it is shown
+    typed
+        Last typed value, accepted or refused
+    """
+
+    field: forms.FormField
+    box: ui.element
+    label: ui.label
+    entry: ui.input | ui.select
+    typed: str
+
+
 class KeyForm:
     """Form with one expandable part per group of keys; values that differ from the file are marked.
 
@@ -51,58 +69,48 @@ class KeyForm:
         Function that returns the label of a field from its key
     opens
         Group that is open at first
-    scene, fields
-        Scene whose fields are shown, and its fields by key
-    last_typed
-        Last typed value by key, accepted or refused
-    rows, labels, inputs
-        Elements by key
+    scene
+        Scene whose fields are shown
+    rows
+        Rows by key
     expansions
         Expandable parts by group
     """
 
     def __init__(
-        self, page: PageContext, label: Callable[[forms.FormField], str], opens: str = ""
+        self,
+        page: context.PageContext,
+        label: Callable[[forms.FormField], str],
+        opens: str = "",
     ) -> None:
         self.page = page
         self.label = label
         self.opens = opens
         self.parts = ui.column().classes("lab-sections w-full gap-0")
-        self.rows: dict[str, ui.element] = {}
+        self.rows: dict[str, KeyRow] = {}
         self.expansions: dict[str, ui.expansion] = {}
-        self.inputs: dict[str, ui.input | ui.select] = {}
         self.scene = ""
-        self.fields: dict[str, forms.FormField] = {}
-        self.last_typed: dict[str, str] = {}
-        self.labels: dict[str, ui.label] = {}
 
     def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         """Show the fields of the current scene. Open groups stay open, and text being typed is kept."""
-        by_key = {field.key: field for fields in groups.values() for field in fields}
-        same = [(key, field.allowed_values) for key, field in by_key.items()] == [
-            (key, field.allowed_values) for key, field in self.fields.items()
+        shown = [field for fields in groups.values() for field in fields]
+        same = [(field.key, field.allowed_values) for field in shown] == [
+            (key, row.field.allowed_values) for key, row in self.rows.items()
         ]
         scene = self.page.state.scene
         if self.scene == scene and same:
-            for key, field in by_key.items():
-                self.update_field(field, self.fields[key])
+            for field in shown:
+                self.update_row(self.rows[field.key], field)
         else:
             self.build(groups)
         self.scene = scene
-        self.fields = by_key
 
     def build(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
         open_now = open_now if self.expansions else {self.opens}
         self.parts.clear()
-        for elements in (
-            self.expansions,
-            self.last_typed,
-            self.rows,
-            self.labels,
-            self.inputs,
-        ):
-            elements.clear()
+        self.expansions.clear()
+        self.rows.clear()
         with self.parts:
             for name, fields in groups.items():
                 box = ui.expansion(name, group=f"keys-{id(self)}", value=name in open_now)
@@ -136,9 +144,7 @@ class KeyForm:
                 f"key-{field.key}"
             )
             entry.props(f'hide-bottom-space aria-label="{field.key}"')
-        self.rows[field.key] = box
-        self.inputs[field.key] = entry
-        self.labels[field.key] = head
+        self.rows[field.key] = KeyRow(field, box, head, entry, field.shown)
 
     def style_class(self, field: forms.FormField) -> str:
         """Style class of a key: changed by the user, set in a file, or default."""
@@ -148,25 +154,27 @@ class KeyForm:
         )
         return "warn" if changed else "given" if field.is_set else "quiet"
 
-    def update_field(self, field: forms.FormField, before: forms.FormField) -> None:
-        """Update a field after the scene has changed; text typed since then is kept."""
-        self.labels[field.key].classes(remove="warn given quiet", add=self.style_class(field))
+    def update_row(self, row: KeyRow, field: forms.FormField) -> None:
+        """Update a key after the scene has changed; text typed since then is kept."""
+        before = row.field
+        row.field = field
+        row.label.classes(remove="warn given quiet", add=self.style_class(field))
         if field.shown != before.shown and (
             not field.allowed_values or field.shown in field.allowed_values
         ):
-            self.last_typed[field.key] = field.shown
-            self.inputs[field.key].set_value(field.shown)
+            row.typed = field.shown
+            row.entry.set_value(field.shown)
             self.show_error(field.key, "")
 
     async def edit(self, key: str, *_: object) -> None:
         """Apply a typed value, or show the reason of its refusal at the field."""
-        value = str(self.inputs[key].value)
-        current = self.fields[key].shown
-        if value == self.last_typed.get(key, current):
+        row = self.rows[key]
+        value = str(row.entry.value)
+        if value == row.typed:
             return  # leaving a field after Enter reports the same value again
-        self.last_typed[key] = value
+        row.typed = value
         self.show_error(key, "")
-        if value == current:
+        if value == row.field.shown:
             return
         before = self.page.state.overrides
         try:
@@ -174,7 +182,7 @@ class KeyForm:
                 forms.with_value, self.page.state.scene, before, key, value
             )
         except InputError as error:
-            self.show_error(key, error.fault if error.key == key else for_page(error))
+            self.show_error(key, error.fault if error.key == key else live.for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())
@@ -186,9 +194,9 @@ class KeyForm:
 
     def show_error(self, key: str, message: str) -> None:
         """Show an error message at a field if the field still exists; an empty message removes it."""
-        entry = self.inputs.get(key)
-        if entry is None:
+        if key not in self.rows:
             return
+        entry = self.rows[key].entry
         if message:
             entry.props("error").props["error-message"] = message
         else:
@@ -209,7 +217,9 @@ class ScenePanel:
         Scene and overrides in the form
     """
 
-    def __init__(self, page: PageContext, folder: Path, saved: Callable[[], None]) -> None:
+    def __init__(
+        self, page: context.PageContext, folder: Path, saved: Callable[[], None]
+    ) -> None:
         self.page = page
         self.folder = folder
         self.saved = saved
@@ -241,11 +251,11 @@ class ScenePanel:
     def filter(self) -> None:
         """Show only keys that contain the search text, and sections with such keys."""
         text = (self.find.value or "").lower()
-        for key, box in self.form.rows.items():
-            box.set_visibility(text in key.lower())
-        visible = {
-            field.section for key, field in self.form.fields.items() if text in key.lower()
-        }
+        visible = set()
+        for key, row in self.form.rows.items():
+            row.box.set_visibility(text in key.lower())
+            if text in key.lower():
+                visible.add(row.field.section)
         for section, expansion in self.form.expansions.items():
             expansion.set_visibility(section in visible)
         self.no_match.set_visibility(not visible)
@@ -265,7 +275,7 @@ class ScenePanel:
     async def save(self) -> None:
         name = (self.name.value or "").strip()
         info = self.page.scene_info
-        title_before = info.title.removesuffix(", changed") if info else ""
+        title_before = info.scene.title.removesuffix(", changed") if info else ""
         title = f"{title_before}, changed" if title_before else name
         state = self.page.state
         path = await self.page.run_here(
@@ -297,7 +307,7 @@ class TrackerPanel:
         Scene and overrides in the form
     """
 
-    def __init__(self, page: PageContext, study: MonteCarloPanel) -> None:
+    def __init__(self, page: context.PageContext, study: MonteCarloPanel) -> None:
         self.page = page
         self.study = study
         self.shown: tuple[str, Mapping[str, str]] | None = None
@@ -346,8 +356,8 @@ class TrackerPanel:
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()
-            entry = self.form.inputs.get(
+            row = self.form.rows.get(
                 f"tracker.{'detector' if group == SENSOR else 'identifier'}"
             )
-            if entry:
-                ui.timer(FOCUS_S, partial(keys.focus, entry), once=True)
+            if row:
+                ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import FlightRow, MotionLog
+from skysim.apps.gui.messages import Curves, FlightRow
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.core.types import Floats
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
@@ -103,7 +105,7 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 def strips(
     rows: Sequence[FlightRow],
-    log: MotionLog,
+    log: Curves,
     residuals: Sequence[tuple[float, int, float]] = (),
 ) -> list[Strip]:
     """Return the strips for which a flight has data.
@@ -114,48 +116,46 @@ def strips(
         Residuals of the identified lights, as in `FlightStep`
     """
 
-    def of_frames(value: Callable[[FlightRow], float]) -> Points:
-        pairs = ((row.t_s, value(row)) for row in rows)
-        return [point(t_s, y) for t_s, y in pairs if not math.isnan(y)]
+    fields = FlightRow._fields
+    of = dict(zip(fields, np.array(rows, float).reshape(-1, len(fields)).T, strict=True))
+
+    def of_frames(name: str, values: Floats, kind: str = "line") -> StripCurve:
+        known = ~np.isnan(values)
+        return StripCurve(name, [*map(point, of["t_s"][known], values[known])], kind)
 
     def of_motion(name: str) -> StripCurve:
-        values = log.curves.get(name, ())
-        return StripCurve(name, [point(*pair) for pair in zip(log.t_s, values, strict=False)])
+        return StripCurve(name, [*map(point, log.get("t_s", ()), log.get(name, ()))])
 
     found = [
         Strip(
             "cross-boresight error, ″",
             (
-                StripCurve(
-                    "tracker", of_frames(lambda row: max(row.cross_arcsec, 1e-3)), "dots"
-                ),
-                StripCurve("3σ", of_frames(lambda row: 3 * row.cross_sigma_arcsec), "band"),
+                of_frames("tracker", np.maximum(of["cross_arcsec"], 1e-3), "dots"),
+                of_frames("3σ", 3 * of["cross_sigma_arcsec"], "band"),
             ),
             logarithmic=True,
         ),
         Strip(
             "roll error, ″",
             (
-                StripCurve("tracker", of_frames(lambda row: row.roll_arcsec), "dots"),
-                StripCurve("−3σ", of_frames(lambda row: -3 * row.roll_sigma_arcsec), "band"),
-                StripCurve("+3σ", of_frames(lambda row: 3 * row.roll_sigma_arcsec), "band"),
+                of_frames("tracker", of["roll_arcsec"], "dots"),
+                of_frames("−3σ", -3 * of["roll_sigma_arcsec"], "band"),
+                of_frames("+3σ", 3 * of["roll_sigma_arcsec"], "band"),
             ),
         ),
         Strip(
             "attitude error, ″",
             (
                 *map(of_motion, ("pointing", "IMU alone", "filter")),
-                StripCurve(
-                    "innovation", of_frames(lambda row: row.innovation_arcsec), "dots"
-                ),
+                of_frames("innovation", of["innovation_arcsec"], "dots"),
             ),
             logarithmic=True,
         ),
         Strip(
             "lights",
             (
-                StripCurve("in the field", of_frames(lambda row: row.lights)),
-                StripCurve("identified", of_frames(lambda row: row.identified)),
+                of_frames("in the field", of["lights"]),
+                of_frames("identified", of["identified"]),
             ),
         ),
         Strip("residual of each light, px", dots=thinned(residuals)),
@@ -167,7 +167,7 @@ def strips(
 
 def point(t_s: float, value: float) -> list[float]:
     """A point of a curve, rounded to the digits that are drawn."""
-    return [round(t_s, 4), float(f"{value:.5g}")]
+    return [float(f"{t_s:.4f}"), float(f"{value:.5g}")]
 
 
 def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
@@ -325,13 +325,12 @@ def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
 
 def rms_line(rows: Sequence[FlightRow]) -> str:
     """Root mean squares over the flight's solved frames, and how many were solved."""
-    solved = [row for row in rows if not math.isnan(row.cross_arcsec)]
+    solved = [
+        (row.cross_arcsec, row.roll_arcsec)
+        for row in rows
+        if not math.isnan(row.cross_arcsec)
+    ]
     if not solved:
         return f"{len(rows)} frames, none solved" if rows else ""
-    cross, roll = (
-        math.hypot(*errors) / math.sqrt(len(solved))
-        for errors in zip(
-            *((row.cross_arcsec, row.roll_arcsec) for row in solved), strict=True
-        )
-    )
+    cross, roll = np.sqrt(np.mean(np.square(solved), axis=0))
     return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"

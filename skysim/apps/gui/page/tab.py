@@ -14,28 +14,24 @@ from typing import Any
 from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.page import monte_carlo_panel, readouts
+from skysim.apps.gui.page import (
+    head,
+    history,
+    log_panel,
+    monte_carlo_panel,
+    photo_panel,
+    plan_panel,
+    readouts,
+    run_panel,
+    settings_panel,
+)
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.page.head import Arrangement, Head
-from skysim.apps.gui.page.history import History
-from skysim.apps.gui.page.log_panel import LogPanel
-from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
-from skysim.apps.gui.page.photo_panel import PhotoPanel
-from skysim.apps.gui.page.plan_panel import PlanPanel
-from skysim.apps.gui.page.readouts import AttitudeCard, LightsPanel
-from skysim.apps.gui.page.run_panel import RunPanel
-from skysim.apps.gui.page.settings_panel import ScenePanel, TrackerPanel
-from skysim.apps.gui.views import forms, keys, style
-from skysim.apps.gui.views.live import Contents, for_page
-from skysim.apps.gui.views.overlay import FRAMES
-from skysim.apps.gui.views.sensor import SensorView
-from skysim.apps.gui.views.space import Scene3D
+from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
-from skysim.scene.loader import load
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
@@ -58,8 +54,8 @@ class Tab:
         Live cameras that it may watch
     user
         Its browser, by `server.user_of`
-    state, scene_info, view, is_open
-        As in `Shown`
+    state, scene_info, view, is_open, message_text
+        As in `PageContext`
     contents
         Contents of the fields that change with every frame
     editing, filling
@@ -68,6 +64,12 @@ class Tab:
 
     session: Session
     new_session: Callable[[], Session | None]
+
+    scene_info: SceneInfo | None = None
+    view: FrameView | None = None
+    is_open = True
+    message_text = ""
+    restarting = False
 
     def __init__(
         self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = ""
@@ -78,18 +80,14 @@ class Tab:
         self.out = out
         self.cameras = cameras
         self.state = PageView(scene)
-        self.scene_info: SceneInfo | None = None
-        self.view: FrameView | None = None
-        self.is_open = True
-        self.restarting = False
-        self.contents = Contents()
+        self.contents = live.Contents()
         self.editing = asyncio.Lock()
         self.filling = asyncio.Lock()
 
     async def close(self) -> None:
         """Release frames, study and worker of the tab after its browser has gone."""
         self.is_open = False
-        FRAMES.pop(self.id, None)
+        overlay.FRAMES.pop(self.id, None)
         self.study_panel.close()
         if hasattr(self, "session"):
             await asyncio.to_thread(self.session.close)
@@ -128,13 +126,13 @@ class Tab:
             dark_page=style.DARK["ground"],
         )
         with ui.element("div").classes("lab"):
-            self.head = Head(self, self.contents, self.folder)
-            self.sensor = SensorView(self.id, self.contents)
+            self.head = head.Head(self, self.contents, self.folder)
+            self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with ui.element("div").classes("lab-side"):
-                Arrangement.splitter("side", "vertical", "Width of the panels")
-                self.attitude = AttitudeCard(self, self.contents)
+                head.Arrangement.splitter("side", "vertical", "Width of the panels")
+                self.attitude = readouts.AttitudeCard(self, self.contents)
                 await self.build_panels()
             with ui.element("div").classes("lab-keys").mark("keys"):
                 for key in keys.KEYS:
@@ -144,8 +142,12 @@ class Tab:
                             sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
-        self.history = History(self, self.state.scene, self.show_query, self.is_settling)
-        self.arrangement = Arrangement([self.run_panel.strips.chart, self.study_panel.chart])
+        self.history = history.History(
+            self, self.state.scene, self.show_query, self.is_settling
+        )
+        self.arrangement = head.Arrangement(
+            [self.run_panel.strips.chart, self.study_panel.chart]
+        )
         self.actions = Actions(
             self, self.sensor, self.run_panel.step, self.performers(), self.commands()
         )
@@ -156,8 +158,8 @@ class Tab:
     async def build_panels(self) -> None:
         with ui.element("div").classes("lab-panes"):
             with ui.element("div").classes("lab-space-pane"):
-                self.scene_3d = Scene3D(self, self.sensor)
-            Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
+                self.scene_3d = space.Scene3D(self, self.sensor)
+            head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
                 "dense align=left no-caps indicator-color=primary"
             ) as self.tabs:
@@ -169,24 +171,30 @@ class Tab:
                 self.tabs, value=PANELS[0], animated=False, keep_alive=True
             ).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
-                    self.lights = LightsPanel(self.sensor)
+                    self.lights = readouts.LightsPanel(self.sensor)
                 with ui.tab_panel("Scene"):
-                    self.scene_panel = ScenePanel(self, self.folder, self.head.update_scenes)
+                    self.scene_panel = settings_panel.ScenePanel(
+                        self, self.folder, self.head.update_scenes
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.run_panel = RunPanel(self, self.contents, self.sensor)
+                    self.run_panel = run_panel.RunPanel(self, self.contents, self.sensor)
                 with ui.tab_panel("Plan"):
-                    self.plan_panel = PlanPanel(self, self.scene_3d, self.run_panel)
+                    self.plan_panel = plan_panel.PlanPanel(
+                        self, self.scene_3d, self.run_panel
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Monte Carlo"):
-                    self.study_panel = MonteCarloPanel(self, self.out, self.user, self.id)
+                    self.study_panel = monte_carlo_panel.MonteCarloPanel(
+                        self, self.out, self.user, self.id
+                    )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
-                    self.tracker_panel = TrackerPanel(self, self.study_panel)
+                    self.tracker_panel = settings_panel.TrackerPanel(self, self.study_panel)
                 with ui.tab_panel("Image"):
-                    self.photo = PhotoPanel(self, self.cameras)
+                    self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
-                    self.log_panel = LogPanel(self)
+                    self.log_panel = log_panel.LogPanel(self)
         self.tabs.on_value_change(self.fill_form)
 
     def update_lights(self) -> None:
@@ -215,30 +223,21 @@ class Tab:
         """Further commands: flight, history, arrangement, panels and exports."""
         return [
             Command(
-                "show the next frame of the flight", ".", partial(self.run_panel.step, 1)
+                "show the next frame of the flight", partial(self.run_panel.step, 1), "."
             ),
             Command(
-                "show the previous frame of the flight", ",", partial(self.run_panel.step, -1)
+                "show the previous frame of the flight", partial(self.run_panel.step, -1), ","
             ),
-            Command("undo the last change", "Ctrl Z", self.history.undo),
-            Command("redo the change that was undone", "Ctrl Shift Z", self.history.redo),
+            Command("undo the last change", self.history.undo, "Ctrl Z"),
+            Command("redo the change that was undone", self.history.redo, "Ctrl Shift Z"),
+            Command("compute the flight of the scene, or stop that", self.run_panel.simulate),
+            Command("change between the dark and the light theme", self.arrangement.toggle),
             Command(
-                "compute the flight of the scene, or stop that", "", self.run_panel.simulate
+                "give frame, 3-D view and panels their first sizes", self.arrangement.reset
             ),
-            Command(
-                "change between the dark and the light theme", "", self.arrangement.toggle
-            ),
-            Command(
-                "give frame, 3-D view and panels their first sizes",
-                "",
-                self.arrangement.reset,
-            ),
+            *(Command(f"panel: {name}", partial(self.show_panel, name)) for name in PANELS),
             *(
-                Command(f"panel: {name}", "", partial(self.show_panel, name))
-                for name in PANELS
-            ),
-            *(
-                Command(f"export: {name}", "", partial(self.head.export, name))
+                Command(f"export: {name}", partial(self.head.export, name))
                 for name in image_export.FILE_BY_ITEM
             ),
         ]
@@ -285,7 +284,7 @@ class Tab:
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
         except InputError as error:
-            self.show_message(for_page(error))
+            self.show_message(live.for_page(error))
             return
         if wanted:
             await self.restore(wanted)
@@ -346,9 +345,8 @@ class Tab:
                 )
             return False
         self.scene_info, view = result
-        control = (await asyncio.to_thread(load, path, overrides)).motion.control
         self.set_state(scene=scene, overrides=overrides)
-        self.set_scene(self.scene_info, control.feedback if control else None)
+        self.set_scene(self.scene_info)
         self.show_live_view(view)
         self.scene_panel.shown = self.tracker_panel.shown = (
             None  # the file of this name may have changed
@@ -357,19 +355,13 @@ class Tab:
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
 
-    def set_scene(self, info: SceneInfo, feedback: str | None) -> None:
-        """Show a new scene in all parts of the page.
-
-        Parameters
-        ----------
-        feedback
-            Feedback of its controller; None without a controller
-        """
+    def set_scene(self, info: SceneInfo) -> None:
+        """Show a new scene in all parts of the page."""
         self.head.set_scene(info)
         self.attitude.set_scene(info)
         self.scene_3d.set_scene(info)
         self.sensor.clear_zoom()
-        self.run_panel.set_scene(feedback)
+        self.run_panel.set_scene(info)
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
 
@@ -385,7 +377,7 @@ class Tab:
 
     async def fill_form(self) -> None:
         """Show the keys of the current scene in the panel of keys that is open; not in others, as it takes a while."""
-        panels: dict[str, ScenePanel | TrackerPanel] = {
+        panels: dict[str, settings_panel.ScenePanel | settings_panel.TrackerPanel] = {
             "Scene": self.scene_panel,
             "Tracker": self.tracker_panel,
         }
@@ -410,11 +402,6 @@ class Tab:
         """Whether every frame is solved."""
         return bool(self.head.identify.value)
 
-    @property
-    def message_text(self) -> str:
-        """The message in the page header."""
-        return self.head.message_text
-
     def set_state(self, **changes: Any) -> None:
         """Change fields of the page's view, and the banner."""
         self.state = replace(self.state, **changes)
@@ -430,7 +417,8 @@ class Tab:
         """
         self.set_state(**state)
         self.view = view
-        self.attitude.show(view)
+        assert self.scene_info is not None
+        self.attitude.show(view, self.scene_info)
         self.scene_3d.show(view)
         self.sensor.show(view, self.scene_info)
 
@@ -446,8 +434,8 @@ class Tab:
             Changes of the fields of `PageView`
         """
         self.set_state(**state)
-        self.attitude.show_photo(photo)
-        self.sensor.show_photo(photo)
+        self.attitude.show(photo, photo)
+        self.sensor.show(photo, photo)
 
     def show_panel(self, name: str) -> None:
         """Open one of PANELS."""
@@ -463,6 +451,7 @@ class Tab:
         """Show a message in the page header until the next action; warnings are also logged."""
         if text == self.message_text:
             return
+        self.message_text = text
         self.head.set_message(text, color)
         if text and color == "warn":
             self.log(text)
@@ -479,7 +468,7 @@ class Tab:
             result = await self.session.run(task, *arguments)
         except InputError as error:
             if self.is_open:
-                self.show_message(for_page(error))
+                self.show_message(live.for_page(error))
             return None
         except WorkerLost as error:
             if self.is_open and not self.restarting:
@@ -497,7 +486,7 @@ class Tab:
         try:
             return await run.io_bound(function, *arguments)
         except InputError as error:
-            self.show_message(for_page(error))
+            self.show_message(live.for_page(error))
             return None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:

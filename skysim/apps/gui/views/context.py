@@ -10,8 +10,10 @@ from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
 
 
-class Shown(Protocol):
-    """The contents of the page.
+class PageContext(Protocol):
+    """The page for its parts: its contents, requests to its worker, and notifications.
+
+    If a request fails, the error is shown in the page header, and the result is None or False.
 
     Attributes
     ----------
@@ -29,22 +31,16 @@ class Shown(Protocol):
         Whether the browser still has the page
     """
 
-    @property
-    def state(self) -> PageView: ...
-    @property
-    def scene_info(self) -> SceneInfo | None: ...
-    @property
-    def view(self) -> FrameView | None: ...
-    @property
-    def message_text(self) -> str: ...
+    state: PageView
+    scene_info: SceneInfo | None
+    view: FrameView | None
+    is_open: bool
+    message_text: str
+
     @property
     def solving(self) -> bool: ...
-    @property
-    def is_open(self) -> bool: ...
 
-
-class Asked(Protocol):
-    """Requests to the worker. An error is shown in the page header, and the result is None or False."""
+    # Requests to the worker.
 
     async def ask(self, task: str, *arguments: Any) -> Any:
         """Return the result of a task."""
@@ -77,9 +73,7 @@ class Asked(Protocol):
     ) -> None:
         """Reopen the scene with further overrides and without some."""
 
-
-class Notified(Protocol):
-    """How a part notifies the page."""
+    # Notifications.
 
     def show_message(self, text: str, color: str = "warn") -> None:
         """Show a message in the page header until the next action."""
@@ -88,7 +82,7 @@ class Notified(Protocol):
         """Add a line to the log."""
 
     def set_state(self, **changes: Any) -> None:
-        """Change fields of `Shown.state`."""
+        """Change fields of `state`."""
 
     def show_frame(self, view: FrameView, **state: Any) -> None:
         """Show a frame of the scene in all views.
@@ -96,7 +90,7 @@ class Notified(Protocol):
         Parameters
         ----------
         state
-            Changes of `Shown.state` that belong to the frame
+            Changes of `state` that belong to the frame
         """
 
     def show_photo(self, image: Photo, /, **state: Any) -> None:
@@ -105,7 +99,7 @@ class Notified(Protocol):
         Parameters
         ----------
         state
-            Changes of `Shown.state` that belong to the image
+            Changes of `state` that belong to the image
         """
 
     def stop_playback(self) -> None:
@@ -113,7 +107,3 @@ class Notified(Protocol):
 
     def show_panel(self, name: str) -> None:
         """Open a panel by its name."""
-
-
-class PageContext(Shown, Asked, Notified, Protocol):
-    """The page for its parts: its contents, requests to its worker, and notifications."""

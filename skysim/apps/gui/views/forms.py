@@ -15,8 +15,8 @@ from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.units import SI_SUFFIX, si_unit
-from skysim.core.yaml_reader import read_yaml, set_key
+from skysim.core.units import si_unit
+from skysim.core.yaml_reader import read_yaml
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
@@ -158,7 +158,7 @@ def section_fields(
         Kinds that the section could have instead of its own
     """
     for name, info in type(model).model_fields.items():
-        file_key = info.alias or SI_SUFFIX.sub("", name)
+        file_key = info.alias or name
         key = f"{prefix}{file_key}"
         value = getattr(model, name)
         is_set = isinstance(tree, dict) and file_key in tree
@@ -387,9 +387,7 @@ def field_override(
 
 def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:
     """Overrides that close the loop with another feedback (a key of FEEDBACKS); "" removes controller and maneuver."""
-    tree = read(find(name))[0]
-    for key, value in overrides.items():
-        set_key(tree, key, value)
+    tree = with_overrides(read(find(name))[0], overrides)
     control = expand_control(tree.get("motion", {}).get("control"))
     if not feedback or control is None:
         return {"motion.control": "null", "motion.maneuver": "[]"}

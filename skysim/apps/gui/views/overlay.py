@@ -9,14 +9,21 @@ import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import compress
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
 import numpy as np
 from nicegui import json
 from numpy.typing import NDArray
 
-from skysim.apps.gui.messages import LIMITS, Display, LightColumns, Pixels, TrackerResult
-from skysim.apps.gui.worker.session import WorkerLost
+from skysim.apps.gui.messages import (
+    LIMITS,
+    Display,
+    LightColumns,
+    Pixels,
+    TrackerResult,
+    places_px,
+)
+from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
@@ -39,6 +46,7 @@ UNSOLVED_TICKS = 60  # number of brightest true lights with marks in a frame wit
 NAMES: dict[Any, str] = read_yaml(DATA / "star_names.yaml")[0]
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
+T = TypeVar("T")
 Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
@@ -62,15 +70,17 @@ def marks(
     """
     detections = result.detections if result else ()
     ids = [one.id for one in detections]
-    found_px = np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
+    found_px = places_px(detections)
     is_identified = np.array(ids, np.int64) >= 0
     visible = lights[:MAX_TRUTH_MARKS]
     offset_px = np.abs(
         lights.xy_px[:, None] - found_px
     )  # of each true light and each detection
-    near = (offset_px < NEAR_PX).all(axis=2)
+    near = np.all(offset_px < NEAR_PX, axis=2)
     bright = bright_count(visible, ids, near[: len(visible)])
-    is_false = ~near.any(axis=0) & bool(len(lights))  # without true lights it is not known
+    is_false = ~np.any(near, axis=0) & bool(
+        len(lights)
+    )  # without true lights it is not known
     true = rounded(visible.xy_px)
     found = rounded(found_px)
     points: Mapping[str, Points] = {
@@ -129,15 +139,6 @@ FRAMES: dict[str, TabFrames] = {}  # frames by tab
 IDLE_S = 2.0  # time without a frame after which a stream ends: a browser has six connections for all tabs
 
 
-class Source(Protocol):
-    """The session of a tab, whose worker has all pixels of its newest images."""
-
-    display: Display | None
-
-    async def run(self, task: str, *arguments: Any) -> Any:
-        """Run a task of the worker."""
-
-
 @dataclass(frozen=True)
 class ServedFrame:
     """A frame of a tab.
@@ -146,11 +147,13 @@ class ServedFrame:
     ----------
     fields
         Further data for frame.js: pointing, marks, contents of live fields
+    source
+        Session of the tab, whose worker has all pixels of its newest images
     """
 
     pixels: Pixels
     fields: Mapping[str, Any]
-    source: Source
+    source: Session
 
     async def response(self, display: Display, whole: bool) -> bytes | None:
         """Header, pixels, fields as JSON, and the length of the fields as an unsigned integer of 32 bits.
@@ -218,7 +221,7 @@ class TabFrames:
         """
         self.newest[number] = frame
         self.added_s = time.monotonic()
-        self.newest.pop(min(self.newest) if len(self.newest) > KEPT_FRAMES else -1, None)
+        self.newest.pop(number - KEPT_FRAMES, None)
         self.alone = number if alone else self.alone
         if self.waiting is None or self.drawn < self.alone:
             self.announce(number)
@@ -261,34 +264,28 @@ def display_of(query: Mapping[str, str]) -> Display | None:
     near
         Column and row
     limits
-        A name or two values in DN
+        A name or two finite values in DN, the lower one first
     curve
         A name
     """
     try:
-        screen_px = pair(query.get("screen", "0,0"))
-        near_px = pair(query["near"]) if query.get("near") else None
-        limits = limits_from(query.get("limits", LIMITS[0]))
-        curve = query.get("curve", next(iter(CURVES)))
+        screen_px = two(int, query.get("screen", "0,0"))
+        near_px = two(int, query["near"]) if query.get("near") else None
+        limits: Any = query.get("limits", LIMITS[0])
+        if limits not in LIMITS:
+            limits = two(float, limits)
     except ValueError:
         return None
-    return Display(screen_px, limits, curve, near_px) if limits and curve in CURVES else None
+    curve = query.get("curve", next(iter(CURVES)))
+    is_allowed = (
+        all(0 <= px <= MAX_SCREEN_PX for px in (*screen_px, *(near_px or ())))
+        and (limits in LIMITS or -math.inf < limits[0] < limits[1] < math.inf)
+        and curve in CURVES
+    )
+    return Display(screen_px, limits, curve, near_px) if is_allowed else None
 
 
-def pair(text: str) -> tuple[int, int]:
-    """Two numbers of pixels. Raises ValueError."""
-    first, second = (int(word) for word in text.split(","))
-    if not (0 <= first <= MAX_SCREEN_PX and 0 <= second <= MAX_SCREEN_PX):
-        raise ValueError
+def two(kind: Callable[[str], T], text: str) -> tuple[T, T]:
+    """Two numbers separated by a comma. Raises ValueError."""
+    first, second = map(kind, text.split(","))
     return first, second
-
-
-def limits_from(text: str) -> str | tuple[float, float] | None:
-    """Parse the limits of the display: a name in LIMITS, or two numbers separated by a comma.
-
-    Returns None if the numbers are not finite or do not increase. Raises ValueError for any other text.
-    """
-    if text in LIMITS:
-        return text
-    low, high = (float(word) for word in text.split(","))
-    return (low, high) if math.isfinite(low) and math.isfinite(high) and low < high else None

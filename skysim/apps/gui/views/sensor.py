@@ -7,7 +7,6 @@ import base64
 import functools
 import math
 from collections.abc import Collection
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
@@ -24,23 +23,14 @@ from skysim.apps.gui.messages import (
     Lens,
     LightColumns,
     LightRow,
-    Pixels,
     Pose,
     SceneInfo,
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import overlay, widgets
-from skysim.apps.gui.views.live import Contents, LiveText
-from skysim.apps.gui.views.overlay import (
-    FRAMES,
-    NAMES,
-    ServedFrame,
-    Source,
-    TabFrames,
-    display_of,
-)
+from skysim.apps.gui.views import live, overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.session import Session
 from skysim.core.types import Floats
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
@@ -48,7 +38,7 @@ from skysim.sources.bodies import NAMES as BODIES
 FIRST_START = (
     "The first frame on a machine takes up to a minute, because the code is compiled."
 )
-LABELS = NAMES | BODIES  # names of lights by number
+LABELS = overlay.NAMES | BODIES  # names of lights by number
 STRETCHES = list(plots.CURVES)
 COLOR_MAPS = {
     "gray": None,
@@ -83,27 +73,28 @@ class SensorView:
         The newest frames
     """
 
-    source: Source
+    source: Session
 
-    def __init__(self, id: str, contents: Contents) -> None:
+    result: TrackerResult | None = None
+    prefix = "HIP"
+    lens: Lens | None = None
+    pose: Pose | None = None
+    statistics = ""  # numbers of the frame, shown while no light is under the mouse
+    hover_px: tuple[float, float] | None = None
+    sent_number = 0
+
+    def __init__(self, id: str, contents: live.Contents) -> None:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
         self.lights: LightColumns = NO_LIGHTS
-        self.result: TrackerResult | None = None
         self.size_px = (4, 3)
-        self.prefix = "HIP"
-        self.lens: Lens | None = None
-        self.pose: Pose | None = None
-        self.statistics = ""  # numbers of the frame, shown while no light is under the mouse
-        self.hover_px: tuple[float, float] | None = None
-        self.sent_number = 0
-        self.frames = TabFrames(self.announce)
+        self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
         with ui.element("div").classes("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
-                self.hover = LiveText(contents).classes("mono").mark("hover")
+                self.hover = live.LiveText(contents).classes("mono").mark("hover")
             with (
                 self.canvas.add_slot("wait"),
                 ui.element("div").classes("lab-wait") as self.wait,
@@ -113,7 +104,6 @@ class SensorView:
                 self.wait_label = ui.label().mark("wait")
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
-        self.canvas.on("choose", self.light_chosen)
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
         self.canvas.on("drawn", self.drawn)
         self.update_display()
@@ -165,23 +155,14 @@ class SensorView:
         self.canvas.run_method("fit")
 
     def toggle(self, kind: str, on: bool) -> None:
-        self.shown = self.shown | {kind} if on else self.shown - {kind}
-        self.update_marks()
+        """Show a kind of marks, or no more: send the marks of the newest frame again.
 
-    def display_image(self, pixels: Pixels, alone: bool) -> None:
-        """Display a new image, as large as the window allows.
-
-        Parameters
-        ----------
-        alone
-            As in `TabFrames.add`
+        It is a message, since NiceGUI sends all properties if one changes.
         """
-        if not self.sent_number:
-            self.wait.set_visibility(False)
-        self.sent_number += 1  # so that each frame has its own address
-        fields = self.fields() | {"contents": self.contents.take()}
-        FRAMES[self.id] = self.frames
-        self.frames.add(self.sent_number, ServedFrame(pixels, fields, self.source), alone)
+        self.shown = self.shown | {kind} if on else self.shown - {kind}
+        self.canvas.run_method(
+            "show", {"src": self.address(self.sent_number)} | self.fields()
+        )
 
     def announce(self, number: int) -> None:
         """Let the browser request a frame."""
@@ -191,7 +172,7 @@ class SensorView:
         """Handle the browser's report of a drawn frame, and of its display for the next ones."""
         self.frames.drawn = int(event.args["src"].rpartition("/")[2])
         self.frame_drawn.set()
-        display = display_of(dict(parse_qsl(str(event.args["display"]))))
+        display = overlay.display_of(dict(parse_qsl(str(event.args["display"]))))
         if display:
             self.source.display = display
 
@@ -204,32 +185,26 @@ class SensorView:
             except TimeoutError:
                 return
 
-    def show(self, view: FrameView, info: SceneInfo | None) -> None:
-        """Show a frame of the scene."""
-        self.prefix = info.prefix if info else "HIP"
-        self.statistics = statistics_text(
-            view.size_px, view.statistics, view.result, view, info
-        )
-        self.take(view, info.lens if info else None)
-
-    def show_photo(self, photo: Photo) -> None:
-        """Show a user's image or the frame of a study's trial."""
-        self.prefix = photo.prefix
-        self.statistics = statistics_text(photo.size_px, photo.statistics, photo.result)
-        self.take(photo, photo.lens)
-
-    def take(self, view: FrameView | Photo, lens: Lens | None) -> None:
-        """Store lights, solution and pointing of a new image, and display it."""
-        self.lights = view.lights
-        self.result = view.result
-        self.size_px = view.size_px
-        self.pose = view.pose
-        is_new_lens = lens is not self.lens
+    def show(self, image: FrameView | Photo, of: SceneInfo | Photo) -> None:
+        """Show a frame of a scene, or another image: a user's, or the frame of a study's trial."""
+        self.prefix = of.prefix
+        self.statistics = statistics_text(image, of)
+        self.lights = image.lights
+        self.result = image.result
+        self.size_px = image.pixels.fields["size"]
+        self.pose = image.pose
+        is_new_lens = of.lens is not self.lens
         if is_new_lens:
-            self.lens = lens
-            self.canvas.run_method("setLens", asdict(lens) if lens else None)
+            self.lens = of.lens
+            self.canvas.run_method("setLens", of.lens)
         self.update_text()
-        self.display_image(view.pixels, alone=is_new_lens)
+        if not self.sent_number:
+            self.wait.set_visibility(False)
+        self.sent_number += 1  # so that each frame has its own address
+        fields = self.fields() | {"contents": self.contents.take()}
+        overlay.FRAMES[self.id] = self.frames
+        served = overlay.ServedFrame(image.pixels, fields, self.source)
+        self.frames.add(self.sent_number, served, alone=is_new_lens)
 
     def update_text(self) -> None:
         """Show data on the light under the mouse, or else the frame's numbers."""
@@ -242,16 +217,10 @@ class SensorView:
     def fields(self) -> dict[str, Any]:
         """Further data for frame.js: pointing and marks."""
         view = {
-            "pose": pose_fields(self.pose) if self.pose else None,
+            "pose": self.pose,
             "label": self.description(),
         }
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
-
-    def update_marks(self) -> None:
-        """Send the marks of the newest frame again, as a message: NiceGUI sends all properties if one changes."""
-        self.canvas.run_method(
-            "show", {"src": self.address(self.sent_number)} | self.fields()
-        )
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
@@ -267,15 +236,11 @@ class SensorView:
         return LABELS.get(id, f"HIP {id}" if id < 1_000_000 else f"star {id}")
 
     def hover_changed(self, event: Any) -> None:
-        """Handle a move of the mouse to another light, or to none."""
-        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
-        self.update_text()
+        """Handle a move of the mouse to another light, or to none, or a click.
 
-    def light_chosen(self, event: Any) -> None:
-        """Handle a click: the data of the light stay on the page until the mouse is on another one."""
-        self.hover_px = (
-            (event.args["x"], event.args["y"]) if event.args["id"] is not None else None
-        )
+        After a click the data of the light stay on the page until the mouse is on another one.
+        """
+        self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
 
     def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
@@ -322,41 +287,30 @@ class SensorView:
         return "\n".join(lines)
 
 
-def pose_fields(pose: Pose) -> dict[str, Any]:
-    """A pose for frame.js."""
-    fields: dict[str, Any] = {"rotation": pose.rotation}
-    return fields | (
-        {"place_m": pose.place_m, "depth_m": pose.depth_m} if pose.depth_m else {}
-    )
-
-
 @functools.cache
 def color_table(name: str) -> str:
     """256 x (red, green, blue) of a color map, base64."""
     ramp = np.arange(256, dtype=np.uint8)[:, None]
     kind = COLOR_MAPS[name]
     if kind is None:
-        table = np.repeat(ramp, 3, axis=1)
-        return base64.b64encode(
-            (255 - table if "inverted" in name else table).tobytes()
-        ).decode()
-    return base64.b64encode(cv2.applyColorMap(ramp, kind)[:, 0, ::-1].tobytes()).decode()
+        table = np.repeat(255 - ramp if "inverted" in name else ramp, 3, axis=1)
+    else:
+        table = cv2.applyColorMap(ramp, kind)[:, 0, ::-1]
+    return base64.b64encode(table.tobytes()).decode()
 
 
-def statistics_text(
-    size_px: tuple[int, int],
-    statistics: plots.FrameStatistics,
-    result: TrackerResult | None,
-    view: FrameView | None = None,
-    scene_info: SceneInfo | None = None,
-) -> str:
-    """A frame's numbers in two columns; fewer if the image is not of the scene (view is None)."""
-    field = ("field", f"{scene_info.field_deg:.4g}°") if scene_info else ("", "")
-    rows = [("frame", f"{size_px[0]} × {size_px[1]} px", *field)]
-    if view:
-        rows += [
-            ("exposure", f"{1e3 * view.exposure_s:.4g} ms", "rendering", f"{view.ms:.0f} ms")
-        ]
+def statistics_text(image: FrameView | Photo, of: SceneInfo | Photo) -> str:
+    """An image's numbers in two columns; fewer if it is not of a scene."""
+    statistics = image.statistics
+    result = image.result
+    field = ("field", f"{of.field_deg:.4g}°") if isinstance(of, SceneInfo) else ("", "")
+    width, height = image.pixels.fields["size"]
+    rows = [("frame", f"{width} × {height} px", *field)]
+    lights: tuple[str, ...] = ()
+    if isinstance(image, FrameView):
+        lights = ("lights", f"{len(image.lights)} in the field")
+        exposure = f"{1e3 * image.exposure_s:.4g} ms"
+        rows += [("exposure", exposure, "rendering", f"{image.ms:.0f} ms")]
     rows += [
         ("sky", f"{statistics.sky_dn:.5g} DN", "scatter", f"{statistics.scatter_dn:.3g} DN"),
         (
@@ -366,7 +320,6 @@ def statistics_text(
             f"{statistics.saturated} px",
         ),
     ]
-    lights = ("lights", f"{len(view.lights)} in the field") if view else ()
     detected = (
         ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
     )

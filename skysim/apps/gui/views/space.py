@@ -6,7 +6,6 @@ A drag pulls at a point of the vehicle; frames show the motion.
 from __future__ import annotations
 
 import asyncio
-import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,12 +16,10 @@ from nicegui import ui
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.views.context import PageContext
+from skysim.apps.gui.views import context, style
 from skysim.apps.gui.views.sensor import SensorView
-from skysim.apps.gui.views.style import DARK, color_scale
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats
-from skysim.dynamics.multibody import Shape
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -31,9 +28,6 @@ VIEWS = {
     "top": "from above",
 }
 UPDATE_S = 0.1
-AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
-MOST_AXIS_M = 1.2
-DIGITS = 5  # decimals of lengths in meters
 COAST_S = 60.0  # time after a drag until the vehicle is stopped
 
 
@@ -49,10 +43,10 @@ class Scene3D:
     newest_view
         Newest frame, which is not sent yet
     waits
-        Whether `send_newest` will be called
+        Whether `update` will be called
     """
 
-    def __init__(self, page: PageContext, sensor: SensorView) -> None:
+    def __init__(self, page: context.PageContext, sensor: SensorView) -> None:
         self.page = page
         self.sensor = sensor
         self.newest_view: FrameView | None = None
@@ -63,8 +57,9 @@ class Scene3D:
                 button = ui.button(
                     name, color=None, on_click=lambda name=name: self.look(name)
                 )
-                button.props("dense outline size=xs")
-                button.props(f'title="look {text}"').mark(f"look-{name}")
+                button.props(f'dense outline size=xs title="look {text}"').mark(
+                    f"look-{name}"
+                )
         hint = ui.label(
             "drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom"
         )
@@ -76,51 +71,33 @@ class Scene3D:
         self.canvas.run_method("look", name)
 
     def set_scene(self, scene_info: SceneInfo) -> None:
-        lab = scene_info.geometry
-        outside = lab.views["outside"]
-        distance_m = math.dist(outside.eye_m, outside.target_m)
-        self.canvas.run_method(
-            "build",
-            {
-                "shapes": [shape_fields(shape) for shape in lab.shapes],
-                "lights": {
-                    "id": lab.ids.tolist(),
-                    "place": lab.lights_m.round(DIGITS).ravel().tolist(),
-                    "radius": lab.radius_m.round(DIGITS).tolist(),
-                    "lit": lab.lit.tolist(),
-                },
-                "views": {name: view._asdict() for name, view in lab.views.items()},
-                "background": DARK["ground"],
-                "prefix": scene_info.prefix,
-                "axis": min(AXIS * distance_m, MOST_AXIS_M),
-            },
-        )
+        fields = {"background": style.DARK["ground"], "prefix": scene_info.prefix}
+        self.canvas.run_method("build", scene_info.geometry | fields)
 
     def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""
-        colors = (f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * color_scale(values))
-        self.canvas.run_method("color", list(zip(ids.tolist(), colors, strict=True)))
+        colors = (
+            f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * style.color_scale(values)
+        )
+        self.canvas.run_method("color", list(zip(ids, colors, strict=True)))
 
     def show(self, view: FrameView) -> None:
         """Send the attitude after a delay, so that of many frames in a short time only the last one is sent."""
         self.newest_view = view
         if not self.waits:
             self.waits = True
-            asyncio.get_running_loop().call_later(UPDATE_S, self.send_newest)
-
-    def send_newest(self) -> None:
-        self.waits = False
-        self.update()
+            asyncio.get_running_loop().call_later(UPDATE_S, self.update)
 
     def update(self) -> None:
         """Send the vehicle's attitude, and the lights that are in the frame or identified."""
         view = self.newest_view
         self.newest_view = None
+        self.waits = False
         if view is None or not self.page.is_open:
             return
         found = view.result.detections if view.result else ()
         identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
-        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
+        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
 
@@ -141,9 +118,14 @@ class PushControl:
         Token of the motion whose frames are being computed; None if there is none
     """
 
+    grip: Grip | None = None
+    before: Triple | None = None
+    motion: object | None = None
+    held_s = 0.0
+
     def __init__(
         self,
-        page: PageContext,
+        page: context.PageContext,
         sensor: SensorView,
         canvas: ui.element,
         moved: Callable[[], None],
@@ -151,25 +133,18 @@ class PushControl:
         self.page = page
         self.sensor = sensor
         self.moved = moved
-        self.grip: Grip | None = None
-        self.before: Triple | None = None
-        self.motion: object | None = None
-        self.held_s = 0.0
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
         with ui.element("div").classes("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
-            button = (
-                ui.button("reset", color=None, on_click=self.reset)
-                .props("dense outline size=xs")
-                .mark("push-reset")
-            )
-            button.props('title="back to the attitude before the push"')
+            ui.button("reset", color=None, on_click=self.reset).props(
+                'dense outline size=xs title="back to the attitude before the push"'
+            ).mark("push-reset")
         self.bar.set_visibility(False)
 
     async def gripped(self, event: Any) -> None:
         """Handle a drag of the vehicle."""
-        grip = Grip(tuple(event.args["held"]), tuple(event.args["wanted"]))
+        grip = Grip(event.args["held"], event.args["wanted"])
         view = self.page.view
         if self.motion is None and view:
             self.page.stop_playback()  # forgets grip and attitude of an earlier push
@@ -216,18 +191,3 @@ class PushControl:
         self.stop()
         if before:
             await self.page.show_live("point", before, self.page.solving)
-
-
-def shape_fields(shape: Shape) -> dict[str, Any]:
-    """A shape for space.js."""
-    return {
-        "name": shape.name,
-        "kind": shape.kind,
-        "size": shape.size_m,
-        "position": shape.position_m,
-        "wxyz": shape.parent_from_shape_wxyz,
-        "rgba": shape.rgba,
-        "on_vehicle": shape.on_vehicle,
-        "vertices": shape.vertices_m.round(DIGITS).ravel().tolist(),
-        "faces": shape.faces.ravel().tolist(),
-    }

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 from urllib.parse import parse_qsl, urlencode
 
@@ -114,12 +114,7 @@ class PageView:
 
     def same_step(self, other: PageView) -> bool:
         """Whether only attitude or time differ, which change continuously."""
-        return self.coarse == other.coarse
-
-    @property
-    def coarse(self) -> tuple[Any, ...]:
-        """The values whose changes a user undoes one by one."""
-        return self.scene, dict(self.overrides), self.kind, self.study, self.trial, self.photo
+        return self == replace(other, angles_deg=self.angles_deg, t_s=self.t_s)
 
     @property
     def banner(self) -> str:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.apps.gui.messages import LabGeometry, Lens, LookFrom, Pose
+from skysim.apps.gui.messages import Lens, Pose
+from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
@@ -28,12 +29,33 @@ from skysim.tracking.onboard_model import calibration
 MAX_STARS = 600
 MAX_LEDS = 4000
 WIDE_DEG = 100.0  # field of the view from the bearing
+AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
+MOST_AXIS_M = 1.2
+DIGITS = 5  # decimals of lengths in meters
 
 
-def lab_geometry(lab: Lab) -> LabGeometry:
-    """Geometry of a lab: the shapes of its MJCF file, its lights, and the places to look from."""
+def lab_geometry(lab: Lab) -> dict[str, Any]:
+    """Geometry of a lab for space.js; meters in the lab frame unless stated otherwise.
+
+    It has the shapes of the MJCF file that `skysim scenes export` writes, without the lights; the lights, stars on a
+    sphere; the places to look from, by name; and the length of the drawn axes.
+    """
     model = multibody.laboratory(lab.export_mjcf())
-    return LabGeometry(model.shapes, *lights(lab.camera.sources), views(lab, model))
+    ids, place_m, radius_m, lit = lights(lab.camera.sources)
+    return {
+        "shapes": [
+            shape._asdict() | {"vertices_m": shape.vertices_m.round(DIGITS)}
+            for shape in model.shapes
+        ],
+        "lights": {
+            "id": ids,
+            "place": place_m.round(DIGITS).ravel(),
+            "radius": radius_m.round(DIGITS),
+            "lit": lit,
+        },
+        "views": views(lab, model),
+        "axis": min(AXIS * math.dist(model.eye_m, model.target_m), MOST_AXIS_M),
+    }
 
 
 def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
@@ -55,8 +77,12 @@ def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray
     return sources.id[rows], position_m, radius_m, power[rows] > 0
 
 
-def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
-    """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above."""
+def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
+    """The places to look from: outside, from the camera along its boresight, from the bearing up, and from above.
+
+    Each is a place, a target and the direction up, in the lab frame, or in body axes if the place is on the vehicle;
+    the vertical field of view, deg; and whether it is on the vehicle.
+    """
     camera = lab.scene.camera
     mount = lab.camera.mount
     body_from_cam = mount.cam_from_body.inv()
@@ -65,22 +91,14 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, LookFrom]:
     field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
     up = np.array([0.0, 0.0, 1.0])
     north = np.array([0.0, 1.0, 0.0])
-    ahead, above = body_from_cam.apply([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    ahead = body_from_cam.apply([0.0, 0.0, 1.0])
+    above = body_from_cam.apply([0.0, -1.0, 0.0])
     return {
-        "outside": look_from(model.eye_m, model.target_m, up, FOVY_DEG),
-        "camera": look_from(pupil_m, pupil_m + ahead, above, field_deg, on_vehicle=True),
-        "bearing": look_from(np.zeros(3), up, north, WIDE_DEG),
-        "top": look_from(model.target_m + height_m * up, model.target_m, north, FOVY_DEG),
+        "outside": (model.eye_m, model.target_m, up, FOVY_DEG, False),
+        "camera": (pupil_m, pupil_m + ahead, above, field_deg, True),
+        "bearing": (np.zeros(3), up, north, WIDE_DEG, False),
+        "top": (model.target_m + height_m * up, model.target_m, north, FOVY_DEG, False),
     }
-
-
-def look_from(
-    eye_m: Floats, target_m: Floats, up: Floats, fov_deg: float, on_vehicle: bool = False
-) -> LookFrom:
-    eye, target, upwards = (
-        (float(x), float(y), float(z)) for x, y, z in (eye_m, target_m, up)
-    )
-    return LookFrom(eye, target, upwards, fov_deg, on_vehicle)
 
 
 # Directions of a frame's pixels, for the browser.
@@ -94,7 +112,7 @@ def lens_of(camera: Camera) -> Lens:
     x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
     y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
     tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    return Lens(NODES, *(tuple(column.tolist()) for column in tangents.T))
+    return Lens(NODES, *tangents.T.copy())
 
 
 def scene_lens(lab: Lab) -> Lens:
@@ -105,7 +123,7 @@ def scene_lens(lab: Lab) -> Lens:
 def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
     lab_from_cam = truth.cam_from_lab.inv()
-    rotation = tuple(lab_from_cam.as_matrix().ravel().tolist())
+    rotation = lab_from_cam.as_matrix().ravel()
     if not isinstance(lab.scene.light, DomeConfig):
         return Pose(rotation)
     place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
@@ -113,11 +131,9 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     length = np.linalg.norm(rays_cam, axis=1)
     dome = surface.build_surface(lab.scene.light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
-    # Depths along the boresight; NaN where a ray meets nothing.
+    # Depths along the boresight, to 0.01 mm; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
-    # To 0.01 mm; None for such a ray.
-    depths_m = (None if math.isnan(depth) else round(depth, 5) for depth in depth_m.tolist())
-    return Pose(rotation, tuple(place_m.tolist()), tuple(depths_m))
+    return Pose(rotation, place_m, depth_m.round(5))
 
 
 # Camera pointing: from typed angles, or by rotations about the camera's own axes, which have no singularity.
@@ -218,6 +234,8 @@ class Push:
     simulation
         Dynamics with gravity, drag, cable, tilt stop and the rotors' momentum, without
         disturbances and controller
+    start_s, end_s
+        Times between which frame 0 shows the motion
     lab_from_body
         The present attitude
     torque_nm
@@ -227,18 +245,15 @@ class Push:
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
         require_vehicle(lab.scene)
         self.lab = lab
-        kept_s = self.exposure_s + MAX_ADVANCE_S
+        window = exposure_window(lab.scene, 0)
+        self.start_s = window.open_s - MARGIN_S
+        self.end_s = window.close_s(lab.scene.camera.height_px) + MARGIN_S
+        kept_s = self.end_s - self.start_s + MAX_ADVANCE_S
         self.simulation = multibody.Simulation(
             lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s
         )
         self.lab_from_body = lab_from_body
         self.torque_nm = np.zeros(3)
-
-    @property
-    def exposure_s(self) -> float:
-        """Duration of the motion that a frame shows."""
-        window = exposure_window(self.lab.scene, 0)
-        return window.close_s(self.lab.scene.camera.height_px) - window.open_s + 2 * MARGIN_S
 
     def advance(self, grip: Grip | None, elapsed_s: float) -> None:
         """Integrate for a time with a torque that follows the vehicle; without a grip there is none."""
@@ -246,31 +261,24 @@ class Push:
         period = round(PERIOD_S / simulation.step_s)
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
-            lab_from_body = Rotation.from_quat(
-                simulation.lab_from_body_wxyz, scalar_first=True
-            )
             self.torque_nm = pull_torque_nm(
-                grip, lab_from_body, self.lab.vehicle.inertia_kg_m2
+                grip, self.lab_from_body, self.lab.vehicle.inertia_kg_m2
             )
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
             simulation.advance(control)
-        self.lab_from_body = Rotation.from_quat(
-            simulation.lab_from_body_wxyz, scalar_first=True
-        )
+            self.lab_from_body = quaternion.to_rotation(simulation.lab_from_body_wxyz)
 
     def seen(self) -> Trajectory:
         """A trajectory whose frame 0 ends now; before the motion the vehicle is at rest."""
-        window = exposure_window(self.lab.scene, 0)
-        end_s = window.close_s(self.lab.scene.camera.height_px) + MARGIN_S
-        begin = self.simulation.step - math.ceil(self.exposure_s / self.simulation.step_s)
+        shown_s = self.end_s - self.start_s
+        begin = self.simulation.step - math.ceil(shown_s / self.simulation.step_s)
         motion = self.simulation.trajectory(max(begin, self.simulation.first_step))
-        t_s = motion.t_s + end_s - self.simulation.now_s
+        t_s = motion.t_s + self.end_s - self.simulation.now_s
         attitudes = motion.lab_from_body
         rates = motion.rate_body_rad_s
-        start_s = window.open_s - MARGIN_S
-        if t_s[0] > start_s:
-            t_s = np.append(start_s, t_s)
+        if t_s[0] > self.start_s:
+            t_s = np.append(self.start_s, t_s)
             rates = np.concatenate([np.zeros((1, 3)), rates])
             attitudes = Rotation.concatenate([attitudes[:1], attitudes])
         return Trajectory(t_s, attitudes, rates)

@@ -26,21 +26,11 @@ from skysim.apps.gui.messages import (
     Triple,
 )
 from skysim.apps.gui.worker import geometry as lenses
-from skysim.apps.gui.worker.workbench import (
-    detection_views,
-    id_prefix,
-    magnitude_by_id,
-    matches_by_row,
-    tracker_result,
-    true_lights,
-)
+from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import runner, store
-from skysim.experiments.study.execution.setups import prepared_setup
-from skysim.experiments.study.execution.store import STORE
-from skysim.experiments.study.execution.trials import run_block
+from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.results import plots, scoring
 
 
@@ -54,7 +44,7 @@ class Photo:
         As in `FrameView`
     lens
         Lens for the pose; both are None if the image was not solved
-    names, true_deg
+    names, angles_deg
         Names of the three angles, and their true values if known
     lights, prefix
         True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
@@ -62,7 +52,6 @@ class Photo:
         Likely cause of a refusal, or assumption about a solved file
     """
 
-    size_px: tuple[int, int]
     result: TrackerResult
     solution: dict[str, Any]
     statistics: plots.FrameStatistics
@@ -71,7 +60,7 @@ class Photo:
     lens: Lens | None = None
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
-    true_deg: Triple | None = None
+    angles_deg: Triple | None = None
     lights: LightColumns = NO_LIGHTS
     prefix: str = "HIP"
     hint: str = ""
@@ -112,27 +101,25 @@ def photo_from_file(
 def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     """Repeat a study's trial: its first frame with the tracker's solution."""
     plan = study_file.load(study)
-    with store.open_store(folder / STORE) as stored:
+    with store.open_store(folder / store.STORE) as stored:
         segment = runner.segment_of(plan, stored, trial)
-    (row,) = run_block(plan.spec, segment)
-    setup = prepared_setup(plan.spec, segment.settings)
+    (row,) = trials.run_block(plan.spec, segment)
+    setup = setups.prepared_setup(plan.spec, segment.settings)
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    result = tracker_result(setup.lab, setup.estimator, frame, truth, report)
+    result = workbench.tracker_result(setup.lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(
             row.error.strip().splitlines()[-1], result.detections, result.ms
         )
     scene = setup.lab.scene
-    (height, width) = frame.image_dn.shape
     photo = Photo(
-        (width, height),
         result,
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        true_deg=scoring.true_angles_deg(setup.lab.camera, truth),
-        lights=true_lights(truth, magnitude_by_id(setup.lab)),
-        prefix=id_prefix(setup.lab),
+        angles_deg=scoring.true_angles_deg(setup.lab.camera, truth),
+        lights=workbench.true_lights(truth, workbench.magnitude_by_id(setup.lab)),
+        prefix=workbench.id_prefix(setup.lab),
         saturation_dn=frame.saturation_dn,
         lens=(lens := lenses.scene_lens(setup.lab)),
         pose=lenses.scene_pose(setup.lab, lens, truth),
@@ -154,22 +141,21 @@ def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> P
 def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoPixels:
     """The photo for the page of an image that a tracker has solved or refused."""
     attitude = report.attitude
-    detections = detection_views(
-        report, matches_by_row(tracker, attitude, report.centroids.xy_px)
-    )
     solution = plate_solver.solution_fields(report) if attitude.solved else {}
     angles: Triple | None = (
         (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
     )
     result = TrackerResult(
-        attitude.status, detections, 1e3 * sum(report.seconds.values()), angles
+        attitude.status,
+        workbench.detections_of(tracker, report),
+        1e3 * sum(report.seconds.values()),
+        angles,
     )
-    height, width = image.shape
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)
-    photo = Photo((width, height), result, solution, statistics)
+    lens: Lens | None = None
+    pose: Pose | None = None
     if attitude.cam_from_ref is not None:
         lens = lenses.lens_of(attitude.camera or tracker.camera)
-        pose = Pose(tuple(attitude.cam_from_ref.inv().as_matrix().ravel().tolist()))
-        photo = replace(photo, lens=lens, pose=pose)
-    return replace(photo, saturation_dn=saturation_dn), image
+        pose = Pose(attitude.cam_from_ref.inv().as_matrix().ravel())
+    return Photo(result, solution, statistics, NO_PIXELS, saturation_dn, lens, pose), image

@@ -22,7 +22,6 @@ from skysim.core.jit import jit
 from skysim.results import plots
 
 LEVELS = 2**16 - 1
-HEADER_BYTES = 16
 # Shade of saturated pixels, and number of the other shades.
 SATURATED = 255
 SHADES = 255
@@ -50,7 +49,7 @@ class PixelLevels(NamedTuple):
 
     def data(self) -> bytes:
         """Offset and step as float64, then the integers."""
-        return header(self) + self.integers.tobytes()
+        return np.array([self.offset, self.step]).tobytes() + self.integers.tobytes()
 
 
 def levels_of(image: NDArray) -> PixelLevels:
@@ -64,25 +63,6 @@ def levels_of(image: NDArray) -> PixelLevels:
     high = float(image.max())
     step = (high - low) / LEVELS or 1.0
     return PixelLevels(np.rint((image - low) / step).astype(np.uint16), low, step)
-
-
-def header(levels: PixelLevels) -> bytes:
-    return np.array([levels.offset, levels.step]).tobytes()
-
-
-def levels_from(data: bytes, size_px: tuple[int, int]) -> PixelLevels:
-    """Return the levels that `PixelLevels.data` has encoded.
-
-    Parameters
-    ----------
-    size_px
-        Width and height of the image
-    """
-    offset, step = np.frombuffer(data, float, 2).tolist()
-    kind = np.uint8 if len(data) - HEADER_BYTES == math.prod(size_px) else np.uint16
-    return PixelLevels(
-        np.frombuffer(data, kind, offset=HEADER_BYTES).reshape(size_px[::-1]), offset, step
-    )
 
 
 def pixels_for(
@@ -100,10 +80,12 @@ def pixels_for(
         Number of the image in its worker
     """
     integers = levels.integers
-    (height, width) = levels.integers.shape
+    (height, width) = integers.shape
     limits = limits_of(levels, display.limits)
     saturation = (saturation_dn - levels.offset) / levels.step
-    columns = columns_for(display, width, height)
+    # The columns of the screen that the image fills; 0 if all pixels are needed.
+    scale = min(display.screen_px[0] / width, display.screen_px[1] / height)
+    columns = math.floor(width * scale + 0.5)
     shaded = 0 < columns < WORTHWHILE * width
     drawn = (
         shades(integers, columns, limits, saturation, display.curve) if shaded else integers
@@ -123,14 +105,7 @@ def pixels_for(
             "y": y,
             "levels": integers[y:, x:][:LOUPE_PX, :LOUPE_PX].tolist(),
         }
-    return Pixels(header(levels) + drawn.tobytes(), fields, display, number)
-
-
-def columns_for(display: Display, width: int, height: int) -> int:
-    """The columns of the screen that an image fills; 0 if all pixels are needed."""
-    return math.floor(
-        width * min(display.screen_px[0] / width, display.screen_px[1] / height) + 0.5
-    )
+    return Pixels(levels._replace(integers=drawn).data(), fields, display, number)
 
 
 def shades(
@@ -266,5 +241,5 @@ def histogram(integers: NDArray) -> dict[str, Any]:
         "range": (low, high),
         "sky": float(sky),
         "scatter": scatter,
-        "counts": counts.tolist(),
+        "counts": counts,
     }

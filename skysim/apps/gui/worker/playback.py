@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import tempfile
 import time
 from collections.abc import Iterator
@@ -13,14 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import (
+    Curves,
     FlightRow,
     FlightStep,
     FrameView,
-    MotionLog,
     TrackerResult,
 )
-from skysim.apps.gui.worker import pixels
-from skysim.apps.gui.worker.workbench import Workbench, tracker_result
+from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
@@ -42,13 +42,13 @@ class KeptFrame:
     Attributes
     ----------
     place
-        Place of the pixels in the file, and their number of bytes; None if they are rendered
-        again, which gives the same bits
+        Place of the pixels in the file; None if they are rendered again, which gives the same
+        bits
     """
 
     view: FrameView
     report: Report
-    place: tuple[int, int] | None
+    place: int | None
 
 
 class Playback:
@@ -66,7 +66,7 @@ class Playback:
         Number of frames reported by `advance`
     """
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: workbench.Workbench) -> None:
         self.bench = bench
         self.frames = list[KeptFrame]()
         self.file = tempfile.TemporaryFile()  # noqa: SIM115
@@ -92,41 +92,35 @@ class Playback:
                     self.add(shot)
         new = self.frames[self.reported :]
         self.reported = len(self.frames)
-        log = self.flight.telemetry() if is_done or new else None
-        if log is not None:
-            for frame in new:
-                frame.view = with_filter_errors(frame, log, self.bench.lab.camera.mount)
-        views = [frame.view for frame in new]
-        return FlightStep(
-            is_done,
-            self.flight.now_s,
-            self.flight.duration_s,
-            tuple(map(frame_row, views)),
-            curves(log) if log is not None else None,
-            tuple(row for view in views for row in light_residuals(view)),
-        )
+        rows: list[FlightRow] = []
+        drawn: Curves | None = None
+        if is_done or new:
+            log = self.flight.telemetry()
+            rows = [frame_row(frame, log, self.bench.lab.camera.mount) for frame in new]
+            drawn = curves(log)
+        residuals = [one for frame in new for one in light_residuals(frame.view)]
+        flight = self.flight
+        return FlightStep(is_done, flight.now_s, flight.duration_s, rows, drawn, residuals)
 
     def add(self, shot: Shot) -> None:
         """Keep a shot, and its pixels if the file has room."""
         bench = self.bench
         assert shot.report is not None
-        solved = tracker_result(
-            bench.lab, bench.estimator, shot.frame, shot.truth, shot.report
-        )
-        view = bench.frame_view(shot.frame, shot.truth, solved, sum(shot.seconds.values()))
+        seconds = sum(shot.seconds.values())
+        view = bench.frame_view(shot.frame, shot.truth, shot.report, seconds)
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(
             KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
         )
 
-    def keep(self, frame: Frame) -> tuple[int, int] | None:
+    def keep(self, frame: Frame) -> int | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
-        data = pixels.levels_of(frame.image_dn).data()
-        begin = self.file.seek(0, 2)
-        if begin + len(data) > KEPT_BYTES:
+        levels = pixels.levels_of(frame.image_dn)
+        place = self.file.seek(0, 2)
+        if place + levels.integers.nbytes > KEPT_BYTES:
             return None
-        self.file.write(data)
-        return begin, len(data)
+        pickle.dump(levels, self.file)
+        return place
 
     def show(self, index: int) -> tuple[FrameView, pixels.PixelLevels]:
         """The view of a kept frame and its pixels; its attitude becomes that of the workbench."""
@@ -134,13 +128,13 @@ class Playback:
         bench = self.bench
         self.shown = index
         bench.frame = None
-        bench.lab_from_body = quaternion.to_rotation(np.array(kept.view.body_wxyz))
+        bench.lab_from_body = quaternion.to_rotation(kept.view.body_wxyz)
         if kept.place is None:
             self.render()
             assert bench.frame is not None
             return kept.view, pixels.levels_of(bench.frame.image_dn)
-        self.file.seek(kept.place[0])
-        return kept.view, pixels.levels_from(self.file.read(kept.place[1]), kept.view.size_px)
+        self.file.seek(kept.place)
+        return kept.view, pickle.load(self.file)
 
     def render(self) -> None:
         """Render the shown frame with its truth, unless a later frame of the scene has been rendered."""
@@ -152,13 +146,23 @@ class Playback:
         bench.report = kept.report
 
 
-def frame_row(view: FrameView) -> FlightRow:
-    """A frame of a flight in numbers."""
+def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
+    """A frame of a flight in numbers, with those of the attitude filter from the flight's telemetry."""
+    view = kept.view
     result = view.result or NO_RESULT
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
+    filter_arcsec = innovation_arcsec = math.nan
+    if log.lab_from_filter is not None:
+        n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
+        lab_from_filter = log.lab_from_filter[n]
+        filter_arcsec = angle_arcsec(lab_from_filter, log.lab_from_body[n])
+        cam_from_lab = kept.report.attitude.cam_from_ref
+        if cam_from_lab is not None:
+            lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+            innovation_arcsec = angle_arcsec(lab_from_body, lab_from_filter)
     counts = len(view.lights), result.identified
-    return FlightRow(view.t_s, *errors, *counts, view.filter_arcsec, view.innovation_arcsec)
+    return FlightRow(view.t_s, *errors, *counts, filter_arcsec, innovation_arcsec)
 
 
 def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
@@ -168,7 +172,7 @@ def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
             yield view.t_s, spot.id, spot.residual_px
 
 
-def curves(log: Telemetry) -> MotionLog:
+def curves(log: Telemetry) -> Curves:
     """Curves of true and estimated attitude errors (arcsec), momentum (N m s) and rate (deg/s), decimated."""
     attitudes = {
         "pointing": log.lab_from_ref,
@@ -181,26 +185,11 @@ def curves(log: Telemetry) -> MotionLog:
         if (error_deg := telemetry_report.attitude_error_deg(attitude, log.lab_from_body))
         is not None
     }
+    values["t_s"] = log.t_s
     values["momentum"] = np.linalg.norm(log.momentum_nms, axis=1)
     values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
     every = max(len(log.t_s) // MAX_POINTS, 1)
-    thinned = {name: tuple(curve[::every].tolist()) for name, curve in values.items()}
-    return MotionLog(tuple(log.t_s[::every].tolist()), thinned)
-
-
-def with_filter_errors(kept: KeptFrame, log: Telemetry, mount: Mount) -> FrameView:
-    """A frame's view with the error of the filter, and the angle between the tracker's attitude and the filter's."""
-    view = kept.view
-    if log.lab_from_filter is None:
-        return view
-    n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
-    lab_from_filter = log.lab_from_filter[n]
-    view = replace(view, filter_arcsec=angle_arcsec(lab_from_filter, log.lab_from_body[n]))
-    cam_from_lab = kept.report.attitude.cam_from_ref
-    if cam_from_lab is None:
-        return view
-    lab_from_body = cam_from_lab.inv() * mount.cam_from_body
-    return replace(view, innovation_arcsec=angle_arcsec(lab_from_body, lab_from_filter))
+    return {name: curve[::every] for name, curve in values.items()}
 
 
 def angle_arcsec(first: Rotation, second: Rotation) -> float:

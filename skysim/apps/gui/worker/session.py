@@ -20,6 +20,8 @@ if TYPE_CHECKING:  # the template sets the environment of numba before it is imp
     from skysim.apps.gui.messages import Display
 
 TEMPLATE = "skysim.apps.gui.template"  # module of the worker from which the others are forked
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload([TEMPLATE])
 SCENE = "SKYSIM_GUI_SCENE"  # environment variable: the scene that the template of the workers sets up
 STOPPED = "the worker of this page has stopped"
 QUEUE_S = 0.2  # interval of looking for a free worker
@@ -32,7 +34,7 @@ class WorkerLost(Exception):
 def serve(pipe: Connection) -> None:
     """Main loop of the worker, until the pipe closes.
 
-    It receives (task, arguments, display), and sends ("ok", result) or ("error", InputError).
+    It receives (task, arguments, display), and sends the result or an InputError.
     """
     worker = importlib.import_module(TEMPLATE).WORKER
     signal.signal(
@@ -44,15 +46,15 @@ def serve(pipe: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            pipe.send(("ok", getattr(worker, task)(*arguments)))
+            pipe.send(getattr(worker, task)(*arguments))
         except InputError as error:
-            pipe.send(("error", error))
+            pipe.send(error)
         except ImageError as error:
-            pipe.send(("error", InputError("", error)))
+            pipe.send(InputError("", error))
         except MemoryError:
-            pipe.send(("error", InputError("", "not enough memory")))
+            pipe.send(InputError("", "not enough memory"))
         except Exception as error:  # a bug in one task must not end the worker
-            pipe.send(("error", InputError("", f"{type(error).__name__}: {error}")))
+            pipe.send(InputError("", f"{type(error).__name__}: {error}"))
 
 
 class Session:
@@ -70,10 +72,8 @@ class Session:
     alive: ClassVar[set[Session]] = set()
 
     def __init__(self) -> None:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload([TEMPLATE])
-        self.pipe, self.worker_pipe = context.Pipe()
-        self.process = context.Process(target=serve, args=(self.worker_pipe,), daemon=True)
+        self.pipe, self.worker_pipe = CONTEXT.Pipe()
+        self.process = CONTEXT.Process(target=serve, args=(self.worker_pipe,), daemon=True)
         self.thread = ThreadPoolExecutor(1, "session")
         self.thread.submit(self.start)
         Session.alive.add(self)
@@ -98,10 +98,10 @@ class Session:
         """Send a task and wait for its result; runs in the session's thread."""
         try:
             self.pipe.send((task, arguments, self.display))
-            status, reply = self.pipe.recv()
+            reply = self.pipe.recv()
         except (EOFError, OSError) as error:
             raise WorkerLost(STOPPED) from error
-        if status == "error":
+        if isinstance(reply, InputError):
             raise reply
         return reply
 
@@ -140,7 +140,6 @@ class Workers:
             File of the scene that it sets up
         """
         os.environ[SCENE] = scene
-        multiprocessing.get_context("forkserver").set_forkserver_preload([TEMPLATE])
         forkserver.ensure_running()
 
     def take(self) -> Session | None:

@@ -17,7 +17,6 @@ from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution import store
-from skysim.experiments.study.execution.store import STORE
 from skysim.results import metrics
 
 RESPONSES = {  # label on the page by response
@@ -52,7 +51,6 @@ class StudyResults(NamedTuple):
     """
 
     done: int
-    wrong: int
     statistics: dict[str, tuple[float, float, float]]
     bins: tuple[float, ...]
     counts: tuple[int, ...]
@@ -137,7 +135,7 @@ class StudyProcess:
 
     def results(self) -> StudyResults | None:
         """Results in the store so far; None before the first trial is done."""
-        path = self.folder / STORE
+        path = self.folder / store.STORE
         if not path.is_file():
             return None
         try:
@@ -153,9 +151,7 @@ class StudyProcess:
         error_arcsec = metrics.QUANTITIES["angle_arcsec"](columns)
         bins, heights = histogram(error_arcsec[np.isfinite(error_arcsec)])
         failed = (*raised, *unsolved(columns))[:MAX_FAILED]
-        return StudyResults(
-            counts["done"], counts["wrong"], statistics, bins, heights, failed
-        )
+        return StudyResults(counts["done"], statistics, bins, heights, failed)
 
 
 def unsolved(columns: Mapping[str, Any]) -> list[tuple[int, str]]:
@@ -202,7 +198,9 @@ def finished(folder: Path, user: str) -> list[Path]:
     """Folders of the studies that have a report and are shown to a user, newest first."""
     folders = (path.parent for path in folder.glob("*/report.html"))
     shown = [
-        path for path in folders if (path / STORE).is_file() and is_shown(path.name, user)
+        path
+        for path in folders
+        if (path / store.STORE).is_file() and is_shown(path.name, user)
     ]
     return sorted(shown, key=lambda path: -(path / "report.html").stat().st_mtime)
 

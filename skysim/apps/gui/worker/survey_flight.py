@@ -25,9 +25,6 @@ from skysim.experiments.dome_survey import (
     survey_procedure,
     survey_report,
 )
-from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
@@ -60,10 +57,10 @@ class Survey:
 
     scene: Scene
     lab: Lab
-    before: CalibrationPrior
+    before: survey_prior.CalibrationPrior
     noise_px: float
     taken: list[TakenFrame] = field(default_factory=list)
-    run: SurveyRun | None = None
+    run: survey_findings.SurveyRun | None = None
 
     def is_of(self, scene: Scene) -> bool:
         """Whether a scene is the surveyed one, apart from its sections `motion` and `exposure`."""
@@ -99,32 +96,19 @@ class Survey:
             so_far = survey_findings.coverage_before(
                 frames, self.before, UNCERTAINTY, self.noise_px
             )
-        counts = survey_findings.coverage_statistics(so_far)
-        found = SurveyFound(
-            frames=len(taken),
-            missed=missed,
-            seen_once=counts["seen_once"],
-            unseen=counts["unseen"],
-            refusal=refusal,
-            ids=so_far.model.leds.id,
-            known=known_share(run),
-            plan=self.next_plan(so_far, len(taken), count),
-        )
+        statistics = survey_findings.coverage_statistics(so_far)
+        del statistics["by_led"]
+        statistics |= {"frames": len(taken), "missed": missed, "refusal": refusal}
+        faults: list[str] = []
         if run:
-            truth = survey_report.truth_statistics(run, self.before, self.lab)
-            faults = survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
-            found = found._replace(
-                connected=int(run.survey.tied.sum()),
-                measured=counts["measured"],
-                renamed=truth["renamed"],
-                sigma_mm=1e3 * run.accuracy.led_rms_m,
-                before_mm=truth["led_mm_before"],
-                error_mm=truth["led_mm_after"],
-                faults=tuple(faults),
-            )
+            statistics |= survey_report.truth_statistics(run, self.before, self.lab)
+            statistics["connected"] = int(run.survey.tied.sum())
+            statistics["sigma_mm"] = 1e3 * run.accuracy.led_rms_m
+            faults += survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
+        plan = self.next_plan(so_far, len(taken), count)
         self.taken = taken
         self.run = run or self.run
-        return found
+        return SurveyFound(statistics, faults, so_far.model.leds.id, known_share(run), plan)
 
     def new_frames(
         self, flight: Flight, views: Sequence[FrameView]
@@ -153,23 +137,25 @@ class Survey:
         new = []
         for row in (row for row in rows if row not in known):
             frame, _ = flight.render(row)
-            lab_from_body = quaternion.to_rotation(np.array(views[row].body_wxyz))
+            lab_from_body = quaternion.to_rotation(views[row].body_wxyz)
             lights = survey_frames.detect_lights(settings, camera, frame.image_dn)
             new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
 
-    def with_imu(self, taken: Sequence[TakenFrame]) -> list[SurveyFrame]:
+    def with_imu(self, taken: Sequence[TakenFrame]) -> list[survey_frames.SurveyFrame]:
         """Frames with the IMU's attitudes."""
         lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
         measured = survey_frames.imu_attitudes(
             self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad
         )
         return [
-            SurveyFrame(frame.lights, at, frame.row)
+            survey_frames.SurveyFrame(frame.lights, at, frame.row)
             for frame, at in zip(taken, measured, strict=True)
         ]
 
-    def next_plan(self, so_far: Coverage, taken: int, count: int) -> SurveyPlan:
+    def next_plan(
+        self, so_far: survey_findings.Coverage, taken: int, count: int
+    ) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
         margin_px = self.before.margin_px
         further = survey_findings.next_stops(
@@ -234,8 +220,8 @@ def survey_plan(
     shown
         (F, N) whether an attitude shows an LED
     """
-    angles = tuple(tuple(row) for row in euler_deg(lab_from_body).tolist())
-    return SurveyPlan(angles, tuple(shown.sum(axis=1).tolist()), shown.shape[1], steps)
+    angles = euler_deg(lab_from_body).tolist()
+    return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
 
 
 def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:
@@ -244,7 +230,7 @@ def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, fl
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
 
 
-def known_share(run: SurveyRun | None) -> Floats:
+def known_share(run: survey_findings.SurveyRun | None) -> Floats:
     """(N,) reduction of each LED's uncertainty by a survey, from 0 (not measured) to 1; (0,) without a survey."""
     if run is None:
         return np.zeros(0)

@@ -32,7 +32,6 @@ from skysim.apps.gui.worker import (
     survey_flight,
 )
 from skysim.apps.gui.worker import workbench as planning
-from skysim.apps.gui.worker.geometry import Grip, Push
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import images
 from skysim.core.errors import InputError
@@ -69,7 +68,7 @@ class Worker:
     shown: dict[int, tuple[pixels.PixelLevels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Playback | None = None
-    pushed: Push | None = None
+    pushed: geometry.Push | None = None
     surveyed: survey_flight.Survey | None = None
     other: photo.Photo | None = None
     image: NDArray | None = None
@@ -181,14 +180,14 @@ class Worker:
         )
         return self.render(solve)
 
-    def push(self, grip: Grip | None, elapsed_s: float, solve: bool) -> PushedView:
+    def push(self, grip: geometry.Grip | None, elapsed_s: float, solve: bool) -> PushedView:
         """Integrate the motion of the pushed vehicle for a time, and render the frame whose exposure ends then.
 
         The motion begins at rest, also after the camera was moved in another way. Raises InputError.
         """
         bench = self.workbench
         if self.pushed is None or self.pushed.lab_from_body is not bench.lab_from_body:
-            self.pushed = Push(bench.lab, bench.lab_from_body)
+            self.pushed = geometry.Push(bench.lab, bench.lab_from_body)
         self.pushed.advance(grip, elapsed_s)
         bench.lab_from_body = self.pushed.lab_from_body
         view = bench.render(bench.next_run().camera, self.pushed.seen(), solve)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from skysim.apps.gui.messages import (
     AmbiguityMap,
     Detection,
     FrameView,
-    LabGeometry,
     Lens,
     LightColumns,
     SceneInfo,
@@ -33,7 +33,6 @@ from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
@@ -64,7 +63,7 @@ class Workbench:
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
-    geometry: LabGeometry
+    geometry: dict[str, Any]
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -109,25 +108,18 @@ class Workbench:
         )
 
     @property
-    def stages(self) -> dict[str, str]:
-        """The tracker's algorithms by stage."""
-        settings = factory.assumed_settings(self.scene)
-        return {name: getattr(settings, name) for name in STAGES}
-
-    @property
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
         scene = self.scene
-        camera = self.scene.camera
+        camera = scene.camera
+        settings = factory.assumed_settings(scene)
         return SceneInfo(
-            scene.name,
-            scene.title,
-            isinstance(scene.light, StarsConfig),
+            scene,
             scoring.angle_names(scene),
             id_prefix(self.lab),
             2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
             1 / camera.focal_px / ARCSEC_RAD,
-            self.stages,
+            {name: getattr(settings, name) for name in STAGES},
             self.lab.duration_s,
             camera.detector.noise,
             self.geometry,
@@ -159,23 +151,23 @@ class Workbench:
         self.frame, self.truth = exposure.render_frame(camera, trajectory, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         clock.lap("all")
-        return self.frame_view(self.frame, self.truth, self.result, clock.seconds["all"])
+        return self.frame_view(self.frame, self.truth, self.report, clock.seconds["all"])
 
     def frame_view(
-        self, frame: Frame, truth: Truth, result: TrackerResult | None, seconds: float
+        self, frame: Frame, truth: Truth, report: Report | None, seconds: float
     ) -> FrameView:
         """The view of a frame of this scene for the page, without its pixels."""
-        height, width = frame.image_dn.shape
         return FrameView(
             geometry.scene_pose(self.lab, self.lens, truth),
             frame.saturation_dn,
-            (width, height),
             scoring.true_angles_deg(self.lab.camera, truth),
-            tuple(quaternion.from_rotation(truth.lab_from_body).tolist()),
+            quaternion.from_rotation(truth.lab_from_body),
             frame.exposure_s,
             plots.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
-            result,
+            tracker_result(self.lab, self.estimator, frame, truth, report)
+            if report
+            else None,
             1e3 * seconds,
         )
 
@@ -227,9 +219,7 @@ def tracker_result(
     row = scoring.row(lab.camera, frame, truth, report)
     return TrackerResult(
         row.status,
-        detection_views(
-            report, matches_by_row(estimator, report.attitude, report.centroids.xy_px)
-        ),
+        detections_of(estimator, report),
         row.time_ms,
         row.estimate_deg,
         row.cross_arcsec,
@@ -240,27 +230,24 @@ def tracker_result(
     )
 
 
-def detection_views(
-    report: Report, names: Mapping[int, tuple[int, float]]
-) -> tuple[Detection, ...]:
-    """Return detections with id and residual of their matched lights.
-
-    Parameters
-    ----------
-    names
-        (id, residual in pixels) by centroid row
-    """
+def detections_of(estimator: factory.Estimator, report: Report) -> tuple[Detection, ...]:
+    """Detections with the numbers of their matched lights, and the distances from the predicted positions of these."""
     centroids = report.centroids
-    rows = zip(
-        centroids.xy_px.tolist(),
-        centroids.sigma_px.tolist(),
-        centroids.flux.tolist(),
-        strict=True,
-    )
-    return tuple(
-        Detection(x, y, sigma, flux, *names.get(n, (-1, math.nan)))
-        for n, ((x, y), sigma, flux) in enumerate(rows)
-    )
+    ids = np.full(len(centroids.flux), -1)
+    residual_px = np.full(len(ids), math.nan)
+    attitude = report.attitude
+    if (
+        attitude.match is not None
+        and attitude.cam_from_ref is not None
+        and not isinstance(estimator, factory.UserTracker)
+    ):
+        light_ids, predicted_px = predicted_lights(estimator, attitude)
+        rows = attitude.match.observed
+        light = attitude.match.star
+        ids[rows] = light_ids[light]
+        residual_px[rows] = np.hypot(*(predicted_px[light] - centroids.xy_px[rows]).T)
+    columns = (*centroids.xy_px.T, centroids.sigma_px, centroids.flux, ids, residual_px)
+    return tuple(map(Detection, *(column.tolist() for column in columns)))
 
 
 def predicted_lights(
@@ -280,29 +267,6 @@ def predicted_lights(
     camera = attitude.camera or estimator.camera
     return estimator.stars.id, camera.pixels(
         attitude.cam_from_ref.apply(estimator.stars.vectors)
-    )
-
-
-def matches_by_row(
-    estimator: factory.Estimator, attitude: Attitude, xy_px: Floats
-) -> dict[int, tuple[int, float]]:
-    """By centroid row: (id of the matched light, distance from its predicted position in pixels)."""
-    if (
-        attitude.match is None
-        or attitude.cam_from_ref is None
-        or isinstance(estimator, factory.UserTracker)
-    ):
-        return {}
-    ids, predicted_px = predicted_lights(estimator, attitude)
-    rows = attitude.match.observed
-    star = attitude.match.star
-    residual_px = np.hypot(*(predicted_px[star] - xy_px[rows]).T)
-    return dict(
-        zip(
-            rows.tolist(),
-            zip(ids[star].tolist(), residual_px.tolist(), strict=True),
-            strict=True,
-        )
     )
 
 

@@ -465,7 +465,7 @@ export default {
     mark(light, id) {
       this.hovered = id;
       this.paint();
-      this.$emit("hover", { id, x: light?.[0], y: light?.[1], inside: Boolean(light) });
+      this.$emit("hover", { x: light?.[0], y: light?.[1], inside: Boolean(light) });
     },
     nearest(at) {
       const reach = REACH_PX / this.placed.scale;
@@ -483,7 +483,7 @@ export default {
       if (pressed.cutting) this.cut = null;
       const found = this.nearest(pressed.start);
       this.pinned = found ? [found[0], found[1]] : pressed.start;
-      this.$emit("choose", { id: found ? found[2] : null, x: this.pinned[0], y: this.pinned[1] });
+      this.$emit("hover", { x: this.pinned[0], y: this.pinned[1], inside: Boolean(found) });
       this.paint();
     },
     leave() {

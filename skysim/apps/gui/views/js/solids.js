@@ -3,8 +3,8 @@ import { THREE } from "nicegui-scene";
 
 const AXES = [["x", 0xff6b6b, [1, 0, 0]], ["y", 0x63c174, [0, 1, 0]], ["z", 0x5aa9ff, [0, 0, 1]]];
 
-// A shape: { name, kind, size, position, wxyz, rgba, vertices, faces }. The field of view and the rim shine.
-export function solid({ name, kind, size, position, wxyz, rgba, vertices, faces }) {
+// A `Shape` of scene_shapes.py. The field of view and the rim shine.
+export function solid({ name, kind, size_m: size, position_m, parent_from_shape_wxyz: wxyz, rgba, vertices_m, faces }) {
   const [red, green, blue, alpha] = rgba, color = new THREE.Color().setRGB(red, green, blue, THREE.SRGBColorSpace);
   const field = /^stage_(field|ray|edge)/.test(name), shines = field || name === "stage_rim_inside";
   const material = new THREE.MeshLambertMaterial({
@@ -16,8 +16,8 @@ export function solid({ name, kind, size, position, wxyz, rgba, vertices, faces 
     material.map = tiles(size[0]);
     material.color.set(0xffffff);
   }
-  const mesh = new THREE.Mesh(form(kind, size, vertices, faces), material);
-  mesh.position.set(...position);
+  const mesh = new THREE.Mesh(form(kind, size, vertices_m, faces), material);
+  mesh.position.set(...position_m);
   mesh.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
   mesh.name = name;
   return mesh;
@@ -32,8 +32,8 @@ function form(kind, size, vertices, faces) {
   if (kind === "capsule") return new THREE.CapsuleGeometry(size[0], 2 * size[1], 6, 12).rotateX(Math.PI / 2);
   if (kind === "plane") return new THREE.PlaneGeometry(2 * size[0], 2 * size[1]);
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices, 3));
-  geometry.setIndex(faces);
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(vertices.flat(), 3));
+  geometry.setIndex(faces.flat());
   geometry.computeVertexNormals();
   return geometry;
 }

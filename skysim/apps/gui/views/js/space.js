@@ -95,17 +95,18 @@ export default {
       this.paintLights();
       this.draw();
     },
-    // Look from a preset: { eye_m, target_m, up, fov_deg, on_vehicle }.
+    // Look from a preset: [eye, target, up, vertical field in degrees, whether they are in body axes].
     look(name) {
       const view = this.lab?.views[name] ?? this.lab?.views.outside;
       if (!view || !this.vehicle) return;
       this.preset = name;
-      const turn = view.on_vehicle ? this.vehicle.quaternion : new THREE.Quaternion();
-      const [eye, target, up] = [view.eye_m, view.target_m, view.up].map((v) => new THREE.Vector3(...v).applyQuaternion(turn));
+      const [from, to, above, fov, onVehicle] = view;
+      const turn = onVehicle ? this.vehicle.quaternion : new THREE.Quaternion();
+      const [eye, target, up] = [from, to, above].map((v) => new THREE.Vector3(...v).applyQuaternion(turn));
       this.camera.up.copy(up);
       this.camera.position.copy(eye);
       this.controls.target.copy(target);
-      this.camera.fov = view.fov_deg;
+      this.camera.fov = fov;
       this.camera.updateProjectionMatrix();
       this.camera.lookAt(target);
       this.vehicle.visible = this.axes.visible = !INSIDE.includes(name);
