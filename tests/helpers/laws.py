@@ -93,8 +93,8 @@ def units(rng: np.random.Generator, count: int) -> Floats:
 def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
     """Random stars, brightest first, with larger proper motions and parallaxes than real ones."""
     hip = np.arange(1, count + 1)
-    ra = rng.uniform(0, 7, count)
-    dec = np.arcsin(rng.uniform(-1, 1, count))
+    ra = np.degrees(rng.uniform(0, 7, count))
+    dec = np.degrees(np.arcsin(rng.uniform(-1, 1, count)))
     motion = rng.normal(0, 1000, (2, count))
     light = rng.uniform(0, 800, count), np.sort(rng.uniform(-1, 6, count))
     return catalog.from_columns(hip, ra, dec, *motion, *light, rng.uniform(1900, 2100))
