@@ -35,6 +35,7 @@ from skysim.core.text import (
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats, Ints
+from skysim.sources.ephemeris import GcrsState
 
 MAX_SATELLITES = 100_000  # in a file
 MAX_AGE_DAYS = 365  # of the elements that are nearest in time
@@ -263,8 +264,8 @@ SAME_M = 1.0
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 
-class OrbitEphemeris(NamedTuple):
-    """Samples of an orbit in GCRS axes.
+class OemOrbit(NamedTuple):
+    """An orbit in GCRS axes given by samples, as a polynomial between them.
 
     Attributes
     ----------
@@ -280,8 +281,8 @@ class OrbitEphemeris(NamedTuple):
     t_s: Floats
     path: BPoly
 
-    def at(self, after_s: Floats) -> tuple[Floats, Floats]:
-        """Positions (K, 3) in m and velocities in m/s at K times. Raises InputError outside the samples."""
+    def states(self, after_s: Floats) -> GcrsState:
+        """(K, 3) positions and velocities at K times. Raises InputError outside the samples."""
         # No extrapolation: the polynomials diverge.
         first, last = self.t_s[[0, -1]]
         if after_s.min() < first or after_s.max() > last:
@@ -290,10 +291,10 @@ class OrbitEphemeris(NamedTuple):
                 "orbit.file",
                 f"{self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s",
             )
-        return self.path(after_s), self.path.derivative()(after_s)
+        return GcrsState(self.path(after_s), self.path.derivative()(after_s))
 
 
-def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
+def read_oem(path: str, start: datetime.datetime) -> OemOrbit:
     """The orbit of an OEM file.
 
     1. Read the segments and their samples.
@@ -329,7 +330,7 @@ def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
     # 3.
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
-    return OrbitEphemeris(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
+    return OemOrbit(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
 
 
 def gravity_m_s2(position_m: Floats) -> Floats:

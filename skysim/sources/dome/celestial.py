@@ -133,12 +133,8 @@ def merge_stars(stars: ProjectedStars, target: Ints) -> ProjectedStars:
     ).T
     v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
-    return ProjectedStars(
-        stars.hip[first][order],
-        v_mag[order],
-        combined_mag(stars.shown_mag)[order],
-        place_m[order],
-    )
+    merged = (stars.hip[first], v_mag, combined_mag(stars.shown_mag), place_m)
+    return ProjectedStars(*(column[order] for column in merged))
 
 
 def merge_close_stars(
@@ -149,9 +145,7 @@ def merge_close_stars(
     A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
     LEDs are too near.
     """
-    selected = ProjectedStars(
-        stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count]
-    )
+    selected = ProjectedStars(*(column[:count] for column in stars))
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):
