@@ -7,6 +7,7 @@ import inspect
 import os
 import pkgutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,7 +44,9 @@ def law(*functions: Any, slow: bool = False) -> Callable[[Test], Test]:
 
 
 def name_of(one: Any) -> str:
-    """The full name of a function, a method, a class's method or a property."""
+    """The full name of a function, of the one that a partial calls, a method, a class's method or a property."""
+    if isinstance(one, partial):
+        one = one.func
     if isinstance(one, property):
         one = one.fget
     return f"{one.__module__}.{one.__qualname__}"
