@@ -33,6 +33,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 
 # Newton decrement g^T N^-1 g at convergence: the squared step in standard deviations. It is small enough for a
@@ -142,6 +144,21 @@ class Bundle:
     map_m: Floats
     map_sigma_m: float = np.inf
     assumed: Assumed | None = None
+
+    @classmethod
+    def start(
+        cls, leds: LedMap, lever: Lever, camera: Camera, attitudes: Rotation, distortion: bool
+    ) -> Bundle:
+        """Start values of all parameters, without priors; with or without a free distortion."""
+        return cls(
+            leds.position_m,
+            attitudes.as_matrix().reshape(-1, 3, 3),
+            np.array(lever.camera_body_m),
+            lever.cam_from_body.as_matrix(),
+            camera.lens,
+            free_lens(distortion),
+            leds.position_m,
+        )
 
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Return the total loss of pixels and priors, and the (M,) robust weights of the sightings.
