@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.light import (
+    AddedLight,
     Beam,
     Exposure,
     Light,
@@ -40,10 +40,9 @@ IMAGES = images_of("LEDs")
 
 
 @dataclass(frozen=True)
-class WallGlow(Light):
+class WallGlow(AddedLight):
     """The glow of wall and floor, which decreases with the strength of the LEDs as they warm up."""
 
-    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
     warm_up: WarmUpConfig | None
 
@@ -63,10 +62,9 @@ class WallGlow(Light):
 
 
 @dataclass(frozen=True)
-class Mirror(Light):
+class Mirror(AddedLight):
     """The images of the LEDs, and of other lights in the laboratory, in the wall."""
 
-    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
