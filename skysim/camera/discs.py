@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from skysim.camera.optics import Optics
-from skysim.camera.projection import image_tracks, in_view, poses, project, sample_times
+from skysim.camera.projection import (
+    Poses,
+    image_tracks,
+    in_view,
+    poses,
+    project,
+    sample_times,
+)
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
 from skysim.core.types import Bools, Floats, Ints, Mount, Sources, SourceTruth, Trajectory
@@ -52,6 +59,11 @@ class Exposed(NamedTuple):
     mount: Mount
     window: Window
 
+    def few_poses(self) -> Poses:
+        """FEW poses over the exposure, to find sources near the field."""
+        end_s = self.window.close_s(self.optics.camera.height_px)
+        return poses(self.trajectory, self.mount, np.linspace(self.window.open_s, end_s, FEW))
+
 
 class DiscOnChip(NamedTuple):
     """Place and scale of a disc on the chip at mid-exposure.
@@ -68,6 +80,7 @@ class DiscOnChip(NamedTuple):
     px_from_radius: Floats
 
 
+FEW = 9  # poses in an exposure at which a body is looked for in the field
 Hidden = Callable[[Floats], Bools]  # which of (M, 2) points of a disc are hidden
 
 
@@ -271,7 +284,6 @@ def light_on_lattice(
 POINT_PX = 0.3
 SMALL_PX = 4.0  # a disc of a smaller diameter is a few points
 COARSE = 16  # places across a disc at which the vehicle is tested for hiding it
-FEW = 9  # poses in an exposure at which a body is looked for in the field
 
 
 def render_bodies(
@@ -285,12 +297,7 @@ def render_bodies(
     Returns the truth of each body in view. Lens, motion and shutter act on a disc as on a star (`disc_image`). Light
     that a nearer body hides is left out.
     """
-    window = exposed.window
-    few_poses = poses(
-        exposed.trajectory,
-        exposed.mount,
-        np.linspace(window.open_s, window.close_s(len(image)), FEW),
-    )
+    few_poses = exposed.few_poses()
     truths = []
     for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
         body = bodies[n]
