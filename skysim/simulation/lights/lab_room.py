@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from skysim.camera.glow.stray import images_in_wall, wall_glow
+from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, wall_glow
 from skysim.core.types import Bools, Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
@@ -26,6 +26,7 @@ from skysim.simulation.lights.light import (
 )
 from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
 from skysim.sources.dome.led import warm_up_factor
+from skysim.sources.dome.mirror import mirrored
 from skysim.sources.dome.surface import Surface, build_surface
 
 # Reflections: a glow if the surface scatters, images if it mirrors.
@@ -74,10 +75,14 @@ class Mirror(AddedLight):
         return beam
 
     def image(self, lit: Lit, exposure: Exposure) -> Lit:
-        """The images of one light in the wall; the same obstacles hide them."""
+        """The images of one light in the wall that are in the field; the same obstacles hide them.
+
+        They keep their virtual places while the camera moves during the exposure, which is exact for a flat wall.
+        """
         assert lit.points is not None
-        images = images_in_wall(
-            self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m
+        grid = chip_grid(exposure.optics, GRID, MARGIN) @ exposure.cam_from_lab.as_matrix()
+        images = mirrored(
+            self.dome.config, self.dome.wall, lit.points, exposure.camera_m, grid
         )
         return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
 
