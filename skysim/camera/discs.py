@@ -138,33 +138,21 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     3. Draw each on a patch of its own; all patches have the size that the longest reach needs.
     """
     optics = exposed.optics
-    camera = exposed.optics.camera
-    t_s = sample_times(
-        exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory
-    )
+    close_s = exposed.window.close_s(optics.camera.height_px)
+    t_s = sample_times(exposed.window.open_s, close_s, exposed.trajectory)
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
-    star = star_kernel(optics, disc.center_px, body.chromatic)
+    colors = None if body.chromatic is None else body.chromatic[None]
+    star = star_kernels(optics, disc.center_px[None], colors)
     # 1. Phases (x, y) in pixels, x fastest.
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
     phase = np.arange(steps) / steps
     phase_px = np.stack(np.meshgrid(phase, phase), axis=-1).reshape(-1, 2)
     # 2. Their directions and tracks.
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
-    tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
+    tracks, _, _ = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px = tracks.xy_px
     middle = len(t_s) // 2
-    is_led = np.zeros(len(points), bool)
-    kernels = source_kernels(
-        camera,
-        xy_px[middle],
-        points.radius_m,
-        is_led,
-        distance_m,
-        cos_in,
-        None,
-        optics.blur_px,
-        points.chromatic,
-    )
+    kernels = star_kernels(optics, xy_px[middle], points.chromatic)
     # 3. One size of patch for all phases, in whole pixels of the chip.
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
@@ -187,13 +175,12 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     return DisplacedImages(patches, low, speed, float(drawn[0, 5]))
 
 
-def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
-    """The kernel of a point of light at a place (2,) on the chip, with `chromatic` (4,) as in `Sources`."""
-    one = np.ones(1)
-    is_led = np.zeros(1, bool)
-    colors = None if chromatic is None else chromatic[None]
+def star_kernels(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
+    """The kernels of points of light at places (N, 2) on the chip, with `chromatic` (N, 4) as in `Sources`."""
+    one = np.ones(len(xy_px))
+    is_led = np.zeros(len(xy_px), bool)
     return source_kernels(
-        optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors
+        optics.camera, xy_px, 0 * one, is_led, one, one, None, optics.blur_px, chromatic
     )
 
 

@@ -122,11 +122,10 @@ def fit_sip(camera: OpencvCalibration) -> Sip | None:
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
         design = monomials(distorted_px / scale, powers)
         solution = np.linalg.lstsq(design, undistorted_px - distorted_px, rcond=None)[0]
-        a: Coefficients = {}
-        b: Coefficients = {}
-        for (p, q), (in_a, in_b) in zip(powers, solution.tolist(), strict=True):
-            a[p, q] = in_a / scale ** (p + q)
-            b[p, q] = in_b / scale ** (p + q)
+        a, b = (
+            {(p, q): one / scale ** (p + q) for (p, q), one in zip(powers, side, strict=True)}
+            for side in solution.T.tolist()
+        )
         # 3. Round trip.
         round_trip = distorted(
             chip_px + monomials(chip_px / scale, powers) @ solution, camera
