@@ -125,7 +125,7 @@ class StarCatalog:
         )
         _check_places(ra, dec)
         columns = _identifiers(id, count), ra, dec, pm_ra, pm_dec, parallax, magnitude
-        return from_columns(*columns, epoch_yr).brightest_first()
+        return from_columns(*columns, epoch_yr=epoch_yr).brightest_first()
 
     def take(self, which: NDArray) -> StarCatalog:
         """Select stars by mask or index."""
@@ -290,7 +290,7 @@ def _kept(path: str | Path, *_state: int) -> StarCatalog:
 def _read(path: str | Path) -> StarCatalog:
     """Read a catalog file, and sort the stars by brightness."""
     table, epoch_yr = columns(path, COLUMNS)
-    return from_columns(*table, epoch_yr).brightest_first()
+    return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 
 
 COLUMNS = (
@@ -396,6 +396,7 @@ def from_columns(
     pm_dec_mas_yr: Floats,
     parallax_mas: Floats,
     v_mag: Floats,
+    *,
     epoch_yr: float,
 ) -> StarCatalog:
     """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec).

@@ -113,7 +113,7 @@ def read_cat(
     numbers = numbers[:, numbers[6] <= limit_v_mag]
     if not numbers.shape[1]:
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
-    stars = catalog.from_columns(*numbers[:7], file_epoch_yr)
+    stars = catalog.from_columns(*numbers[:7], epoch_yr=file_epoch_yr)
     epoch_yr = file_epoch_yr if epoch_yr is None else epoch_yr
     magnitude = stars.v_mag
     if color:

@@ -100,7 +100,9 @@ def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
     dec = np.degrees(np.arcsin(rng.uniform(-1, 1, count)))
     motion = rng.normal(0, 1000, (2, count))
     light = rng.uniform(0, 800, count), np.sort(rng.uniform(-1, 6, count))
-    return catalog.from_columns(hip, ra, dec, *motion, *light, rng.uniform(1900, 2100))
+    return catalog.from_columns(
+        hip, ra, dec, *motion, *light, epoch_yr=rng.uniform(1900, 2100)
+    )
 
 
 def turn(rng: np.random.Generator, most_rad: float = np.pi) -> Rotation:
