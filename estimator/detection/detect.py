@@ -92,7 +92,13 @@ def default(
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
     blobs = _classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors)
-    return _stars_first(blobs, max_blobs)
+    if len(blobs) <= max_blobs:
+        return blobs
+    # The brightest that may be stars, and as many others as there is room for
+    star = blobs.flag & classify.NO_STAR == 0
+    kept = star & (np.cumsum(star) <= max_blobs)
+    room = max_blobs - np.count_nonzero(kept)
+    return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
 
 
 def _classified(
@@ -145,16 +151,6 @@ def _classified_streaks(
     """Return the blobs with their flags, detected with the filter along a streak."""
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, along)
     return classify.classify(image, streaks, along)
-
-
-def _stars_first(blobs: Blobs, max_blobs: int) -> Blobs:
-    """Return at most `max_blobs` blobs: the brightest that may be stars, and as many others as there is room for."""
-    if len(blobs) <= max_blobs:
-        return blobs
-    star = blobs.flag & classify.NO_STAR == 0
-    kept = star & (np.cumsum(star) <= max_blobs)
-    room = max_blobs - np.count_nonzero(kept)
-    return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
 
 
 def local(

@@ -179,25 +179,26 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     from sgp4.api import Satrec
 
     record = Satrec()
+    where = Where(path, n, "message")
     texts = {key: str(value) for key, value in fields.items() if value not in (None, "")}
     # Elements that SGP4 needs.
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
-        raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
+        raise InputError(path, f"{missing[0]} is missing", where=where)
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
         raise InputError(
             path,
             f"EPOCH {excerpt(epoch)}",
             "2012-06-22T21:00:00.123456",
-            where=Where(path, n, "message"),
+            where=where,
         )
     try:
         # sgp4 reads epochs with a fraction of a second only.
         full_epoch = epoch if "." in epoch else f"{epoch}.0"
         omm.initialize(record, OPTIONAL | texts | {"EPOCH": full_epoch})
     except (ValueError, OverflowError) as error:
-        raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
+        raise InputError(path, excerpt(error), where=where) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 

@@ -275,13 +275,12 @@ def widened(kernels: Kernels, extra_px: Floats) -> Kernels:
     Standard deviation and sharpness grow in proportion, the reach with them.
     """
     point = kernels.kind == GAUSS
-    widening = np.hypot(kernels.sigma_px, extra_px) / np.where(point, kernels.sigma_px, 1)
+    sigma_px = np.where(point, kernels.sigma_px, 1)
+    widening = np.where(point, np.hypot(sigma_px, extra_px) / sigma_px, 1)
     return kernels._replace(
-        sigma_px=np.where(point, kernels.sigma_px * widening, kernels.sigma_px),
-        reach_px=np.where(
-            point, kernels.reach_px * np.maximum(widening, 1), kernels.reach_px
-        ),
-        sharp_px=np.where(point, kernels.sharp_px * widening, kernels.sharp_px),
+        sigma_px=kernels.sigma_px * widening,
+        reach_px=kernels.reach_px * np.maximum(widening, 1),
+        sharp_px=kernels.sharp_px * widening,
     )
 
 
