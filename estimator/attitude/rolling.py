@@ -120,10 +120,24 @@ def _rows(
     rate: Floats,
     exposure_s: float | None,
 ) -> list[_Rows]:
-    """Return the rows of the tangents and, with an exposure time, of the streaks."""
+    """Return the rows of the tangents and, with an exposure time, of the streaks.
+
+    Those of the tangents are measured minus those of the (K, 3) rays predicted at the times of their rows.
+    """
     ray = place - lever_cam_m
     jacobian = tangent_jacobian(place, ray).reshape(-1, 2, 3)
-    rows = [_place_rows(camera, centroids, ray, jacobian, turn, rate)]
+    delay_s = camera.row_delays_s(centroids.xy_px)
+    # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
+    gain = error_gain(camera, -jacobian @ rate)
+    error_rad2 = (
+        gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
+    )
+    # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
+    by_rotation = jacobian @ turn.as_matrix()
+    by_rate = -delay_s[:, None, None] * jacobian
+    residual = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:]
+    slopes = np.concatenate([by_rotation, by_rate], axis=2)
+    rows = [_Rows(residual, slopes, inverses(error_rad2))]
     if exposure_s is not None and centroids.streak_px is not None:
         rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
     return rows
@@ -150,29 +164,6 @@ def _solve(normal: Floats, gradient: Floats, lights: int) -> Floats:
     if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
         raise ValueError(f"{lights} lights do not determine attitude and rate")
     return np.linalg.solve(normal / sizes, gradient / size) / size
-
-
-def _place_rows(
-    camera: Camera,
-    centroids: Centroids,
-    ray: Floats,
-    jacobian: Floats,
-    turn: Rotation,
-    rate: Floats,
-) -> _Rows:
-    """Return the rows of the tangents: measured minus those of the (K, 3) rays predicted at the times of their rows."""
-    delay_s = camera.row_delays_s(centroids.xy_px)
-    # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
-    gain = error_gain(camera, -jacobian @ rate)
-    error_rad2 = (
-        gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
-    )
-    # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
-    by_rotation = jacobian @ turn.as_matrix()
-    by_rate = -delay_s[:, None, None] * jacobian
-    residual = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:]
-    slopes = np.concatenate([by_rotation, by_rate], axis=2)
-    return _Rows(residual, slopes, inverses(error_rad2))
 
 
 def _streak_rows(

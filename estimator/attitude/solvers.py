@@ -8,6 +8,7 @@ vectors (`wahba.refine`), so that they agree to the last digits.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,37 +33,43 @@ def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotati
     return rotation(kernel.raw_triad(cam, ref, weight))
 
 
-def davenport(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by Davenport's q-method, refined. Arguments and errors are those of `quest`."""
-    return _solve_profile(kernel.raw_davenport, vectors_cam, vectors_ref, sigma_rad)
+def _solve_profile(
+    raw: Callable[[Floats], Floats],
+    vectors_cam: Floats,
+    vectors_ref: Floats,
+    sigma_rad: Floats,
+) -> Rotation:
+    """Solve the attitude profile with the method `raw`, then refine the solution on the vectors."""
+    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
+    R_cam_from_ref = raw(kernel.profile(cam, ref, weight))
+    kernel.refine(R_cam_from_ref, cam, ref, weight)
+    return rotation(R_cam_from_ref)
 
 
-def quest(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by QUEST (Shuster & Oh 1981), refined by Gauss-Newton.
+davenport = partial(_solve_profile, kernel.raw_davenport)
+"""Return cam_from_ref by Davenport's q-method, refined. Arguments and errors are those of `quest`."""
 
-    Parameters
-    ----------
-    vectors_cam, vectors_ref
-        (N, 3) unit vectors, N >= 2, in camera axes and in the reference frame
-    sigma_rad
-        (N,) standard deviation of each direction per axis
+quest = partial(_solve_profile, kernel.raw_quest)
+"""Return cam_from_ref by QUEST (Shuster & Oh 1981), refined by Gauss-Newton.
 
-    Raises
-    ------
-    ValueError
-        For fewer than two directions, and for unusable numbers.
-    """
-    return _solve_profile(kernel.raw_quest, vectors_cam, vectors_ref, sigma_rad)
+Parameters
+----------
+vectors_cam, vectors_ref
+    (N, 3) unit vectors, N >= 2, in camera axes and in the reference frame
+sigma_rad
+    (N,) standard deviation of each direction per axis
 
+Raises
+------
+ValueError
+    For fewer than two directions, and for unusable numbers.
+"""
 
-def esoq2(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by ESOQ2 (Mortari 1997), refined. Arguments and errors are those of `quest`."""
-    return _solve_profile(kernel.raw_esoq2, vectors_cam, vectors_ref, sigma_rad)
+esoq2 = partial(_solve_profile, kernel.raw_esoq2)
+"""Return cam_from_ref by ESOQ2 (Mortari 1997), refined. Arguments and errors are those of `quest`."""
 
-
-def svd(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
-    return _solve_profile(kernel.raw_svd, vectors_cam, vectors_ref, sigma_rad)
+svd = partial(_solve_profile, kernel.raw_svd)
+"""Return cam_from_ref by singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
 
 
 def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
@@ -83,19 +90,6 @@ SOLVERS: dict[str, Solver] = {
     "svd": svd,
     "least_squares": least_squares,
 }
-
-
-def _solve_profile(
-    raw: Callable[[Floats], Floats],
-    vectors_cam: Floats,
-    vectors_ref: Floats,
-    sigma_rad: Floats,
-) -> Rotation:
-    """Solve the attitude profile with the method `raw`, then refine the solution on the vectors."""
-    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
-    R_cam_from_ref = raw(kernel.profile(cam, ref, weight))
-    kernel.refine(R_cam_from_ref, cam, ref, weight)
-    return rotation(R_cam_from_ref)
 
 
 def _checked_arrays(

@@ -33,6 +33,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.dome_map import LedMap, Lever
+from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 
 # Newton decrement g^T N^-1 g at convergence: the squared step in standard deviations. It is small enough for a
@@ -143,6 +145,21 @@ class Bundle:
     map_sigma_m: float = np.inf
     assumed: Assumed | None = None
 
+    @classmethod
+    def start(
+        cls, leds: LedMap, lever: Lever, camera: Camera, attitudes: Rotation, distortion: bool
+    ) -> Bundle:
+        """Start values of all parameters, without priors; with or without a free distortion."""
+        return cls(
+            leds.position_m,
+            attitudes.as_matrix().reshape(-1, 3, 3),
+            np.array(lever.camera_body_m),
+            lever.cam_from_body.as_matrix(),
+            camera.lens,
+            free_lens(distortion),
+            leds.position_m,
+        )
+
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Return the total loss of pixels and priors, and the (M,) robust weights of the sightings.
 
@@ -231,13 +248,12 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1 / q[:, 2]
     pinhole[:, :, 2] = -tangent / q[:, 2:]
     weight = 1 / sightings.sigma_px[:, None, None]
-    by_tangent = _by_tangent(tangent, coefficients)
+    by_tangent, by_coefficients = _slopes(tangent, coefficients)
     by_body = focal * weight * (by_tangent @ pinhole @ bundle.R_cam_from_body)
     # Derivatives by all eight elements of the lens; only the first are unknowns.
     by_center = np.tile(np.eye(2), (len(q), 1, 1))
-    by_coefficients = focal * _by_coefficients(tangent)
     by_lens = np.concatenate(
-        [distorted_tangent[:, :, None], by_center, by_coefficients], axis=2
+        [distorted_tangent[:, :, None], by_center, focal * by_coefficients], axis=2
     )
     error_px = sightings.xy_px - bundle.lens[1:3] - focal * distorted_tangent
     return Linearization(
@@ -269,8 +285,11 @@ def _distort(tangent: Floats, coefficients: Floats) -> Floats:
     return np.column_stack([x * radial + tangential_x, y * radial + tangential_y])
 
 
-def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
-    """Return the (M, 2, 2) derivative of the distorted tangent with respect to the undistorted one; symmetric."""
+def _slopes(tangent: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
+    """Return the derivatives of the distorted tangent with respect to the undistorted one and to the coefficients.
+
+    The first is (M, 2, 2) and symmetric, the second (M, 2, 5) for k1, k2, p1, p2, k3.
+    """
     k1, k2, p1, p2, k3 = coefficients
     x, y = tangent.T
     r2 = x * x + y * y
@@ -281,23 +300,14 @@ def _by_tangent(tangent: Floats, coefficients: Floats) -> Floats:
     by[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     by[:, 0, 1] = by[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
     by[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return by
-
-
-def _by_coefficients(tangent: Floats) -> Floats:
-    """Return the (M, 2, 5) derivative of the distorted tangent with respect to k1, k2, p1, p2, k3."""
-    x, y = tangent.T
-    r2 = x * x + y * y
-    return np.stack(
-        [
-            tangent * r2[:, None],
-            tangent * r2[:, None] ** 2,
-            np.column_stack([2 * x * y, r2 + 2 * y * y]),
-            np.column_stack([r2 + 2 * x * x, 2 * x * y]),
-            tangent * r2[:, None] ** 3,
-        ],
-        axis=2,
-    )
+    by_coefficients = [
+        tangent * r2[:, None],
+        tangent * r2[:, None] ** 2,
+        np.column_stack([2 * x * y, r2 + 2 * y * y]),
+        np.column_stack([r2 + 2 * x * x, 2 * x * y]),
+        tangent * r2[:, None] ** 3,
+    ]
+    return by, np.stack(by_coefficients, axis=2)
 
 
 class NormalEquations(NamedTuple):

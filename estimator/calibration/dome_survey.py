@@ -225,8 +225,8 @@ def survey(
     check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
-    free_lens = ba.free_lens(fit_distortion)
-    start = _start_bundle(frames, leds_start, lever_start, camera_start, free_lens)
+    attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
+    start = Bundle.start(leds_start, lever_start, camera_start, attitudes, fit_distortion)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
     fit = _fit(start, sightings, gauge, LOSSES[loss], fit_noise)
@@ -397,22 +397,6 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
         np.concatenate([frame.led for frame in frames]).astype(np.int64),
         np.concatenate([frame.xy_px for frame in frames]),
         np.concatenate([frame.sigma_px for frame in frames]),
-    )
-
-
-def _start_bundle(
-    frames: Sequence[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int
-) -> Bundle:
-    """Return the start values of all parameters, without priors."""
-    attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
-    return Bundle(
-        leds.position_m,
-        attitudes.as_matrix(),
-        np.array(lever.camera_body_m),
-        lever.cam_from_body.as_matrix(),
-        camera.lens,
-        free_lens,
-        leds.position_m,
     )
 
 

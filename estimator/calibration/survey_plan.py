@@ -8,7 +8,7 @@ that each attitude shows. `choose` selects attitudes one after another by what e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -165,19 +165,11 @@ def _bundle(
 ) -> tuple[Bundle, Sightings]:
     """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
     camera = model.camera
-    arm_m = np.array(model.lever.camera_body_m)
+    known = model.leds, model.lever, camera
+    start = Bundle.start(*known, body_from_lab, model.fit_distortion)
+    arm_m = start.camera_body_m
     assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
-    bundle = Bundle(
-        model.leds.position_m,
-        body_from_lab.as_matrix().reshape(-1, 3, 3),
-        arm_m,
-        model.lever.cam_from_body.as_matrix(),
-        camera.lens,
-        ba.free_lens(model.fit_distortion),
-        model.leds.position_m,
-        model.leds_sigma_m,
-        assumed,
-    )
+    bundle = replace(start, map_sigma_m=model.leds_sigma_m, assumed=assumed)
     # With pixels of 0 the residuals are the negative predictions over sigma.
     frame, led = np.nonzero(seen)
     sightings = Sightings(

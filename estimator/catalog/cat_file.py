@@ -105,12 +105,11 @@ def read_stars(path: str | Path) -> StarCatalog:
     """Read a .CAT file as a tracker's catalog, brightest first; its stars have no motion and no parallax."""
     on_board = read(path)
     count = len(on_board)
-    stars = StarCatalog(
+    return StarCatalog(
         on_board.id,
         on_board.vectors,
         np.zeros((count, 3)),
         np.zeros(count),
         on_board.magnitude,
         on_board.epoch_yr,
-    )
-    return stars.take(np.argsort(stars.v_mag, kind="stable"))
+    ).brightest_first()

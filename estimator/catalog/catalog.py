@@ -124,15 +124,17 @@ class StarCatalog:
             "catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200"
         )
         _check_places(ra, dec)
-        place = np.radians(ra), np.radians(dec)
-        numbers = _identifiers(id, count)
-        stars = from_columns(numbers, *place, pm_ra, pm_dec, parallax, magnitude, epoch_yr)
-        return stars.take(np.argsort(stars.v_mag, kind="stable"))
+        columns = _identifiers(id, count), ra, dec, pm_ra, pm_dec, parallax, magnitude
+        return from_columns(*columns, epoch_yr=epoch_yr).brightest_first()
 
     def take(self, which: NDArray) -> StarCatalog:
         """Select stars by mask or index."""
         columns = [name for name in self.__slots__ if name != "epoch_yr"]
         return replace(self, **{name: getattr(self, name)[which] for name in columns})
+
+    def brightest_first(self) -> StarCatalog:
+        """Sort the stars by brightness; equally bright ones keep their order."""
+        return self.take(np.argsort(self.v_mag, kind="stable"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,12 +289,8 @@ def _kept(path: str | Path, *_state: int) -> StarCatalog:
 
 def _read(path: str | Path) -> StarCatalog:
     """Read a catalog file, and sort the stars by brightness."""
-    (hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag), epoch_yr = columns(path, COLUMNS)
-    radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = from_columns(
-        hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, epoch_yr
-    )
-    return stars.take(np.argsort(v_mag, kind="stable"))
+    table, epoch_yr = columns(path, COLUMNS)
+    return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 
 
 COLUMNS = (
@@ -391,13 +389,14 @@ def _number_or_nan(text: str) -> float:
 
 
 def from_columns(
-    hip: Ints,
-    ra_rad: Floats,
-    dec_rad: Floats,
+    hip: NDArray,
+    ra_deg: Floats,
+    dec_deg: Floats,
     pm_ra_mas_yr: Floats,
     pm_dec_mas_yr: Floats,
     parallax_mas: Floats,
     v_mag: Floats,
+    *,
     epoch_yr: float,
 ) -> StarCatalog:
     """Convert spherical coordinates and proper motions to vectors; pm_ra includes the factor cos(dec).
@@ -405,6 +404,7 @@ def from_columns(
     The tangent plane has the axes east = (-sin a, cos a, 0) and north = (-sin d cos a, -sin d sin a, cos d), with
     the right ascension a and the declination d. The proper motion is pm_ra east + pm_dec north.
     """
+    ra_rad, dec_rad = np.radians([ra_deg, dec_deg])
     sa = np.sin(ra_rad)
     ca = np.cos(ra_rad)
     sd = np.sin(dec_rad)
@@ -413,7 +413,8 @@ def from_columns(
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
     north = np.column_stack([-sd * ca, -sd * sa, cd])
     drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
-    return StarCatalog(hip, vectors, drift, MAS_RAD * parallax_mas, v_mag, epoch_yr)
+    parallax_rad = MAS_RAD * parallax_mas
+    return StarCatalog(hip.astype(np.int64), vectors, drift, parallax_rad, v_mag, epoch_yr)
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
@@ -461,7 +462,7 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     result = StarCatalog(
         stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr
     )
-    return result.take(np.argsort(result.v_mag, kind="stable"))
+    return result.brightest_first()
 
 
 def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:

@@ -113,16 +113,12 @@ def read_cat(
     numbers = numbers[:, numbers[6] <= limit_v_mag]
     if not numbers.shape[1]:
         raise ImageError(f"{path}: no star of V <= {limit_v_mag:g}; allowed: a fainter limit")
-    hip, ra_deg, dec_deg, pm_ra, pm_dec, parallax, v_mag = numbers[:7]
-    radec_rad = np.radians(ra_deg), np.radians(dec_deg)
-    stars = catalog.from_columns(
-        hip.astype(np.int64), *radec_rad, pm_ra, pm_dec, parallax, v_mag, file_epoch_yr
-    )
+    stars = catalog.from_columns(*numbers[:7], epoch_yr=file_epoch_yr)
     epoch_yr = file_epoch_yr if epoch_yr is None else epoch_yr
-    magnitude = v_mag
+    magnitude = stars.v_mag
     if color:
         b_v, v_i = np.where(np.isnan(numbers[7:]), [[SUN_B_V], [SUN_V_I]], numbers[7:])
-        magnitude = v_mag + color.constant + color.b_v * b_v + color.v_i * v_i
+        magnitude = stars.v_mag + color.constant + color.b_v * b_v + color.v_i * v_i
     single = np.ones(len(stars), np.int64)
     return OnBoard(stars.id, catalog.at_epoch(stars, epoch_yr), magnitude, single, epoch_yr)
 

@@ -94,7 +94,8 @@ def gaussian_fit(
     the model does not fit (no convergence, larger than the window) keeps its center of gravity.
     """
     image = prepare(image, blobs, gain_e_dn, priors)
-    return _gaussian_centroids(image, blobs, gain_e_dn, priors)
+    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
 def streak(
@@ -116,7 +117,7 @@ def streak(
     streaks = _fit_streaks(image, blobs, gain_e_dn, priors)
     failed = np.isnan(streaks[:, 0])
     if failed.all():
-        return _gaussian_centroids(image, blobs, gain_e_dn, priors)
+        return gaussian_fit(image, blobs, gain_e_dn, priors)
     # Columns of `streak_fit.fit_all`: x, y, flux; xx, yy, xy
     covariance = streaks[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
     rows = streaks[:, [0, 1, 5, 2]]
@@ -215,14 +216,6 @@ CENTROIDERS: dict[str, Centroider] = {
     "streak": streak,
     "disk": disk,
 }
-
-
-def _gaussian_centroids(
-    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
-) -> Centroids:
-    """Return the centroids of `gaussian_fit` in a prepared image."""
-    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
-    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
 def _fit_gaussians(

@@ -18,6 +18,7 @@ and raises ImageError for an image that cannot be used (see `check_image`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,13 @@ def default(
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     of_type("priors", priors, FramePriors)
     blobs = _classified(image, threshold_sigma, min_area_px, SPARE * max_blobs, priors)
-    return _stars_first(blobs, max_blobs)
+    if len(blobs) <= max_blobs:
+        return blobs
+    # The brightest that may be stars, and as many others as there is room for
+    star = blobs.flag & classify.NO_STAR == 0
+    kept = star & (np.cumsum(star) <= max_blobs)
+    room = max_blobs - np.count_nonzero(kept)
+    return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
 
 
 def _classified(
@@ -144,16 +151,6 @@ def _classified_streaks(
     """Return the blobs with their flags, detected with the filter along a streak."""
     streaks = detect_streaks(image, background, threshold_sigma, max_blobs, along)
     return classify.classify(image, streaks, along)
-
-
-def _stars_first(blobs: Blobs, max_blobs: int) -> Blobs:
-    """Return at most `max_blobs` blobs: the brightest that may be stars, and as many others as there is room for."""
-    if len(blobs) <= max_blobs:
-        return blobs
-    star = blobs.flag & classify.NO_STAR == 0
-    kept = star & (np.cumsum(star) <= max_blobs)
-    room = max_blobs - np.count_nonzero(kept)
-    return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
 
 
 def local(
@@ -226,34 +223,36 @@ def thesis(
     return detect_blobs(image, flat, threshold - flat.level, THESIS_AREA_PX, max_blobs)
 
 
-def sequential(
+def _scan(
+    scan: Callable[..., tuple[Ints, Floats]],
     image: NDArray,
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Detect by SHEFEX-2's sequential scan: one pass over the frame that inserts each object into a sorted table.
+    """Run one of SHEFEX's scans and convert its table to Blobs."""
+    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
+    # One level for the frame, and the noise of a raw pixel
+    flat = flat_background(estimate_background(image), image.shape)
+    level = float(flat.level[0, 0])
+    noise = float(flat.noise[0, 0]) / FILTERED_NOISE
+    boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
+    return _to_blobs(boxes, sums, 0, max_blobs, flat)
 
-    The table holds the `max_blobs` brightest objects so far. An object is a set of eight-connected pixels above a
-    global threshold, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
-    """
-    return _scan(sequential_scan, image, threshold_sigma, min_area_px, max_blobs)
 
+sequential = partial(_scan, sequential_scan)
+"""Detect by SHEFEX-2's sequential scan: one pass over the frame that inserts each object into a sorted table.
 
-def maximum(
-    image: NDArray,
-    threshold_sigma: float = 5.0,
-    min_area_px: int = 3,
-    max_blobs: int = 200,
-    priors: FramePriors = NO_PRIORS,
-) -> Blobs:
-    """Detect by SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object.
+The table holds the `max_blobs` brightest objects so far. An object is a set of eight-connected pixels above a global
+threshold, sky + `threshold_sigma` times a raw pixel's noise (reference: the SHEFEX-2 paper, fig. 3 right).
+"""
 
-    The source is the SHEFEX-2 paper, fig. 3 left.
-    """
-    return _scan(maximum_scan, image, threshold_sigma, min_area_px, max_blobs)
+maximum = partial(_scan, maximum_scan)
+"""Detect by SHEFEX-2's alternative scan: search the whole frame for its largest pixel, once per object.
 
+The source is the SHEFEX-2 paper, fig. 3 left.
+"""
 
 DETECTORS: dict[str, Detector] = {
     "default": default,
@@ -528,23 +527,6 @@ def noise_factor(taps: Ints) -> float:
     for x, y in taps + reach:
         kernel[y - 1 : y + 2, x - 1 : x + 2] += binomial
     return float(np.sqrt(np.sum(kernel**2)))
-
-
-def _scan(
-    scan: Callable[..., tuple[Ints, Floats]],
-    image: NDArray,
-    threshold_sigma: float,
-    min_area_px: int,
-    max_blobs: int,
-) -> Blobs:
-    """Run one of SHEFEX's scans and convert its table to Blobs."""
-    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
-    # One level for the frame, and the noise of a raw pixel
-    flat = flat_background(estimate_background(image), image.shape)
-    level = float(flat.level[0, 0])
-    noise = float(flat.noise[0, 0]) / FILTERED_NOISE
-    boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
-    return _to_blobs(boxes, sums, 0, max_blobs, flat)
 
 
 def _to_blobs(

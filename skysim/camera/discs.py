@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from skysim.camera.optics import Optics
-from skysim.camera.projection import image_tracks, in_view, poses, project, sample_times
+from skysim.camera.projection import (
+    Poses,
+    image_tracks,
+    in_view,
+    poses,
+    project,
+    sample_times,
+)
 from skysim.camera.psf.kernel_cache import Kernels, source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
 from skysim.core.types import Bools, Floats, Ints, Mount, Sources, SourceTruth, Trajectory
@@ -51,6 +58,11 @@ class Exposed(NamedTuple):
     mount: Mount
     window: Window
 
+    def few_poses(self) -> Poses:
+        """FEW poses over the exposure, to find sources near the field."""
+        end_s = self.window.close_s(self.optics.camera.height_px)
+        return poses(self.trajectory, self.mount, np.linspace(self.window.open_s, end_s, FEW))
+
 
 class DiscOnChip(NamedTuple):
     """Place and scale of a disc on the chip at mid-exposure.
@@ -67,6 +79,7 @@ class DiscOnChip(NamedTuple):
     px_from_radius: Floats
 
 
+FEW = 9  # poses in an exposure at which a body is looked for in the field
 Hidden = Callable[[Floats], Bools]  # which of (M, 2) points of a disc are hidden
 
 
@@ -124,33 +137,21 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     3. Draw each on a patch of its own; all patches have the size that the longest reach needs.
     """
     optics = exposed.optics
-    camera = exposed.optics.camera
-    t_s = sample_times(
-        exposed.window.open_s, exposed.window.close_s(camera.height_px), exposed.trajectory
-    )
+    close_s = exposed.window.close_s(optics.camera.height_px)
+    t_s = sample_times(exposed.window.open_s, close_s, exposed.trajectory)
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
-    star = star_kernel(optics, disc.center_px, body.chromatic)
+    colors = None if body.chromatic is None else body.chromatic[None]
+    star = star_kernels(optics, disc.center_px[None], colors)
     # 1. Phases (x, y) in pixels, x fastest.
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
     phase = np.arange(steps) / steps
     phase_px = np.stack(np.meshgrid(phase, phase), axis=-1).reshape(-1, 2)
     # 2. Their directions and tracks.
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
-    tracks, distance_m, cos_in = image_tracks(points, optics, all_poses, t_s, Emitter())
+    tracks, _, _ = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px = tracks.xy_px
     middle = len(t_s) // 2
-    is_led = np.zeros(len(points), bool)
-    kernels = source_kernels(
-        camera,
-        xy_px[middle],
-        points.radius_m,
-        is_led,
-        distance_m,
-        cos_in,
-        None,
-        optics.blur_px,
-        points.chromatic,
-    )
+    kernels = star_kernels(optics, xy_px[middle], points.chromatic)
     # 3. One size of patch for all phases, in whole pixels of the chip.
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
@@ -173,13 +174,12 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     return DisplacedImages(patches, low, speed, float(drawn[0, 5]))
 
 
-def star_kernel(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
-    """The kernel of a point of light at a place (2,) on the chip, with `chromatic` (4,) as in `Sources`."""
-    one = np.ones(1)
-    is_led = np.zeros(1, bool)
-    colors = None if chromatic is None else chromatic[None]
+def star_kernels(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
+    """The kernels of points of light at places (N, 2) on the chip, with `chromatic` (N, 4) as in `Sources`."""
+    one = np.ones(len(xy_px))
+    is_led = np.zeros(len(xy_px), bool)
     return source_kernels(
-        optics.camera, xy_px[None], 0 * one, is_led, one, one, None, optics.blur_px, colors
+        optics.camera, xy_px, 0 * one, is_led, one, one, None, optics.blur_px, chromatic
     )
 
 
@@ -270,7 +270,6 @@ def light_on_lattice(
 POINT_PX = 0.3
 SMALL_PX = 4.0  # a disc of a smaller diameter is a few points
 COARSE = 16  # places across a disc at which the vehicle is tested for hiding it
-FEW = 9  # poses in an exposure at which a body is looked for in the field
 
 
 def render_bodies(
@@ -284,12 +283,7 @@ def render_bodies(
     Returns the truth of each body in view. Lens, motion and shutter act on a disc as on a star (`disc_image`). Light
     that a nearer body hides is left out.
     """
-    window = exposed.window
-    few_poses = poses(
-        exposed.trajectory,
-        exposed.mount,
-        np.linspace(window.open_s, window.close_s(len(image)), FEW),
-    )
+    few_poses = exposed.few_poses()
     truths = []
     for n in in_view(centers_of(bodies), exposed.optics, few_poses).tolist():
         body = bodies[n]

@@ -54,6 +54,8 @@ class Optics:
         Greatest field angle (from the boresight) on the chip
     blur_px
         Standard deviation of a Gaussian blur before the lens (seeing)
+    scale
+        Scale of the image about the principal point, if any; a negative one mirrors it through the axis
     """
 
     camera: CameraConfig
@@ -61,6 +63,7 @@ class Optics:
     fold_r: float
     field_rad: float
     blur_px: float = 0.0
+    scale: float | None = None
 
     @classmethod
     def from_camera(cls, camera: CameraConfig) -> Optics:
@@ -77,7 +80,7 @@ class Optics:
 
         With x = X / Z, y = Y / Z and r^2 = x^2 + y^2:
         x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' likewise (Brown 1971).
-        Pixel = center + f x'.
+        Pixel = center + f x', then scaled about the center.
         """
         # NaN in Z marks directions without an image.
         z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
@@ -87,7 +90,8 @@ class Optics:
         center = self.camera.center_px
         if any(self.camera.distortion):
             x, y = distort(self.camera.distortion, self.fold_r, x, y)
-        return np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
+        xy_px = np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
+        return xy_px if self.scale is None else center + self.scale * (xy_px - center)
 
     def throughput(self, cos_field: Floats) -> Floats:
         """Relative throughput at field angles theta of any shape: cos(theta) V(theta), zero behind the camera.
@@ -100,25 +104,6 @@ class Optics:
         if config is None:
             return cosine
         return cosine * VIGNETTING[config.kind](config, np.arccos(np.minimum(cosine, 1)))
-
-
-@dataclass(frozen=True, slots=True)
-class ScaledOptics(Optics):
-    """A lens whose image is scaled about the principal point; a negative scale mirrors it through the axis."""
-
-    scale: float = 1.0
-
-    @classmethod
-    def of(cls, optics: Optics, scale: float) -> ScaledOptics:
-        """The lens `optics` with its image scaled, and without its blur."""
-        return cls(
-            optics.camera, optics.collecting_m2, optics.fold_r, optics.field_rad, scale=scale
-        )
-
-    def project(self, vectors_cam: Floats) -> Floats:
-        """As `Optics.project`, then scaled about the principal point."""
-        center = np.array(self.camera.center_px)
-        return center + self.scale * (Optics.project(self, vectors_cam) - center)
 
 
 def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:

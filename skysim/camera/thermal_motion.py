@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.optics import Optics, ScaledOptics
+from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
 from skysim.core.types import Mount, Sources
 from skysim.scene.sections.surroundings import (
@@ -93,4 +93,4 @@ def camera_at(
     difference_k = temperature_c(config, t_s) - config.reference_c
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
     scale = 1 + PPM * config.lens_ppm_k * difference_k
-    return mount, ScaledOptics.of(optics, scale) if config.lens_ppm_k else optics
+    return mount, replace(optics, scale=scale) if config.lens_ppm_k else optics

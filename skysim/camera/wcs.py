@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import distort, field_rad, fold_r
 from skysim.core.types import Bools, Floats
 from skysim.scene.opencv_calibration import OpencvCalibration
+from skysim.sources.stars import sky_axes
 
 MAX_ORDER = 9  # the highest that SIP allows
 TARGET_ERROR_PX = 1e-4  # the fit stops at the first order with a smaller error
@@ -55,9 +56,7 @@ def header(camera: OpencvCalibration, cam_from_icrs: Rotation) -> dict[str, Any]
     right, down, boresight = cam_from_icrs.as_matrix()
     ra = np.arctan2(boresight[1], boresight[0])
     dec = np.arcsin(np.clip(boresight[2], -1, 1))
-    # Unit vectors to the east and to the north at the tangent point.
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    east, north, _ = sky_axes(ra, dec)
     scale = np.degrees(1 / camera.focal_px)
     distortion = fit_sip(camera)
     suffix = "-SIP" if distortion else ""
@@ -124,11 +123,10 @@ def fit_sip(camera: OpencvCalibration) -> Sip | None:
         powers = [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
         design = monomials(distorted_px / scale, powers)
         solution = np.linalg.lstsq(design, undistorted_px - distorted_px, rcond=None)[0]
-        a: Coefficients = {}
-        b: Coefficients = {}
-        for (p, q), (in_a, in_b) in zip(powers, solution.tolist(), strict=True):
-            a[p, q] = in_a / scale ** (p + q)
-            b[p, q] = in_b / scale ** (p + q)
+        a, b = (
+            {(p, q): one / scale ** (p + q) for (p, q), one in zip(powers, side, strict=True)}
+            for side in solution.T.tolist()
+        )
         # 3. Round trip.
         round_trip = distorted(
             chip_px + monomials(chip_px / scale, powers) @ solution, camera

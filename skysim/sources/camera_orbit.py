@@ -22,7 +22,6 @@ from skysim.core.time import tt_jd
 from skysim.core.types import Bools, Floats
 from skysim.scene.sections.surroundings import (
     CircularOrbitConfig,
-    OemOrbitConfig,
     TleOrbitConfig,
 )
 from skysim.scene.sections.vehicle import SiteConfig
@@ -36,7 +35,6 @@ from skysim.sources.ephemeris import (
 )
 from skysim.sources.orbit_elements import (
     MeanElements,
-    OrbitEphemeris,
     check_epochs,
     gcrs_states,
     read_elements,
@@ -137,21 +135,6 @@ class TleOrbit:
         return GcrsState(position_m, velocity_m_s)
 
 
-@dataclass(frozen=True, slots=True)
-class OemOrbit:
-    """An orbit given by samples, as a polynomial between them."""
-
-    ephemeris: OrbitEphemeris
-
-    def states(self, after_s: Floats) -> GcrsState:
-        return GcrsState(*self.ephemeris.at(after_s))
-
-
-def circular(config: CircularOrbitConfig, start: datetime.datetime) -> CircularOrbit:
-    """A circular orbit; it does not depend on the scene's start."""
-    return CircularOrbit(config)
-
-
 def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
     """The orbit of one satellite of a file of TLEs or OMMs.
 
@@ -176,15 +159,10 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
     return TleOrbit(chosen, start)
 
 
-def oem(config: OemOrbitConfig, start: datetime.datetime) -> OemOrbit:
-    """The orbit of an OEM file."""
-    return OemOrbit(read_oem(config.file, start))
-
-
 ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {
-    "circular": circular,
+    "circular": lambda config, _start: CircularOrbit(config),
     "tle": tle,
-    "oem": oem,
+    "oem": lambda config, start: read_oem(config.file, start),
 }
 
 

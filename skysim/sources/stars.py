@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from dataclasses import replace
+from typing import Any
 
 import erfa
 import numpy as np
@@ -175,6 +176,18 @@ def steady_points(
     )
 
 
+def sky_axes(ra_rad: Any, dec_rad: Any) -> tuple[Floats, Floats, Floats]:
+    """Unit vectors (..., 3) to the east and to the north of directions on the sky, and along them."""
+    sin_a = np.sin(ra_rad)
+    cos_a = np.cos(ra_rad)
+    sin_d = np.sin(dec_rad)
+    cos_d = np.cos(dec_rad)
+    east = [-sin_a, cos_a, np.zeros_like(sin_a)]
+    north = [-sin_d * cos_a, -sin_d * sin_a, cos_d]
+    toward = [cos_d * cos_a, cos_d * sin_a, sin_d]
+    return np.stack(east, -1), np.stack(north, -1), np.stack(toward, -1)
+
+
 def cam_from_icrs(
     ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats
 ) -> Rotation:
@@ -192,11 +205,6 @@ def cam_from_icrs(
         Position angle of the image's up (-y) at the boresight, from north through east
     """
     ra, dec, roll = (np.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
-    # Unit vectors to the east, to the north and along the boresight.
-    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
-    north = np.stack(
-        [-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)], axis=-1
-    )
-    z = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+    east, north, z = sky_axes(ra, dec)
     y = -(np.cos(roll)[..., None] * north + np.sin(roll)[..., None] * east)
     return Rotation.from_matrix(np.stack([np.cross(y, z), y, z], axis=-2))

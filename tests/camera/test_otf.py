@@ -14,6 +14,7 @@ from scipy.signal import fftconvolve
 from skysim.camera.psf.kernel import (
     HARMONIC_FLOOR,
     Kernel,
+    PsfModel,
     bandwidth,
     build_kernel,
     pack_table,
@@ -302,7 +303,7 @@ def test_nearly_equal_sizes_share_a_kernel() -> None:
 @pytest.mark.long
 def test_sharp_images_use_a_grid_and_blurred_ones_tables() -> None:
     lens = camera(f_number=1.4, pixel="9.9 um")
-    assert round_kernel(AiryPsfConfig(kind="airy"), lens, 0, 0, 0) is None
+    assert round_kernel(PsfModel(AiryPsfConfig(kind="airy"), lens, 0.0, ())) is None
     assert len(build_kernel(AiryPsfConfig(kind="airy"), lens).grid)
     assert len(build_kernel(AiryPsfConfig(kind="airy", sigma_px=0.6), lens).radial)
 
@@ -345,9 +346,9 @@ def test_a_measured_gaussian_is_that_gaussian(
         )
     # As few sub-pixel positions, in powers of two, as are more than seven times the highest frequency.
     assert (
-        7 * bandwidth(psf, camera(), 0.0, 1e-3)
+        7 * bandwidth(PsfModel(psf, camera(), 0.0, ()), 1e-3)
         < len(image.grid) - 3
-        <= 14 * bandwidth(psf, camera(), 0.0, 1e-3)
+        <= 14 * bandwidth(PsfModel(psf, camera(), 0.0, ()), 1e-3)
     )
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from skysim.camera.psf import splat
-from skysim.camera.psf.kernel import Kernel, build_kernel, grid_kernel, round_kernel
+from skysim.camera.psf.kernel import Kernel, PsfModel, build_kernel, grid_kernel, round_kernel
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig, MoffatPsfConfig, Psf
 from tests.helpers.splatting import add_kernel
@@ -56,17 +56,13 @@ def exact_gaussian(x: float, y: float, sigma_px: float) -> Floats:
     return np.outer(down, across)
 
 
-def steps(*sizes_px: float) -> tuple[int, ...]:
-    return tuple(round(100 * size) for size in sizes_px)
-
-
 # One of each way of drawing, all of a blur at which the pixels' own aliasing (exp(-2 pi^2 sigma^2)) is below 1e-5.
 KERNELS = {
     "gaussian": build_kernel(gaussian(0.8), CAMERA),
     "T0": build_kernel(gaussian(2.0), CAMERA, 0, 6),
     "T0, T4": build_kernel(gaussian(0.8), CAMERA, 0, 6),
     "T0 to T8": build_kernel(gaussian(0.25), CAMERA, 0, 3),
-    "grid": grid_kernel(gaussian(0.8), CAMERA, *steps(0, 3, 0)),
+    "grid": grid_kernel(PsfModel(gaussian(0.8), CAMERA, 0.0, (3.0,))),
 }
 every_kernel = pytest.mark.parametrize("image", KERNELS.values(), ids=KERNELS)
 
@@ -172,7 +168,7 @@ def test_a_point_through_a_gaussian_lens_is_exact(sigma_px: float) -> None:
 @pytest.mark.parametrize("make", [round_kernel, grid_kernel])
 def test_tables_give_the_error_function_s_image(make: object, sigma_px: float) -> None:
     # Radial tables end at 5 sigma, where the image has fallen to 4e-6 of its peak.
-    image: Kernel = make(gaussian(sigma_px), CAMERA, 0, 0, 0)  # type: ignore[operator]
+    image: Kernel = make(PsfModel(gaussian(sigma_px), CAMERA, 0.0, ()))  # type: ignore[operator]
     for x, y in PLACES:
         wanted = exact_gaussian(x, y, sigma_px)
         np.testing.assert_allclose(

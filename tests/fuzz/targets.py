@@ -215,7 +215,7 @@ def answers(data: bytes) -> None:
 def orbits(data: bytes) -> None:
     """An orbit or satellites: OEM, TLE, OMM."""
     path = str(write_file(data, "orbit"))
-    rejects(lambda: read_oem(path, START).at(np.zeros(1)), InputError)
+    rejects(lambda: read_oem(path, START).states(np.zeros(1)), InputError)
     rejects(lambda: gcrs_states(read_elements(path), START, np.zeros(1)), InputError)
 
 

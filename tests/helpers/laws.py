@@ -7,6 +7,7 @@ import inspect
 import os
 import pkgutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -43,7 +44,9 @@ def law(*functions: Any, slow: bool = False) -> Callable[[Test], Test]:
 
 
 def name_of(one: Any) -> str:
-    """The full name of a function, a method, a class's method or a property."""
+    """The full name of a function, of the one that a partial calls, a method, a class's method or a property."""
+    if isinstance(one, partial):
+        one = one.func
     if isinstance(one, property):
         one = one.fget
     return f"{one.__module__}.{one.__qualname__}"
@@ -93,11 +96,13 @@ def units(rng: np.random.Generator, count: int) -> Floats:
 def drawn(rng: np.random.Generator, count: int = 60) -> StarCatalog:
     """Random stars, brightest first, with larger proper motions and parallaxes than real ones."""
     hip = np.arange(1, count + 1)
-    ra = rng.uniform(0, 7, count)
-    dec = np.arcsin(rng.uniform(-1, 1, count))
+    ra = np.degrees(rng.uniform(0, 7, count))
+    dec = np.degrees(np.arcsin(rng.uniform(-1, 1, count)))
     motion = rng.normal(0, 1000, (2, count))
     light = rng.uniform(0, 800, count), np.sort(rng.uniform(-1, 6, count))
-    return catalog.from_columns(hip, ra, dec, *motion, *light, rng.uniform(1900, 2100))
+    return catalog.from_columns(
+        hip, ra, dec, *motion, *light, epoch_yr=rng.uniform(1900, 2100)
+    )
 
 
 def turn(rng: np.random.Generator, most_rad: float = np.pi) -> Rotation:

@@ -158,7 +158,9 @@ def test_an_oem_in_eme2000_differs_by_the_frame_bias(tmp_path: Path) -> None:
     places = []
     for frame in ("GCRF", "EME2000"):
         path.write_text(text.replace("GCRF", frame), encoding="utf-8")
-        places.append(orbit_elements.read_oem(str(path), START).at(np.array([30.0]))[0][0])
+        places.append(
+            orbit_elements.read_oem(str(path), START).states(np.array([30.0]))[0][0]
+        )
     assert 0.1 < np.linalg.norm(places[0] - places[1]) < 0.9
 
 

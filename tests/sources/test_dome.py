@@ -15,6 +15,7 @@ from skysim.scene.sections import light
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import dome
 from skysim.sources.dome import surface as dome_surface
+from skysim.sources.dome.layouts.placing import cap
 from skysim.sources.dome.surface import SURFACES, Ellipsoid, Plane
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 
@@ -252,7 +253,7 @@ def test_the_density_of_boards_follows_from_their_spacing(spacing_in: float) -> 
 
 def test_boards_are_uniform_in_area() -> None:
     """Fibonacci's spiral is uniform in the cosine: each tenth of the cap's area has a tenth of the boards."""
-    z = dome.cap(1000, np.radians(27))[:, 2]
+    z = cap(1000, np.radians(27))[:, 2]
     counts, _ = np.histogram(z, np.linspace(np.cos(np.radians(27)), 1, 11))
     np.testing.assert_array_equal(counts, 100)
 

@@ -16,12 +16,14 @@ from skysim.core.errors import InputError
 from skysim.core.types import Sources
 from skysim.scene import loader
 from skysim.scene.sections import light
+from skysim.scene.sections.layouts import HOLES
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
 from skysim.sources.dome.layouts import boards, spreads
 from skysim.sources.dome.layouts.led_list import led_list
+from skysim.sources.dome.layouts.registry import board_of
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
@@ -248,7 +250,7 @@ def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
 
 def test_grid_boards_lie_along_their_rows() -> None:
     leds = lit(GRID_BOARDS)
-    place = leds.place[np.argsort(leds.id), :3].reshape(-1, dome.HOLES, 3)
+    place = leds.place[np.argsort(leds.id), :3].reshape(-1, HOLES, 3)
     step_m = place[:, 1] - place[:, 0]
     # Holes 0 and 1 are neighbors along the board's first axis, which has no part along the lab's x.
     np.testing.assert_allclose(np.linalg.norm(step_m, axis=1), 0.008, rtol=0, atol=1e-15)
@@ -736,7 +738,7 @@ def assert_refused(overrides: dict[str, str], says: str) -> None:
 def test_each_led_has_its_board_s_number_if_there_are_boards() -> None:
     config = loader.load("afit_simsat").light
     leds = dome.sources(config, BAND)
-    boards = dome.board_of(config.layout, leds.id)
+    boards = board_of(config.layout, leds.id)
     assert boards is not None
     middle = np.array([leds.place[boards == b, :3].mean(axis=0) for b in np.unique(boards)])
     # Corner to corner.
@@ -744,7 +746,7 @@ def test_each_led_has_its_board_s_number_if_there_are_boards() -> None:
     spread = loader.load(
         "afit_simsat", {"light.layout": "{kind: fibonacci, cap_deg: 9, count: 5}"}
     ).light
-    assert dome.board_of(spread.layout, np.arange(5)) is None
+    assert board_of(spread.layout, np.arange(5)) is None
 
 
 # Drives

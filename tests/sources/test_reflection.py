@@ -178,7 +178,7 @@ QUADRICS = {
         np.array([0.4, 0.2, 0.5]),
     ),
     "cylinder": (
-        Cylinder(np.array([0.0, 0.0, 0.2]), radius_m=1.2, axis=0),
+        Cylinder(np.array([0.0, 0.0, 0.2]), semi_axes_m=np.array([np.inf, 1.2, 1.2])),
         np.array([-0.1, 0.1, 0.0]),
     ),
     "flat": (Plane(np.array([0.0, 0.0, 1.2])), np.array([0.3, 0.2, 0.9])),
@@ -205,9 +205,8 @@ def bounce(name: str, start: Floats, toward: Floats) -> tuple[Floats, Floats]:
         normal = np.tile([0.0, 0.0, -1.0], (len(toward), 1))
         hit = start + steps[:, None] * toward
     else:
-        weights = (
-            1 / (wall.semi_axes_m if isinstance(wall, Ellipsoid) else wall.semi_axes_m()) ** 2
-        )  # type: ignore[union-attr]
+        assert isinstance(wall, Ellipsoid)
+        weights = 1 / wall.semi_axes_m**2
         a = (toward**2) @ weights
         b = 2 * (toward * (start - wall.center_m)) @ weights
         c = (start - wall.center_m) ** 2 @ weights - 1

@@ -35,6 +35,7 @@ from skysim.scene.sections.surroundings import (
     UniformGlowConfig,
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
+from skysim.sources.stars import sky_axes
 
 # Starlight: the light of the stars that are too faint to be drawn one by one.
 
@@ -251,11 +252,7 @@ BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
 
 def direction(ra_deg: float, dec_deg: float) -> Floats:
     """(3,) unit vector of a right ascension and declination."""
-    ra = math.radians(ra_deg)
-    dec = math.radians(dec_deg)
-    return np.array(
-        [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
-    )
+    return sky_axes(math.radians(ra_deg), math.radians(dec_deg))[2]
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
@@ -288,19 +285,20 @@ def glow_map(
 
 
 @lru_cache(maxsize=8)
-def node_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
+def node_directions(
+    optics: Optics, spacing_px: float | None = None
+) -> tuple[Floats, Floats, tuple[int, int]]:
     """`pixel_directions` at the nodes, and the nodes' (h, w); cached, since they depend on the camera alone."""
-    xy_px, shape = nodes_px(optics.camera)
+    xy_px, shape = nodes_px(optics.camera, spacing_px)
     return *pixel_directions(xy_px, optics), shape
 
 
 def nodes_px(
-    camera: CameraConfig, spacing: float | None = None
+    camera: CameraConfig, spacing_px: float | None = None
 ) -> tuple[Floats, tuple[int, int]]:
-    """(h * w, 2) pixel positions of the nodes, row by row, and (h, w); the glow's spacing if none is given."""
-    spacing = spacing or min(
-        MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0)
-    )
+    """(h * w, 2) pixel positions of nodes at most this far apart, row by row, and (h, w); None for smooth light."""
+    smooth_px = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
+    spacing = spacing_px or smooth_px
     w, h = (
         math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px)
     )

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.background import (
     even_grid_px,
     fill,
+    nodes_px,
     pixel_directions,
     viewing_geometry,
 )
@@ -92,8 +93,7 @@ def projector_glow(
 @lru_cache(maxsize=2)
 def chip_directions(optics: Optics) -> tuple[Floats, Floats]:
     """Viewing directions of all pixels of the chip, (H * W, 3) in camera axes, and their solid angles."""
-    y, x = np.indices((optics.camera.height_px, optics.camera.width_px), dtype=float)
-    return pixel_directions(np.column_stack([x.ravel(), y.ravel()]), optics)
+    return pixel_directions(nodes_px(optics.camera, 1.0)[0], optics)
 
 
 def panel_radiance_e_s_m2_sr(

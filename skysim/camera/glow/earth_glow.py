@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
     angular_separation_deg,
-    nodes_px,
-    pixel_directions,
+    node_directions,
     transmittance,
     viewing_geometry,
 )
@@ -87,17 +86,10 @@ def earth_light(
     reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
     if from_nadir_rad > reach_rad + optics.field_rad:
         return None
-    toward, pixel_sr, shape = fine_directions(optics)
+    toward, pixel_sr, shape = node_directions(optics, NODE_PX)
     view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
     radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
     return (radiance * view.etendue_m2_sr()).reshape(shape)
-
-
-@lru_cache(maxsize=4)
-def fine_directions(optics: Optics) -> tuple[Floats, Floats, tuple[int, int]]:
-    """Viewing directions and solid angles of pixels at nodes NODE_PX apart, and the nodes' (h, w)."""
-    xy_px, shape = nodes_px(optics.camera, NODE_PX)
-    return *pixel_directions(xy_px, optics), shape
 
 
 # Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side. A body's irradiance

@@ -10,7 +10,7 @@ with the principal point c; m > 0 puts the ghost on the other side. A ghost take
 vignetting like its light.
 
 Glare is light that rough or dirty surfaces scatter over the chip (`add_glare`). The wall of a dome glows with the light
-that it scatters (`wall_glow`), and LEDs are mirrored in it (`images_in_wall`).
+that it scatters (`wall_glow`), and LEDs are mirrored in it (`mirror.mirrored`).
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import node_directions, unproject, viewing_geometry
-from skysim.camera.optics import Optics, ScaledOptics
-from skysim.core.types import Floats, Sources, SourceTruth
+from skysim.camera.optics import Optics
+from skysim.core.types import Floats, SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
-from skysim.sources.dome.mirror import mirrored
 from skysim.sources.photometry import Band
 from skysim.sources.satellites import GHOST
 
@@ -38,7 +37,7 @@ BLUR_PX = 0.7  # sigma of the edge of a ghost's disk
 
 
 @lru_cache(maxsize=64)
-def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
+def ghost_optics(optics: Optics, ghost: GhostConfig) -> Optics:
     """The lens as a pair of surfaces images through it: `share` of the light, spread over a disk.
 
     Its field contains every light whose ghost reaches the chip.
@@ -48,8 +47,8 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> ScaledOptics:
     reach = (1 + ghost.radius_px / camera.corner_px) / abs(ghost.magnification)
     field_rad = math.atan(math.tan(optics.field_rad) * reach)
     collecting_m2 = optics.collecting_m2 * ghost.share
-    scale = -ghost.magnification * getattr(optics, "scale", 1.0)
-    return ScaledOptics(camera, collecting_m2, optics.fold_r, field_rad, scale=scale)
+    scale = -ghost.magnification * (optics.scale or 1.0)
+    return Optics(camera, collecting_m2, optics.fold_r, field_rad, scale=scale)
 
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
@@ -190,21 +189,6 @@ def spread(
     places = (np.linspace(0, 1, count) for count in IRRADIANCE)
     nodes = (np.linspace(0, 1, count) for count in shape)
     return np.asarray(RectBivariateSpline(*places, values, kx=1, ky=1)(*nodes)).ravel()
-
-
-def images_in_wall(
-    dome: ReflectingDome,
-    leds: Sources,
-    optics: Optics,
-    cam_from_lab: Rotation,
-    camera_m: Floats,
-) -> Sources:
-    """The images of the LEDs in the wall that are in the field, for a camera at rest.
-
-    They keep their virtual places while the camera moves during the exposure, which is exact for a flat wall.
-    """
-    grid = chip_grid(optics, GRID, MARGIN) @ cam_from_lab.as_matrix()
-    return mirrored(dome.config, dome.wall, leds, camera_m, grid)
 
 
 @lru_cache(maxsize=8)

@@ -112,14 +112,15 @@ def build_kernel(
     InputError
         For an unreadable file of a measured PSF.
     """
-    steps = tuple(
-        round(value / QUANTUM_PX)
+    sigma_px, *radii_px = (
+        QUANTUM_PX * round(value / QUANTUM_PX)
         for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
     )
-    if psf.kind == "gaussian" and not (steps[1] or steps[2]):
+    model = PsfModel(psf, camera, sigma_px, tuple(filter(None, radii_px)))
+    if psf.kind == "gaussian" and not model.radii_px:
         return Kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)), NO_RADIAL, NO_GRID)
-    round_image = None if psf.kind in NOT_ROUND else round_kernel(psf, camera, *steps)
-    return round_image or grid_kernel(psf, camera, *steps)
+    round_image = None if psf.kind in NOT_ROUND else round_kernel(model)
+    return round_image or grid_kernel(model)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,16 +131,6 @@ class PsfModel:
     camera: CameraConfig
     sigma_px: float
     radii_px: tuple[float, ...]
-
-    @classmethod
-    def from_steps(cls, psf: Psf, camera: CameraConfig, sigma: int, *radii: int) -> PsfModel:
-        """The model from sizes in steps of QUANTUM_PX."""
-        return cls(
-            psf,
-            camera,
-            sigma * QUANTUM_PX,
-            tuple(radius * QUANTUM_PX for radius in radii if radius),
-        )
 
     def otf(self, fx: Floats, fy: Floats, extra_sigma_px: float) -> Otf:
         """The product of the factors' transfer functions, without the pixel's, times that of an extra Gaussian."""
@@ -174,9 +165,10 @@ def passband(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> f
     return float(f[np.flatnonzero(combined >= level)[-1]])
 
 
-def bandwidth(psf: Psf, camera: CameraConfig, sigma_px: float, level: float) -> float:
+def bandwidth(model: PsfModel, level: float) -> float:
     """`passband` in steps of a half from 1 to 64, so that similar sizes share tables."""
-    return float(max(np.ceil(2 * passband(psf, camera, sigma_px, level)) / 2, 1.0))
+    passed = passband(model.psf, model.camera, model.sigma_px, level)
+    return float(max(np.ceil(2 * passed) / 2, 1.0))
 
 
 def softening_sigma_px(bandwidth: float, highest: float) -> float:
@@ -236,7 +228,7 @@ def fourier_bessel_series(
 
 
 @lru_cache(maxsize=4096)
-def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
+def round_kernel(model: PsfModel) -> Kernel | None:
     """A kernel of radial tables; None where three harmonics cannot represent the pixel's corners.
 
     1. Size of the image and of the series' circle, highest frequency and number of terms.
@@ -247,9 +239,8 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     A series holds at most 16 cycles a pixel and MAX_TERMS terms; a sharper image is softened to that: an image of 130
     px radius by 0.2 px.
     """
-    model = PsfModel.from_steps(psf, camera, *steps)
     reach = model.reach_px()
-    highest_passed = bandwidth(psf, camera, model.sigma_px, OTF_FLOOR)
+    highest_passed = bandwidth(model, OTF_FLOOR)
     # 1. Radii in coarse steps, so that images of similar size share a cached series.
     step = 4.0 if reach < 64 else 16.0
     sizes = reach, reach + model.wing_margin_px()
@@ -270,7 +261,7 @@ def round_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel | None:
     if np.abs(harmonics[2]).max() > min(MAX_T8[0] * harmonics[0].max(), MAX_T8[1]):
         return None
     # 4. A sharp end would alias with the pixel grid.
-    if psf.kind in WINGED:
+    if model.psf.kind in WINGED:
         s = np.clip((reach - np.arange(count) / PER_PX) / FADE_PX, 0, 1)
         harmonics *= s**2 * (3 - 2 * s)
     return Kernel(0.0, pack_table(harmonics), NO_GRID)
@@ -326,7 +317,7 @@ def pack_table(harmonics: Floats) -> Singles:
 
 
 @lru_cache(maxsize=64)
-def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
+def grid_kernel(model: PsfModel) -> Kernel:
     """A kernel of tables at S x S sub-pixel positions, by a fast Fourier transform of the product.
 
     1. S is a power of two from 4 to 128: more than seven times the highest frequency, but less for a large image.
@@ -334,9 +325,8 @@ def grid_kernel(psf: Psf, camera: CameraConfig, *steps: int) -> Kernel:
     3. Sort the samples: one table of pixels for each sub-pixel position, each normalized to 1.
     """
     # 1. Number of samples.
-    model = PsfModel.from_steps(psf, camera, *steps)
     half = int(np.ceil(model.reach_px()))
-    highest_passed = bandwidth(psf, camera, model.sigma_px, 1e-3)
+    highest_passed = bandwidth(model, 1e-3)
     size = 2 * half + 1
     samples = 128
     while samples > 4 and (samples >= 14 * highest_passed or samples * size > 3072):

@@ -79,16 +79,13 @@ class KernelCache(NamedTuple):
     rows
         Row of each key in the lists that follow
     kernels
-        Kind, sigma_px, reach_px and sharp_px of each kernel
-    spans
-        The row of `Kernels.table` of each kernel
+        Kind, sigma_px, reach_px and sharp_px of each kernel, and its row of `Kernels.table`
     tables
         One element: all tables joined
     """
 
     rows: dict[tuple[int, ...], int]
-    kernels: list[tuple[int, float, float, float]]
-    spans: list[tuple[int, int, int, int]]
+    kernels: list[tuple[float, ...]]
     tables: list[Singles]
 
 
@@ -100,7 +97,7 @@ MAX_RADIUS_PX = 500.0
 @lru_cache(maxsize=16)
 def kernel_cache(camera: CameraConfig) -> KernelCache:
     """The kernel cache of a camera, empty at first."""
-    return KernelCache({}, [], [], [np.empty(0, np.float32)])
+    return KernelCache({}, [], [np.empty(0, np.float32)])
 
 
 def source_kernels(
@@ -262,9 +259,9 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     add_kernels(cache, camera, used)
     rows = np.array([cache.rows[key] for key in used], dtype=np.int64)[inverse]
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
-    properties = np.array(cache.kernels).reshape(-1, 4)[rows]
-    kind, sigma, reach, sharp = np.ascontiguousarray(properties.T)
-    spans = np.array(cache.spans, dtype=np.int64).reshape(-1, 4)[rows]
+    properties = np.array(cache.kernels).reshape(-1, 8)[rows]
+    kind, sigma, reach, sharp = np.ascontiguousarray(properties[:, :4].T)
+    spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
     return Kernels(
@@ -278,13 +275,12 @@ def widened(kernels: Kernels, extra_px: Floats) -> Kernels:
     Standard deviation and sharpness grow in proportion, the reach with them.
     """
     point = kernels.kind == GAUSS
-    widening = np.hypot(kernels.sigma_px, extra_px) / np.where(point, kernels.sigma_px, 1)
+    sigma_px = np.where(point, kernels.sigma_px, 1)
+    widening = np.where(point, np.hypot(sigma_px, extra_px) / sigma_px, 1)
     return kernels._replace(
-        sigma_px=np.where(point, kernels.sigma_px * widening, kernels.sigma_px),
-        reach_px=np.where(
-            point, kernels.reach_px * np.maximum(widening, 1), kernels.reach_px
-        ),
-        sharp_px=np.where(point, kernels.sharp_px * widening, kernels.sharp_px),
+        sigma_px=kernels.sigma_px * widening,
+        reach_px=kernels.reach_px * np.maximum(widening, 1),
+        sharp_px=kernels.sharp_px * widening,
     )
 
 
@@ -387,8 +383,7 @@ def add_kernels(
     for key in dict.fromkeys(key for key in keys if key not in cache.rows):
         properties, sizes, table = make_kernel(camera, key)
         cache.rows[key] = len(cache.kernels)
-        cache.kernels.append(properties)
-        cache.spans.append((begin, begin + table.size, *sizes))
+        cache.kernels.append((*properties, begin, begin + table.size, *sizes))
         tables.append(table.ravel())
         begin += table.size
         if 4 * begin > 2 * CACHE_BYTES:

@@ -240,16 +240,16 @@ PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {
 }
 
 
-def moffat_reach_px(psf: MoffatPsfConfig, camera: CameraConfig) -> float:
+def moffat_extent_px(psf: MoffatPsfConfig, camera: CameraConfig) -> tuple[float, float]:
     """Radius where a Moffat profile falls below WING_LEVEL of its image's peak pixel; at most 64 px or four alpha."""
     alpha = moffat_alpha_px(psf)
     # A sharp profile's peak pixel has at most all of the light.
     level = WING_LEVEL / max(1.0, (psf.beta - 1) / (np.pi * alpha**2))
     radius = alpha * np.sqrt(level ** (-1 / psf.beta) - 1)
-    return float(min(radius, max(64.0, 4 * alpha)))
+    return float(min(radius, max(64.0, 4 * alpha))), 0.0
 
 
-def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
+def airy_extent_px(psf: AiryPsfConfig, camera: CameraConfig) -> tuple[float, float]:
     """Radius where the mean of Airy's rings, 4 / (pi z^3) of its peak at z = pi r / (lambda N), falls below WING_LEVEL.
 
     At most 64 px or eight lambda N. The light beyond, 2 / (pi z), is 2.5 % at most.
@@ -257,21 +257,21 @@ def airy_reach_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
     unit = airy_unit_px(psf, camera)
     sharp = max(1.0, np.pi / 4 / unit**2)
     z = (4 / np.pi / WING_LEVEL * sharp) ** (1 / 3)
-    return float(min(z * unit / np.pi, max(64.0, 8 * unit)))
+    return float(min(z * unit / np.pi, max(64.0, 8 * unit))), psf.sigma_px
 
 
-def measured_reach_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> float:
+def measured_extent_px(psf: MeasuredPsfConfig, camera: CameraConfig) -> tuple[float, float]:
     """The farthest cell's distance in x or y, plus the two cells that interpolation adds."""
-    return float(np.abs(cell_positions_px(psf)).max() + 2 / psf.oversampling)
+    return float(np.abs(cell_positions_px(psf)).max() + 2 / psf.oversampling), 0.0
 
 
 # By kind: radius that holds the light of a point, and sigma of the Gaussian that widens it, both in pixels.
 EXTENT: dict[str, Callable[[Any, CameraConfig], tuple[float, float]]] = {
     "gaussian": lambda psf, camera: (0.0, psf.sigma_px),
-    "moffat": lambda psf, camera: (moffat_reach_px(psf, camera), 0.0),
-    "airy": lambda psf, camera: (airy_reach_px(psf, camera), psf.sigma_px),
+    "moffat": moffat_extent_px,
+    "airy": airy_extent_px,
     "disk": lambda psf, camera: (psf.radius_px, psf.sigma_px),
-    "measured": lambda psf, camera: (measured_reach_px(psf, camera), 0.0),
+    "measured": measured_extent_px,
 }
 WINGED = ("moffat", "airy")  # kinds with infinite wings
 NOT_ROUND = ("measured",)  # kinds that may not be round

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 from skysim.camera.glow.air_glow import air_glow
 from skysim.camera.glow.background import node_directions, viewing_geometry
@@ -18,6 +17,7 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.simulation.lights.light import (
+    AddedLight,
     Beam,
     Exposure,
     Light,
@@ -56,10 +56,9 @@ class Skyline(Obstacle):
 
 
 @dataclass(frozen=True)
-class AirGlow(Light):
+class AirGlow(AddedLight):
     """Airglow, moonlight and twilight."""
 
-    only_adds: ClassVar[bool] = True
     air: Air
     config: AirGlowConfig
 

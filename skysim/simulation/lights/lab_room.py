@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
-from skysim.camera.glow.stray import images_in_wall, wall_glow
+from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, wall_glow
 from skysim.core.types import Bools, Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.light import (
+    AddedLight,
     Beam,
     Exposure,
     Light,
@@ -26,6 +26,7 @@ from skysim.simulation.lights.light import (
 )
 from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
 from skysim.sources.dome.led import warm_up_factor
+from skysim.sources.dome.mirror import mirrored
 from skysim.sources.dome.surface import Surface, build_surface
 
 # Reflections: a glow if the surface scatters, images if it mirrors.
@@ -40,10 +41,9 @@ IMAGES = images_of("LEDs")
 
 
 @dataclass(frozen=True)
-class WallGlow(Light):
+class WallGlow(AddedLight):
     """The glow of wall and floor, which decreases with the strength of the LEDs as they warm up."""
 
-    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
     warm_up: WarmUpConfig | None
 
@@ -63,10 +63,9 @@ class WallGlow(Light):
 
 
 @dataclass(frozen=True)
-class Mirror(Light):
+class Mirror(AddedLight):
     """The images of the LEDs, and of other lights in the laboratory, in the wall."""
 
-    only_adds: ClassVar[bool] = True
     dome: ReflectingDome
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
@@ -76,10 +75,14 @@ class Mirror(Light):
         return beam
 
     def image(self, lit: Lit, exposure: Exposure) -> Lit:
-        """The images of one light in the wall; the same obstacles hide them."""
+        """The images of one light in the wall that are in the field; the same obstacles hide them.
+
+        They keep their virtual places while the camera moves during the exposure, which is exact for a flat wall.
+        """
         assert lit.points is not None
-        images = images_in_wall(
-            self.dome, lit.points, exposure.optics, exposure.cam_from_lab, exposure.camera_m
+        grid = chip_grid(exposure.optics, GRID, MARGIN) @ exposure.cam_from_lab.as_matrix()
+        images = mirrored(
+            self.dome.config, self.dome.wall, lit.points, exposure.camera_m, grid
         )
         return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e
 from skysim.camera.glow.stray import ghost_optics
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
 from skysim.simulation.lights.light import (
+    AddedLight,
     Beam,
     Exposure,
     Light,
@@ -28,10 +28,9 @@ STRAY_LIGHT = "stray light"
 
 
 @dataclass(frozen=True)
-class Baffle(Light):
+class Baffle(AddedLight):
     """Stray light past the baffle from all bodies that nothing hides, and from the Earth, uniform over the detector."""
 
-    only_adds: ClassVar[bool] = True
     config: BaffleConfig
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
@@ -70,10 +69,9 @@ def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Ghosts(Light):
+class Ghosts(AddedLight):
     """Ghost images: pairs of surfaces of the lens reflect light onto the detector a second time."""
 
-    only_adds: ClassVar[bool] = True
     ghosts: tuple[GhostConfig, ...]
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
@@ -85,10 +83,9 @@ class Ghosts(Light):
 
 
 @dataclass(frozen=True)
-class Glare(Light):
+class Glare(AddedLight):
     """Veiling glare: light that the lens scatters over the detector."""
 
-    only_adds: ClassVar[bool] = True
     config: GlareConfig
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:

@@ -17,14 +17,14 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import ClassVar, NamedTuple, Self, TypeVar
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.discs import FEW, Exposed, centers_of
+from skysim.camera.discs import Exposed, centers_of
 from skysim.camera.optics import Optics
-from skysim.camera.projection import Poses, poses
+from skysim.camera.projection import Poses
 from skysim.camera.render import OcclusionTest, Window
 from skysim.core.types import Bools, Floats, Mount, SatelliteTruth, Sources, Trajectory
 from skysim.dynamics.multibody.model import VehicleModel
@@ -127,9 +127,8 @@ class Exposure:
 
     @cached_property
     def few_poses(self) -> Poses:
-        """FEW poses over the exposure, to find sources near the field."""
-        end_s = self.window.close_s(self.optics.camera.height_px)
-        return poses(self.trajectory, self.mount, np.linspace(self.window.open_s, end_s, FEW))
+        """Poses over the exposure, to find sources near the field."""
+        return self.exposed(self.optics).few_poses()
 
     @cached_property
     def pose(self) -> Poses:
@@ -312,7 +311,7 @@ class Light:
         Whether it neither hides nor changes other lights, and no tracker knows it
     """
 
-    only_adds: ClassVar[bool] = False
+    only_adds = False
 
     def during(self, exposure: Exposure) -> Lit:
         """The light of this source in an exposure."""
@@ -321,6 +320,12 @@ class Light:
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
         """The beam after this light: with its own light added, and with its effect on the lights before it."""
         return beam.plus(self.during(exposure))
+
+
+class AddedLight(Light):
+    """A light that only adds; see `Light.only_adds`."""
+
+    only_adds = True
 
 
 @dataclass(frozen=True)

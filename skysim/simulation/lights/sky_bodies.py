@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
 from skysim.core.types import Bools, Floats
 from skysim.scene.sections.light import BodiesConfig, StarsConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
+    AddedLight,
     EdgedGlow,
     Exposure,
     Light,
@@ -81,7 +81,7 @@ def build_earth(plan: LightPlan) -> Iterator[Light]:
 
 
 @dataclass(frozen=True)
-class Satellites(Light):
+class Satellites(AddedLight):
     """Artificial satellites that can cross the field: those of a file, then random ones.
 
     Attributes
@@ -92,7 +92,6 @@ class Satellites(Light):
         Orbital elements of the file; None without a file
     """
 
-    only_adds: ClassVar[bool] = True
     config: SatellitesConfig
     elements: MeanElements | None
 

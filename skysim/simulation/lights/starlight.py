@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,7 +13,14 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, StarSources
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import Glow
-from skysim.simulation.lights.light import Exposure, KnownLight, Light, LightPlan, Lit
+from skysim.simulation.lights.light import (
+    AddedLight,
+    Exposure,
+    KnownLight,
+    Light,
+    LightPlan,
+    Lit,
+)
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
 
@@ -92,10 +98,9 @@ BACKGROUND = "background"
 
 
 @dataclass(frozen=True)
-class BackgroundLight(Light):
+class BackgroundLight(AddedLight):
     """Extended light that does not change from frame to frame."""
 
-    only_adds: ClassVar[bool] = True
     glows: tuple[Glow, ...]
 
     def during(self, exposure: Exposure) -> Lit:

@@ -9,16 +9,8 @@ from __future__ import annotations
 
 from skysim.core.types import Sources
 from skysim.scene.sections import light
-from skysim.scene.sections.layouts import HOLES as HOLES
-from skysim.sources.dome.layouts.boards import patch_boards as patch_boards
-from skysim.sources.dome.layouts.placing import cap as cap
-from skysim.sources.dome.layouts.registry import LAYOUTS as LAYOUTS
-from skysim.sources.dome.layouts.registry import board_of as board_of
+from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.room import check_room
-from skysim.sources.dome.surface import SURFACES as SURFACES
-from skysim.sources.dome.surface import Ellipsoid as Ellipsoid
-from skysim.sources.dome.surface import Plane as Plane
-from skysim.sources.dome.surface import Surface as Surface
 from skysim.sources.dome.surface import build_surface
 from skysim.sources.photometry import Band
 

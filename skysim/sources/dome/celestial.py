@@ -41,6 +41,10 @@ class ProjectedStars(NamedTuple):
     shown_mag: Floats
     place_m: Floats
 
+    def take(self, which: slice | Ints) -> ProjectedStars:
+        """Select stars by index."""
+        return ProjectedStars(*(column[which] for column in self))  # type: ignore[arg-type]
+
 
 def project_stars(
     config: layouts.CelestialConfig, surface: Surface, led: leds.LedConfig, band: Band
@@ -133,12 +137,8 @@ def merge_stars(stars: ProjectedStars, target: Ints) -> ProjectedStars:
     ).T
     v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
-    return ProjectedStars(
-        stars.hip[first][order],
-        v_mag[order],
-        combined_mag(stars.shown_mag)[order],
-        place_m[order],
-    )
+    shown_mag = combined_mag(stars.shown_mag)
+    return ProjectedStars(stars.hip[first], v_mag, shown_mag, place_m).take(order)
 
 
 def merge_close_stars(
@@ -149,9 +149,7 @@ def merge_close_stars(
     A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
     LEDs are too near.
     """
-    selected = ProjectedStars(
-        stars.hip[:count], stars.v_mag[:count], stars.shown_mag[:count], stars.place_m[:count]
-    )
+    selected = stars.take(slice(count))
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):

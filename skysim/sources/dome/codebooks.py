@@ -137,7 +137,7 @@ def de_bruijn(count: int, levels: int) -> Words:
 
 def gray(count: int) -> Words:
     """(count, bits) numbers n in the reflected binary code, n xor n / 2; the least distance is 1."""
-    bits = max((count + 1).bit_length(), 2)
+    bits = data_bits(count)
     number = np.arange(2**bits)
     return without_constant(bits_of(number ^ number >> 1, bits))[:count]
 

@@ -86,27 +86,19 @@ def diffuse_light(
         patches = Patches(
             *(np.concatenate(pair) for pair in zip(patches, floor, strict=True))
         )
-    # 2. Direct light.
-    emitters = led_emitters(leds, lobe)
+    # 2. Direct light, with the strengths averaged over the pulses.
+    duty = np.minimum(leds.on_s / leds.period_s, 1.0)
+    sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
+    place_m = np.ascontiguousarray(leds.place[:, :3])
+    emitters = Emitters(place_m, leds.normal, leds.strength * duty, sampled)
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)
     total = np.asarray(np.linalg.solve(np.eye(len(transfer)) - transfer, direct))
-    return DiffuseLight(emitters, patch_emitters(patches, total))
-
-
-def led_emitters(leds: Sources, lobe: Lobe) -> Emitters:
-    """The LEDs as emitters, with their strengths averaged over their pulses."""
-    duty = np.minimum(leds.on_s / leds.period_s, 1.0)
-    sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
-    place_m = np.ascontiguousarray(leds.place[:, :3])
-    return Emitters(place_m, leds.normal, leds.strength * duty, sampled)
-
-
-def patch_emitters(patches: Patches, irradiance_e_s_m2: Floats) -> Emitters:
-    """Lambertian patches of this irradiance as emitters: the radiance is rho E / pi."""
-    strength = patches.reflectance * irradiance_e_s_m2 * patches.area_m2 / np.pi
-    return Emitters(patches.place_m, patches.normal, strength, np.linspace(0, 1, 2))
+    # Lambertian patches of this irradiance have the radiance rho E / pi.
+    strength = patches.reflectance * total * patches.area_m2 / np.pi
+    linear = np.linspace(0, 1, 2)
+    return DiffuseLight(emitters, Emitters(patches.place_m, patches.normal, strength, linear))
 
 
 def wall_patches(wall: Surface, reflectance: float) -> Patches:

@@ -209,7 +209,9 @@ class Ellipsoid(Surface):
         # A sphere is the same at every tilt.
         if self.lab_from_own.magnitude() > 0 and np.ptp(self.semi_axes_m) > 0:
             return fit_ellipsoid(self.samples_m())
-        return FittedEllipsoid(self.center_m, self.semi_axes_m, 0.0)
+        # An infinite axis becomes one so long that the ellipsoid is straight.
+        semi_axes_m = np.minimum(self.semi_axes_m, FLAT_RADIUS_M)
+        return FittedEllipsoid(self.center_m, semi_axes_m, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,43 +255,20 @@ class Plane(Surface):
 
 
 @dataclass(frozen=True, slots=True)
-class Cylinder(Surface):
-    """A cylinder: sum((x_i / radius)^2) = 1 over the two axes i across it, in its own frame.
+class Cylinder(Ellipsoid):
+    """A cylinder: an ellipsoid with an infinite semi-axis along an axis of its own frame.
 
     Attributes
     ----------
-    axis
-        0, 1 or 2 for an axis along its own x, y or z
     half_length_m
         Half the extent along the axis
     """
 
-    radius_m: float
-    axis: int
     half_length_m: float = math.inf
 
-    def semi_axes_m(self, along_m: float = math.inf) -> Floats:
-        """Semi-axes of the cylinder as an ellipsoid, of this length along the axis."""
-        return np.where(np.arange(3) == self.axis, along_m, self.radius_m)
-
-    def level(self, own_m: Floats) -> Floats:
-        return np.sum((own_m / self.semi_axes_m()) ** 2, axis=1) - 1
-
-    def gradient(self, own_m: Floats) -> Floats:
-        return own_m / self.semi_axes_m() ** 2
-
-    def distance(self, start_m: Floats, along: Floats) -> Floats:
-        return exit_distance(start_m / self.semi_axes_m(), along / self.semi_axes_m())
-
     def within(self, own_m: Floats) -> Bools:
-        inside_ends = np.abs(own_m[:, self.axis]) <= self.half_length_m + SLACK_M
-        return self.rim.contains(own_m) & inside_ends
-
-    def nearest_ellipsoid(self) -> FittedEllipsoid:
-        """An ellipsoid so long that it is straight; a fit if the cylinder is tilted."""
-        if self.lab_from_own.magnitude() > 0:
-            return fit_ellipsoid(self.samples_m())
-        return FittedEllipsoid(self.center_m, self.semi_axes_m(FLAT_RADIUS_M), 0.0)
+        along_m = own_m[:, self.semi_axes_m.argmax()]
+        return self.rim.contains(own_m) & (np.abs(along_m) <= self.half_length_m + SLACK_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,9 +456,9 @@ def cylinder(config: light.CylinderSurfaceConfig) -> Surface:
     half_m = math.inf if config.length_m is None else config.length_m / 2
     below_m = half_m if config.axis == "z" else config.radius_m
     pose = pose_and_rim(config, config.apex_m - below_m)
-    return Cylinder(
-        radius_m=config.radius_m, axis="xyz".index(config.axis), half_length_m=half_m, **pose
-    )
+    semi_axes_m = np.full(3, config.radius_m)
+    semi_axes_m["xyz".index(config.axis)] = math.inf
+    return Cylinder(semi_axes_m=semi_axes_m, half_length_m=half_m, **pose)
 
 
 def surveyed(config: light.SurveyedSurfaceConfig) -> Surface:

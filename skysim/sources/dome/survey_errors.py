@@ -178,7 +178,7 @@ def standard_normals(seed: int, kind: str, shape: tuple[int, ...]) -> Floats:
 
 
 def assumed_m(place_m: Floats, sigma_m: float, seed: int, kind: str) -> Floats:
-    """Surveyed places: the true places (..., 3) plus an error of sigma_m along each axis; unchanged for 0."""
+    """Surveyed lengths: the true ones, of any shape, plus an error of sigma_m each; unchanged for 0."""
     if not sigma_m:
         return place_m
     return place_m + scaled_errors(sigma_m, standard_normals(seed, kind, place_m.shape))
@@ -297,7 +297,5 @@ def assumed_ellipsoid(surface: Surface, config: SurveyErrorsConfig) -> tuple[Flo
 
 def assumed_focal_length_m(focal_length_m: float, config: SurveyErrorsConfig) -> float:
     """The focal length that the tracker assumes: the true one plus its survey error."""
-    if not config.focal_length_sigma_m:
-        return focal_length_m
-    drawn = standard_normals(config.seed, "focal", (1,))
-    return focal_length_m + float(scaled_errors(config.focal_length_sigma_m, drawn)[0])
+    true_m = np.array([focal_length_m])
+    return float(assumed_m(true_m, config.focal_length_sigma_m, config.seed, "focal")[0])

@@ -12,7 +12,7 @@ from estimator.attitude import dome_map, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey
-from estimator.calibration.bundle_adjustment import Assumed
+from estimator.calibration.bundle_adjustment import Assumed, Bundle
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.gauge import align_attitudes
 from estimator.calibration.survey_subset import connected_subset
@@ -114,6 +114,14 @@ def leds_of(place_m: np.ndarray) -> LedMap:
     return LedMap(np.arange(len(place_m)), place_m, CENTER_M, AXES_M)
 
 
+def start_bundle(
+    frames: list[DomeFrame], leds: LedMap, lever: Lever, camera: Camera, free_lens: int
+) -> Bundle:
+    attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
+    start = Bundle.start(leds, lever, camera, attitudes, True)
+    return replace(start, free_lens=free_lens)
+
+
 def small_survey(
     noise_px: float, seed: int, start_seed: int = 3, **how: object
 ) -> tuple[DomeSurvey, np.ndarray, Rotation, Lever]:
@@ -151,7 +159,7 @@ def test_the_derivatives_match_finite_differences_of_the_residuals(block: str) -
     place, turned, lever = small_dome(11, frames=3)
     frames = filmed(np.random.default_rng(12), turned, place, lever, SMALL, 0.1)
     seen = dome_survey._collect(frames, len(place))
-    bundle = dome_survey._start_bundle(frames, leds_of(place), lever, SMALL, 8)
+    bundle = start_bundle(frames, leds_of(place), lever, SMALL, 8)
     exact = getattr(ba.linearize(bundle, seen), block)
     lights = 3 * len(place)
     size = 3 * 3 + 3 + 8
@@ -179,7 +187,7 @@ def test_the_gauge_freedoms_change_no_pixel() -> None:
     place, turned, lever = small_dome(13)
     frames = filmed(np.random.default_rng(14), turned, place, lever, SMALL, 0.1)
     seen = dome_survey._collect(frames, len(place))
-    bundle = dome_survey._start_bundle(frames, leds_of(place), lever, SMALL, 7)
+    bundle = start_bundle(frames, leds_of(place), lever, SMALL, 7)
     terms = ba.normal_equations(bundle, seen, np.ones(len(seen.led)))
     led, rest = ba.gauge_freedoms(bundle)
     still_led = np.einsum("nij,njk->nik", terms.by_led, led.reshape(-1, 3, 4)).reshape(-1, 4)
@@ -613,7 +621,7 @@ def test_the_three_weak_moves_are_conformal_maps() -> None:
     turned = attitudes(rng, 200, 20)
     frames = filmed(rng, turned, place, AFIT_LEVER, AFIT, 0.1, imu_deg=0.0)
     seen = dome_survey._collect(frames, 700)
-    whole = dome_survey._start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
+    whole = start_bundle(frames, leds_of(place), AFIT_LEVER, AFIT, 3)
     part = connected_subset(whole, seen, np.ones(len(seen.led), dtype=bool))
     terms = ba.normal_equations(part.bundle, part.sightings, np.ones(len(part.index)))
     reduced = ba.eliminate_lights(terms, ba.gauge_freedoms(part.bundle)[1], 0.0)

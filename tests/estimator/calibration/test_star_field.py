@@ -373,7 +373,7 @@ def test_no_frame_identified_is_refused() -> None:
     frames = [Centroids(np.zeros((9, 2)), np.ones(9), np.ones(9))] * 3
 
     class Blind:
-        stars = catalog.from_columns(np.arange(1), *np.zeros((6, 1)), 2000.0)
+        stars = catalog.from_columns(np.arange(1), *np.zeros((6, 1)), epoch_yr=2000.0)
 
         def solve_centroids(self, centroids: Centroids) -> Attitude:
             return Attitude("no identification beyond chance")

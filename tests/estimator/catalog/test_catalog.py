@@ -35,10 +35,7 @@ def stars() -> StarCatalog:
 
 def made_up(*rows: tuple[float, ...]) -> StarCatalog:
     """Stars of (id, ra deg, dec deg, pm_ra, pm_dec mas/yr, parallax mas, V)."""
-    hip, ra, dec, *rest = np.array(rows).T
-    return catalog.from_columns(
-        hip.astype(int), np.radians(ra), np.radians(dec), *rest, EPOCH_YR
-    )
+    return catalog.from_columns(*np.array(rows).T, epoch_yr=EPOCH_YR)
 
 
 def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -71,19 +71,15 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     if config.file:
         key = config.file
         coordinates, level, number = read_csv(Path(config.file))
-        check_each_once(key, coordinates)
     else:
         coordinates = np.array(config.positions_m or config.directions_deg)
     # Places are used as they are; directions are projected from the bearing.
-    directions = (
-        coordinates if coordinates.shape[1] == 3 else directions_from_angles(coordinates)
-    )
+    are_places = coordinates.shape[1] == 3
+    directions = coordinates if are_places else directions_from_angles(coordinates)
+    if config.file:
+        check_each_once(key, directions)
     check_cap(key, directions, config.cap_deg)
-    place_m = (
-        coordinates
-        if coordinates.shape[1] == 3
-        else project_from_bearing(surface, directions)
-    )
+    place_m = coordinates if are_places else project_from_bearing(surface, directions)
     check_on_surface(key, surface, place_m)
     # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
@@ -107,9 +103,7 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
 
 
 def check_each_once(key: str, coordinates: Floats) -> None:
-    """Raise InputError for two rows of a file with one place (N, 3), or direction (N, 2)."""
-    if coordinates.shape[1] == 2:
-        coordinates = directions_from_angles(coordinates)
+    """Raise InputError for two rows of a file with one place or unit vector (N, 3)."""
     pairs = cKDTree(coordinates).query_pairs(SAME_PLACE)
     if pairs:
         first, second = min(pairs)

@@ -7,7 +7,7 @@ of its chords at `STEPS_PER_PITCH` steps per LED and `STEPS_PER_TURN` per turn a
 short by (2 pi / STEPS_PER_TURN)^2 / 24 of their length, 3e-6.
 
 1. The mean meridian of the surface (`mean_meridian`).
-2. Curves of the tapes (`circles`, `spiral`, `strips`), with their lengths (`tape_length_m`).
+2. Curves of the tapes (`circles`, `spiral`, `strips`), with their lengths (`lay`).
 3. An LED every pitch along each tape, with the errors of pitch and glue (`wind`, `aside`).
 """
 
@@ -242,14 +242,10 @@ WINDINGS = {"latitude": circles, "spiral": spiral, "meridian": strips}
 def lay(
     surface: Surface, tilt_rad: Floats, azimuth_rad: Floats, closed: bool = False
 ) -> Tape:
-    """A tape along (K,) directions from the bearing, with its length."""
-    return Tape(tilt_rad, azimuth_rad, tape_length_m(surface, tilt_rad, azimuth_rad), closed)
-
-
-def tape_length_m(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
-    """(K,) length of the tape from its beginning to each of K points, along the surface."""
+    """A tape along (K,) directions from the bearing, with its length along the surface to each."""
     place_m = project_from_bearing(surface, directions(tilt_rad, azimuth_rad))
-    return np.append(0, np.cumsum(np.linalg.norm(np.diff(place_m, axis=0), axis=1)))
+    steps_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    return Tape(tilt_rad, azimuth_rad, np.append(0, np.cumsum(steps_m)), closed)
 
 
 # Optical fibers in a shell (JHU/APL's dome): their ends at another layout's points, with the errors of making them.
