@@ -41,14 +41,12 @@ def excerpt(text: object) -> str:
 
 
 def to_numbers(
-    source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
+    source: str | Path, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
 ) -> Floats:
     """(N, width) numbers of the words of each line. Raises InputError for the first line without finite numbers."""
     for line, words in zip(places, rows, strict=True):
         if len(words) != width:
-            raise InputError(
-                source, f"{len(words)} numbers", width, where=Where(source, line)
-            )
+            raise Where(source, line).error(f"{len(words)} numbers", width)
     try:
         numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
     except ValueError:
@@ -68,11 +66,11 @@ def check_numbers(where: Where, words: Sequence[str]) -> None:
                 continue
         except ValueError:
             kind = "number"
-        raise InputError(where.file, f"{excerpt(word)} is not a {kind}", where=where)
+        raise where.error(f"{excerpt(word)} is not a {kind}")
 
 
 def seconds_since(
-    source: str,
+    source: str | Path,
     places: Sequence[int],
     epochs: Sequence[str],
     start: datetime.datetime,
@@ -94,11 +92,9 @@ def seconds_since(
         if len(epoch.split("-")) != len(epochs[0].split("-"))
     ]
     if bad:
-        raise InputError(
-            source,
+        raise Where(source, places[min(bad)], unit).error(
             f"{excerpt(epochs[min(bad)])} is not an epoch",
             "2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5",
-            where=Where(source, places[min(bad)], unit),
         )
     # 2. UTC, by astropy.
     texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
@@ -119,8 +115,7 @@ def seconds_since(
                     Time(text, format=kind, scale=scale)
                 except ValueError:
                     problem = f"{excerpt(epochs[n])} is not a date and time"
-                    where = Where(source, places[n], unit)
-                    raise InputError(source, problem, where=where) from None
+                    raise Where(source, places[n], unit).error(problem) from None
             raise
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
@@ -168,11 +163,8 @@ def read_named_rows(
     places = [n for n, _ in lines[1:]]
     for place, row in zip(places, rows, strict=True):
         if len(row) != len(columns):
-            raise InputError(
-                path,
-                f"{len(row)} values",
-                f"{len(columns)}, as the first line has",
-                where=Where(path, place),
+            raise Where(path, place).error(
+                f"{len(row)} values", f"{len(columns)}, as the first line has"
             )
     used = [columns.index(one) for one in (*needed, *also) if one in columns]
     numbers = to_numbers(
@@ -202,9 +194,7 @@ def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
     """The keyword and the value of a line. Raises InputError if it is not KEYWORD = value."""
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
-        raise InputError(
-            path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n)
-        )
+        raise Where(path, n).error(f"{excerpt(line)} is not KEYWORD = value")
     return key, value
 
 
@@ -223,7 +213,5 @@ def one_of(
     line, value = metadata[key]
     names = list(allowed)
     if value.upper() not in names:
-        raise InputError(
-            path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line)
-        )
+        raise Where(path, line).error(f"{key} = {excerpt(value)}", ", ".join(names))
     return value.upper()

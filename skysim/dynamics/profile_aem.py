@@ -101,12 +101,12 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
     parser: Any = XMLPullParser(("start", "end"))
     for n, line in lines:
         if "<!DOCTYPE" in line:  # it may declare entities that expand
-            raise InputError(path, "XML with a document type", "none", Where(path, n))
+            raise Where(path, n).error("XML with a document type", "none")
         try:
             parser.feed(f"{line}\n")
             events = list(parser.read_events())
         except ParseError as error:
-            raise InputError(path, f"not XML: {error}", where=Where(path, n)) from None
+            raise Where(path, n).error(f"not XML: {error}") from None
         for event, element in events:
             tag = element.tag
             if event == "start":
@@ -158,11 +158,8 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
             elif key == VERSION:
                 version = value
         else:
-            raise InputError(
-                path,
-                f"{excerpt(line)} after {section}",
-                "DATA_START or META_START",
-                where=Where(path, n),
+            raise Where(path, n).error(
+                f"{excerpt(line)} after {section}", "DATA_START or META_START"
             )
     check_version(path, VERSION, version, VERSIONS)
     if section not in ("", "DATA_STOP"):
@@ -175,9 +172,7 @@ def next_section(where: Where, section: str, keyword: str) -> str:
     after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
     after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
     if section not in after[keyword]:
-        raise InputError(
-            where.file, f"{keyword} after {section or 'the header'}", where=where
-        )
+        raise where.error(f"{keyword} after {section or 'the header'}")
     return keyword
 
 
@@ -193,7 +188,6 @@ def segment_samples(
     """
     # 1. Metadata.
     metadata = segment.metadata
-    source = str(path)
     segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR",) if version == "1.0" else ())))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     kind = one_of(path, metadata, "ATTITUDE_TYPE", TYPES)
@@ -207,24 +201,19 @@ def segment_samples(
     ]
     names = [metadata[key][1] for key in REQUIRED[:2]]
     if sum(name.upper() in REFERENCES for name in names) != 1:
-        raise InputError(
-            path,
+        raise Where(path, metadata["REF_FRAME_B"][0]).error(
             f"the attitude of {names[1]} in {names[0]}",
             "one of the two an inertial or laboratory frame, the other of the vehicle",
-            where=Where(path, metadata["REF_FRAME_B"][0]),
         )
     # 2. Data lines: an epoch, and the numbers.
     for n, words in segment.data:
         if len(words) != width + 1:
-            raise InputError(
-                path,
-                f"{len(words)} values",
-                f"an epoch and {width} numbers",
-                where=Where(path, n),
+            raise Where(path, n).error(
+                f"{len(words)} values", f"an epoch and {width} numbers"
             )
     lines = [n for n, _ in segment.data]
-    numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
-    t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
+    numbers = to_numbers(path, lines, [words[1:] for _, words in segment.data], width)
+    t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
     # 3. Conventions: scalar last and A to B, unless the keywords say otherwise.
     xyzw = quaternions(path, metadata, kind, numbers)
     reverse = (
@@ -232,7 +221,7 @@ def segment_samples(
         and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
     )
     a, b = frames[::-1] if reverse else frames
-    samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
+    samples = from_quaternions(path, "line", lines, t_s, (a, b), xyzw, absolute=True)
     # 4. Frame bias and useable span.
     useable = within_span(path, metadata, t_s, start, system)
     return take(to_icrs(samples, names), useable)
@@ -254,11 +243,8 @@ def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Float
         axes = sequence.upper().translate(NUMBERED)
         return np.asarray(Rotation.from_euler(axes, angles_deg, degrees=True).as_quat())
     except ValueError:
-        raise InputError(
-            path,
-            f"EULER_ROT_SEQ = {excerpt(sequence)}",
-            "three axes, such as 321 or ZYX",
-            Where(path, line),
+        raise Where(path, line).error(
+            f"EULER_ROT_SEQ = {excerpt(sequence)}", "three axes, such as 321 or ZYX"
         ) from None
 
 
@@ -270,7 +256,7 @@ def within_span(
     for side, key in enumerate(("USEABLE_START_TIME", "USEABLE_STOP_TIME")):
         if key in metadata:
             line, epoch = metadata[key]
-            ends_s[side] = float(seconds_since(str(path), [line], [epoch], start, system)[0])
+            ends_s[side] = float(seconds_since(path, [line], [epoch], start, system)[0])
     # A nanosecond allows for the rounding of epochs.
     inside = np.flatnonzero((t_s >= ends_s[0] - 1e-9) & (t_s <= ends_s[1] + 1e-9))
     return slice(int(inside[0]), int(inside[-1]) + 1) if len(inside) else slice(0, 0)
