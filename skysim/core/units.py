@@ -11,9 +11,16 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    model_validator,
+)
 
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
@@ -213,7 +220,7 @@ class ConfigModel(BaseModel):
 
 
 def check_table(
-    first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg"
+    first: Sequence[float], values: Sequence[float], name: str, first_name: str
 ) -> None:
     """Raise InputError unless two columns have equal length and the first one ascends strictly."""
     if len(first) != len(values):
@@ -222,3 +229,13 @@ def check_table(
         )
     if any(b <= a for a, b in itertools.pairwise(first)):
         raise InputError("", f"{first_name} is not strictly ascending")
+
+
+class TableConfig(ConfigModel):
+    """Base of a section whose last two keys are the columns of a table: of equal length, the first ascending."""
+
+    @model_validator(mode="after")
+    def check_columns(self) -> Self:
+        *_, first, second = type(self).model_fields
+        check_table(getattr(self, first), getattr(self, second), second, first)
+        return self

@@ -321,12 +321,21 @@ def set_key(tree: Tree, key: str, value: str) -> None:
         ) from error
 
 
-def shared_depth(first: Sequence[str], second: Sequence[str]) -> int:
-    """Number of leading keys that two nested keys have in common."""
-    depth = 0
-    while depth < min(len(first), len(second)) and first[depth] == second[depth]:
-        depth += 1
-    return depth
+def one_line(value: Any, sort_keys: bool = True) -> str:
+    """A value as YAML on one line."""
+    dumped = yaml.safe_dump(
+        value, default_flow_style=True, width=1_000_000, sort_keys=sort_keys
+    )
+    return dumped.removesuffix("...\n").strip()
+
+
+def opened_sections(before: list[str], sections: list[str]) -> list[str]:
+    """The lines of YAML that open the nested sections of a key, without those that it shares with the key before."""
+    return [
+        f"{'  ' * n}{name}:"
+        for n, name in enumerate(sections)
+        if before[: n + 1] != sections[: n + 1]
+    ]
 
 
 def list_index(values: list[Any], component: str, key: str) -> int:

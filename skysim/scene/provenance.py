@@ -18,8 +18,16 @@ from typing import Any, NamedTuple
 import yaml
 
 from skysim.core.units import ConfigModel, si_unit
-from skysim.core.yaml_reader import OverrideTexts, Tree, parse_yaml, read_yaml, shared_depth
+from skysim.core.yaml_reader import (
+    OverrideTexts,
+    Tree,
+    one_line,
+    opened_sections,
+    parse_yaml,
+    read_yaml,
+)
 from skysim.scene import loader, unused
+from skysim.scene.camera_sheet import rounded
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
 
@@ -223,17 +231,13 @@ def plain(value: Any, name: str) -> Any:
         }
     if isinstance(value, tuple):
         return [plain(item, name) for item in value]
-    if value is None or isinstance(value, dict | bool | datetime.datetime):
+    if not isinstance(value, float):
         return value
-    if isinstance(value, float) and (unit := si_unit(name)):
-        return f"{tidy(value)} {unit}" if math.isfinite(value) else "infinity"
-    return tidy(value) if isinstance(value, float) else value
-
-
-def tidy(value: float) -> float | int:
-    """The number rounded to 15 digits, without the rounding error of its unit's conversion."""
-    short = float(f"{value:.15g}")
-    return int(short) if short.is_integer() and abs(short) < 1e15 else short
+    # 15 digits are without the rounding error of the unit's conversion.
+    unit = si_unit(name)
+    if unit and math.isinf(value):
+        return "infinity"
+    return f"{rounded(value, 15)} {unit}" if unit else rounded(value, 15)
 
 
 def as_dicts(found: list[Entry]) -> list[Tree]:
@@ -255,26 +259,16 @@ def text(found: list[Entry]) -> str:
     open_: list[str] = []
     for path, value, origin, no_effect in found:
         *parents, key = path
-        # Open the sections that the previous key does not share.
-        shared = shared_depth(open_, parents)
-        lines += [
-            (f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))
-        ]
+        lines += [(line, "") for line in opened_sections(open_, parents)]
         open_ = parents
         indent = "  " * len(parents)
         comment = f"{origin}; no effect" if no_effect else str(origin)
         if not (isinstance(value, list) and value and isinstance(value[0], dict)):
-            lines.append((f"{indent}{key}: {flow(value)}", comment))
+            lines.append((f"{indent}{key}: {one_line(value, sort_keys=False)}", comment))
             continue
         lines.append((f"{indent}{key}:", comment))
-        lines += [(f"{indent}  - {flow(item)}", "") for item in value]
+        lines += [(f"{indent}  - {one_line(item, sort_keys=False)}", "") for item in value]
     return "".join(
         f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n"
         for line, note in lines
     )
-
-
-def flow(value: Any) -> str:
-    """A value as YAML on one line."""
-    dumped = yaml.safe_dump(value, default_flow_style=True, width=1_000_000, sort_keys=False)
-    return dumped.removesuffix("\n...\n").strip()

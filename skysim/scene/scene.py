@@ -271,14 +271,10 @@ class Scene(ConfigModel, metaclass=SceneKind):
         points = dome.points
         nested = dome.layout is not points
         camera_m = points.camera_m or self.vehicle.camera_m
-        chip = (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
             key = f"light.layout.{'points.' if nested else ''}camera"
             raise InputError(key, "missing", "that, or vehicle.camera")
-        field_deg = tuple(
-            math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px))
-            for side_px in chip
-        )
+        field_deg = self.camera.calibration().field_deg[:2]
         points = points.model_copy(
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
         )

@@ -28,6 +28,7 @@ from skysim.core.yaml_reader import (
     as_tree,
     excerpt,
     is_file,
+    one_line,
     override_texts,
     read_yaml,
     set_key,
@@ -38,7 +39,7 @@ from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import TRIAL, Plan, one_line
+from skysim.experiments.study.plan import TRIAL, Plan
 from skysim.experiments.study.report.study_report import study_report
 from skysim.results.report import Report
 from skysim.scene import loader
@@ -173,17 +174,17 @@ def keys_of(study: Any, path: Path) -> Mapping[str, Any]:
     """The keys of a study's file at `path`, of a mapping, or of a study of a scene. Raises InputError."""
     if isinstance(study, str | Path):
         return read_yaml(path)[0]
-    if isinstance(study, Mapping) and STUDY_KEYS & set(study):
+    if isinstance(study, Scene):
+        return {"title": study.title, "seed": study.seed, "scene": loader.keys_of(study)}
+    if not isinstance(study, Mapping):
+        raise InputError(
+            "study", excerpt(repr(study)), "a name, a path, a mapping of keys, a Scene"
+        )
+    if STUDY_KEYS & set(study):
         scene = study.get("scene")
         return (
             {**study, "scene": loader.keys_of(scene)} if isinstance(scene, Scene) else study
         )
-    if not isinstance(study, Scene | Mapping):
-        raise InputError(
-            "study", excerpt(repr(study)), "a name, a path, a mapping of keys, a Scene"
-        )
-    if isinstance(study, Scene):
-        return {"title": study.title, "seed": study.seed, "scene": loader.keys_of(study)}
     loaded = loader.load(own_code.with_names(study, {}), refuses_unused=False)
     return {"title": loaded.title, "seed": loaded.seed, "scene": study}
 
@@ -240,11 +241,9 @@ def part_settings(tree: Tree, name: str, part: Any, folder: Path) -> Settings:
     scene = loader.with_overrides(loader.merged(loader.all_layers(tree["scene"])), texts)
     control = value_at(scene, "motion.control")
     if name == "controller":
-        law = {"law": part}
+        has_section = isinstance(control, dict) and control
         return (
-            {"motion.control.law": part}
-            if isinstance(control, dict) and control
-            else {"motion.control": law}
+            {"motion.control.law": part} if has_section else {"motion.control": {"law": part}}
         )
     file = part if isinstance(part, str | Path) else table_file(part, folder)
     maneuver = [{"kind": "profile", "file": str(Path(file).resolve())}]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -38,7 +37,7 @@ from skysim.core.units import (
     Seed,
     Triple,
 )
-from skysim.core.yaml_reader import Tree, explain, is_file, set_key
+from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.experiments.study.own_code import digests_of
 from skysim.results.files.parts import Prices, find_prices, read_prices
@@ -624,13 +623,6 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     except ValidationError as error:
         # One line without file and line number; the caller adds the factor.
         raise explain(error, TrialSection, tree, [(Path(), "")], {}).at(None) from None
-
-
-def one_line(value: Value) -> str:
-    """A value as YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix(
-        "\n...\n"
-    )
 
 
 class TrialSection(ConfigModel):

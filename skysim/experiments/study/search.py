@@ -19,11 +19,9 @@ import numpy as np
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
-from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
-from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.store import TIMES, Store
-from skysim.experiments.study.execution.trials import REFUSED, Row
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import (
     Distribution,
     Factor,
@@ -471,9 +469,8 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     columns = store.point_columns(number)
     replicates = plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
-    rows = []
-    for k in missing:
-        seed = seed_of(plan.spec, number, k)
-        rows.append(failed._replace(trial=number * replicates + k, replicate=k, seed=seed))
-    return rows
+    job = TrialJob(plan.spec)
+    first = number * replicates
+    segments = (Segment(number, {}, first + k, range(k, k + 1)) for k in missing)
+    error = scene_error(columns)
+    return [job.failed(one, error)._replace(scene=REFUSED) for one in segments]

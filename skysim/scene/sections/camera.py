@@ -29,6 +29,7 @@ from skysim.core.units import (
     Number,
     PositiveFraction,
     Seed,
+    TableConfig,
     Temperature,
     check_table,
     quantity,
@@ -123,17 +124,12 @@ class TwoStopsConfig(ConfigModel):
     cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
 
 
-class VignettingTableConfig(ConfigModel):
+class VignettingTableConfig(TableConfig):
     """Measured transmission against field angle, 1 on the axis."""
 
     kind: Literal["table"]
     angle_deg: Ascending
     transmission: Fractions
-
-    @model_validator(mode="after")
-    def check_columns(self) -> VignettingTableConfig:
-        check_table(self.angle_deg, self.transmission, "transmission")
-        return self
 
 
 class ChromaticConfig(ConfigModel):
@@ -221,7 +217,7 @@ class GlareConfig(ConfigModel):
     core_px: Annotated[Number, Field(ge=2, le=1000)]
 
 
-class BaffleConfig(ConfigModel):
+class BaffleConfig(TableConfig):
     """Point source transmittance (PST) of baffle and lens for the light of bodies outside the field.
 
     Attributes
@@ -235,8 +231,7 @@ class BaffleConfig(ConfigModel):
     pst: Fractions
 
     @model_validator(mode="after")
-    def check_columns(self) -> BaffleConfig:
-        check_table(self.angle_deg, self.pst, "pst")
+    def check_angles(self) -> BaffleConfig:
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
         return self

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.trials import rate_axis
@@ -241,13 +240,11 @@ def light_text(scene: Scene, lab: Lab) -> str:
 
 def camera_text(camera: CameraConfig) -> str:
     """The camera in words: pixels, field of view and scale."""
-    sides = (camera.width_px, camera.height_px)
-    field = " × ".join(
-        f"{2 * math.degrees(math.atan(side / 2 / camera.focal_px)):.3g}°" for side in sides
-    )
-    scale = 1 / camera.focal_px / ARCSEC_RAD
+    known = camera.calibration()
+    field = " × ".join(f"{side:.3g}°" for side in known.field_deg[:2])
     lens = f"{1e3 * camera.focal_length_m:.4g} mm f/{camera.f_number:.3g}"
-    return f"{sides[0]} × {sides[1]} px, {lens}, field {field}, {scale:.3g}″ a pixel"
+    size = f"{camera.width_px} × {camera.height_px} px"
+    return f"{size}, {lens}, field {field}, {known.arcsec_px:.3g}″ a pixel"
 
 
 def tracker_text(scene: Scene) -> str:
