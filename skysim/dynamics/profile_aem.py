@@ -66,6 +66,13 @@ TYPES = {
     "SPIN/NUTATION": 7,
     "SPIN/NUTATION_MOM": 7,
 }
+# Keywords that begin or end a part, and those after which each may come; the header has none.
+AFTER = {
+    "META_START": ("", "DATA_STOP"),
+    "META_STOP": ("META_START",),
+    "DATA_START": ("META_STOP",),
+    "DATA_STOP": ("DATA_START",),
+}
 NUMBERED = str.maketrans("123", "XYZ")
 # Elements of an XML message, and what their keywords begin with.
 XML_SECTIONS = {"metadata": "META", "data": "DATA"}
@@ -145,8 +152,10 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
         if line.split(maxsplit=1)[0] == "COMMENT":
             continue
         # A keyword that begins or ends a part, a data line, or KEYWORD = value of the header or the metadata.
-        if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
-            section = next_section(Where(path, n), section, line)
+        if line in AFTER:
+            if section not in AFTER[line]:
+                raise Where(path, n).error(f"{line} after {section or 'the header'}")
+            section = line
             if line == "META_START":
                 segments.append(TextSegment({}, []))
         elif section == "DATA_START":
@@ -165,15 +174,6 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
     if section not in ("", "DATA_STOP"):
         raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
     return version, segments
-
-
-def next_section(where: Where, section: str, keyword: str) -> str:
-    """The section that a keyword begins or ends. Raises InputError if it is out of order."""
-    after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
-    after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
-    if section not in after[keyword]:
-        raise where.error(f"{keyword} after {section or 'the header'}")
-    return keyword
 
 
 def segment_samples(

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files
 from skysim.core.errors import InputError, Where, printable
 from skysim.core.text import Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
@@ -82,11 +81,6 @@ def read_csv(
     numbers = to_numbers(path, places, [cells for _, cells in body], len(names))
     columns |= dict(zip(names, numbers.T, strict=True))
     return to_samples(path, "line", places, columns, start, rotation)
-
-
-def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Samples:
-    """Samples of an ECSV file. Raises InputError, also for wrong units of the columns."""
-    return from_table(files.read_table(path), path, start, rotation)
 
 
 def from_table(

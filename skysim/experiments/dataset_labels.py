@@ -144,18 +144,12 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
     extents = image_extents(
         sources, exposure_window(scene, frame.index), scene.camera.height_px
     )
-    runs = {SATURATED: run_lengths(frame.image_dn, least_value(frame))}
+    least_dn = frame.saturation_dn
+    if frame.image_dn.dtype.kind == "u":
+        least_dn = math.ceil(least_dn)  # an integer compares faster
+    runs = {SATURATED: run_lengths(frame.image_dn, least_dn)}
     runs |= {name: run_lengths(added.masks[name]) for name in MASKS if name in added.masks}
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
-
-
-def least_value(frame: Frame) -> float:
-    """The least value of a saturated pixel; an integer if pixels are, since this compares faster."""
-    return (
-        math.ceil(frame.saturation_dn)
-        if frame.image_dn.dtype.kind == "u"
-        else frame.saturation_dn
-    )
 
 
 def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:

@@ -197,21 +197,16 @@ def without_resampling(values: Floats, value: float) -> Summary:
 
 
 def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
-    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`."""
-    if len(values) <= MANY_VALUES:
-        return bootstrap_of_few(values, function)
-    found = bootstrap_of_many(values)
-    value, low, high = map(float, function(found[:3]))
-    return found._replace(value=value, low=low, high=high)
+    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`.
 
-
-def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
-    """A function of the mean, with the interval of `resampled` from the same draws.
-
-    A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
-    the same for all samples of a size.
+    The draws are those of `resampled`: a resample's sum is that of the values times how often it draws each, and the
+    seed is fixed, so these numbers are the same for all samples of a size.
     """
     count = len(values)
+    if count > MANY_VALUES:
+        found = bootstrap_of_many(values)
+        value, low, high = map(float, function(found[:3]))
+        return found._replace(value=value, low=low, high=high)
     value = float(function(np.mean(values)))
     if count < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
@@ -361,11 +356,8 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
     "rms": lambda values: mean_of(np.square(values), np.sqrt),
     "sd": lambda values: resampled(values, sample_std),
-    **{
-        name: lambda values, share=share: quantile(values, share)  # type: ignore[misc]
-        for name, share in QUANTILES.items()
-    },
-    "tol95": lambda values: tolerance_limit(values, 0.95),
+    **{name: partial(quantile, probability=share) for name, share in QUANTILES.items()},
+    "tol95": partial(tolerance_limit, probability=0.95),
     "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
     "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }

@@ -209,7 +209,10 @@ def with_part(
         isinstance(given, Mapping) and not set(profile_table.TIMES) & set(given)
     )
     names = given if many and isinstance(given, Mapping) else {}
-    named = names or {level_name(one): one for one in (given if many else [given])}
+    named = names or {
+        Path(one).stem if isinstance(one, str | Path) else name_of(one): one
+        for one in (given if many else [given])
+    }
     levels = {}
     for key, one in named.items():
         if name == "tracker":
@@ -225,11 +228,6 @@ def with_part(
     if len(levels) < len(given) or name in tree.get("factors", {}):
         raise InputError(name, "two have the same name", "other names, as a mapping")
     tree["factors"] = tree.get("factors", {}) | {name: {"levels": levels}}
-
-
-def level_name(part: Any) -> str:
-    """Name of a part among several."""
-    return Path(part).stem if isinstance(part, str | Path) else name_of(part)
 
 
 def part_settings(tree: Tree, name: str, part: Any, folder: Path) -> Settings:

@@ -244,13 +244,6 @@ class Store:
         """The file of a part."""
         return self.parts_folder / f"{number:06d}.parquet"
 
-    def remove_unlisted_parts(self) -> None:
-        """Remove part files of a run that was killed before it listed them."""
-        listed = {part.path for part in self.parts()}
-        for path in self.parts_folder.glob("*"):
-            if path not in listed:
-                remove(path)
-
     def parts(self) -> list[Part]:
         """All parts, in the order in which they were written."""
         # A store of an earlier skysim has no such table.
@@ -571,6 +564,8 @@ def writing(path: Path) -> Iterator[Store]:
                     db.execute(statement)
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
             check_format(store)
-            store.remove_unlisted_parts()
+            # Part files of a run that was killed before it listed them.
+            for part in {*store.parts_folder.glob("*")} - {one.path for one in store.parts()}:
+                remove(part)
             store.move_rows()
             yield store

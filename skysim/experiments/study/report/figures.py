@@ -213,7 +213,7 @@ def draw_line(
 
     offset = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
     low, high = drawn_interval(axes, one)
-    if layout.draws_bands(x_axis):
+    if x_axis.numeric and len(x_axis.levels) > layout.MAX_X_WITH_BARS:
         offset = axes.transData
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
@@ -422,35 +422,33 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
     """Bar chart of the first-order and total indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
-    return png(
-        lambda fig: draw_indices(fig, selected, response), (7.0, 1.1 + 0.42 * len(selected))
-    )
 
+    def draw(fig: Any) -> None:
+        """Two bars per factor, with their intervals."""
+        axes = fig.subplots()
+        rows = np.arange(len(selected))
+        for shift, name, ink, parts in (
+            (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
+            (0.19, "total", GRAY, [one.total[:3] for one in selected]),
+        ):
+            value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
+            axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
+            ends = np.clip([low, high], -9, 9)
+            axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
+        bounds = np.array(
+            [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
+        )
+        bounds = bounds[np.isfinite(bounds)]
+        left = min(1.05 * bounds.min(), 0.0)
+        right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
+        axes.set_xlim(left, right)
+        axes.set_yticks(rows, [one.factor for one in selected])
+        axes.set_ylim(len(selected) - 0.4, -0.6)
+        axes.grid(False, axis="y")
+        axes.set_xlabel(f"share of the variance, {label(response).partition(' [')[0]}")
+        fig.legend(loc="outside right upper")
 
-def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
-    """Draw two bars per factor, with their intervals."""
-    axes = fig.subplots()
-    rows = np.arange(len(selected))
-    for shift, name, ink, parts in (
-        (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
-        (0.19, "total", GRAY, [one.total[:3] for one in selected]),
-    ):
-        value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
-        axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
-        ends = np.clip([low, high], -9, 9)
-        axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
-    bounds = np.array(
-        [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
-    )
-    bounds = bounds[np.isfinite(bounds)]
-    left = min(1.05 * bounds.min(), 0.0)
-    right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
-    axes.set_xlim(left, right)
-    axes.set_yticks(rows, [one.factor for one in selected])
-    axes.set_ylim(len(selected) - 0.4, -0.6)
-    axes.grid(False, axis="y")
-    axes.set_xlabel(f"share of the variance, {label(response).partition(' [')[0]}")
-    fig.legend(loc="outside right upper")
+    return png(draw, (7.0, 1.1 + 0.42 * len(selected)))
 
 
 # Optimizations.

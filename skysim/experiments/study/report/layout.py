@@ -95,11 +95,6 @@ class Panel(NamedTuple):
     bounds: list[float]
 
 
-def draws_bands(x_axis: Axis) -> bool:
-    """Whether intervals are drawn as a band: a numeric axis with more than MAX_X_WITH_BARS levels."""
-    return x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS
-
-
 def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
     """Whether medians are drawn instead of intervals: sampled points that are many or share a non-numeric axis."""
     return is_sampled(study) and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)

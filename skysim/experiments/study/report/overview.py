@@ -94,10 +94,13 @@ def overview(plan: Plan) -> Overview:
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    findings = [
-        finding_text([(line, with_leds(at, leds)) for line, at in one], checked)
-        for one in found.values()
-    ]
+    # The number of LEDs is in the name of a checked point if the points of the study differ in it.
+    if len(set(leds.values())) > 1:
+        found = {
+            key: [(line, f"{at}, {leds[at]} LEDs") for line, at in one]
+            for key, one in found.items()
+        }
+    findings = [finding_text(one, checked) for one in found.values()]
     return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require)
 
 
@@ -105,17 +108,6 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     """The greatest tilt of a trial's random attitudes under a dome; None if there are none."""
     drawn = trial.start if isinstance(trial, FlightTrial) else trial
     return None if drawn is None or not scene.dome else float(np.max(drawn.tilt_deg))
-
-
-def with_leds(levels: str, leds: Mapping[str, int]) -> str:
-    """The name of a checked point, with its number of LEDs if the points of the study differ in it.
-
-    Parameters
-    ----------
-    leds
-        Number of LEDs of each checked point under a dome
-    """
-    return f"{levels}, {leds[levels]} LEDs" if len(set(leds.values())) > 1 else levels
 
 
 def finding_text(at: list[tuple[str, str]], checked: int) -> str:

@@ -64,6 +64,8 @@ from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
 STUDY_FILE = "The study file"
+# Columns of the table of ranges: the least and the largest value of a response, with their points.
+RANGES = list(map(text_column, ("response", "least", "at", "largest", "at")))
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
 OPEN_ROWS = 20  # number of rows above which that table is folded
@@ -242,7 +244,9 @@ def compose(
         *drawn[:1],
         folded("All answers", [Items(found.headline)], on_terminal=True),
         folded("Further figures", further),
-        folded("Ranges of the responses", [range_table(study, found.lines)])
+        folded(
+            "Ranges of the responses", [Table(RANGES, answer.range_rows(study, found.lines))]
+        )
         if not found.pooled
         else Text(""),
         Section("Requirements", requirement_table(study, found)),
@@ -384,14 +388,6 @@ def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
         ),
         Table([Column(f"worst {ranked(response)}", format=".4g"), *heads], worst),
     ]
-
-
-def range_table(study: Study, lines: PointRows) -> Table:
-    """The least and the largest value of each response, with their points."""
-    heads = ("response", "least", "at", "largest", "at")
-    return Table(
-        [Column(head, kind="text") for head in heads], answer.range_rows(study, lines)
-    )
 
 
 def requirement_table(study: Study, found: Analysis) -> list[Block]:
