@@ -528,19 +528,24 @@ def suggestion(word: str, allowed: Sequence[str]) -> str:
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
     """The number of leading components of a dotted key that are in the text, and the line of the last of them."""
-    node = yaml.compose(text, yaml.SafeLoader)
-    depth = 0
-    line = None
-    for key in keys:
-        entry = None
-        if isinstance(node, yaml.MappingNode):
-            entry = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and key.isascii() and key.isdigit():
-            item = node.value[int(key)] if int(key) < len(node.value) else None
-            entry = item and (item, item)
-        if not entry:
-            break
-        depth += 1
-        line = entry[0].start_mark.line + 1
-        node = entry[1]
-    return depth, line
+    lines = key_lines(text)
+    depth = max((n for n in range(len(keys) + 1) if tuple(keys[:n]) in lines), default=0)
+    return depth, lines.get(tuple(keys[:depth]))
+
+
+def key_lines(text: str) -> dict[tuple[str, ...], int]:
+    """The line of every key of a YAML text, and of every item of its lists, by nested keys."""
+    lines: dict[tuple[str, ...], int] = {}
+
+    def visit(node: yaml.Node | None, keys: tuple[str, ...]) -> None:
+        """Add the lines below a node at nested keys."""
+        found = node.value if isinstance(node, yaml.MappingNode) else ()
+        inner = [(str(key.value), key, value) for key, value in found]
+        if isinstance(node, yaml.SequenceNode):
+            inner = [(str(n), item, item) for n, item in enumerate(node.value)]
+        for name, place, value in inner:
+            lines[(*keys, name)] = place.start_mark.line + 1
+            visit(value, (*keys, name))
+
+    visit(yaml.compose(text, yaml.SafeLoader), ())
+    return lines

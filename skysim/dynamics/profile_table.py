@@ -15,7 +15,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,16 +24,10 @@ from skysim.core.errors import InputError, Where, printable
 from skysim.core.text import Line, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import Samples, from_quaternions
+from skysim.scene.sections.motion import RotationName
 from skysim.sources.stars import cam_from_icrs
 
-QUATERNIONS = (
-    "lab_from_body",
-    "body_from_lab",
-    "icrs_from_body",
-    "body_from_icrs",
-    "icrs_from_cam",
-    "cam_from_icrs",
-)
+QUATERNIONS = get_args(RotationName)
 BARE = ("q_x", "q_y", "q_z", "q_w")
 BODY_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 GIMBAL_ANGLES = ("azimuth_deg", "elevation_deg")

@@ -15,12 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from skysim.core.units import ConfigModel, si_unit
 from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
+    key_lines,
     one_line,
     opened_sections,
     parse_yaml,
@@ -109,11 +108,6 @@ def located_tree(layers: list[Layer], overrides: OverrideTexts) -> Tree:
     return tree | {"camera": with_preset(camera)} if isinstance(camera, dict) else tree
 
 
-def over_base(base: Tree, own: Tree) -> Tree:
-    """`loader.over_base` for located values."""
-    return loader.over_base(base, own, preset_camera)
-
-
 def preset_camera(preset: Located) -> Tree:
     """The camera section of a preset with the origin of each value; empty if there is no preset."""
     if preset.value is None:
@@ -122,6 +116,10 @@ def preset_camera(preset: Located) -> Tree:
     tree, text = read_yaml(path)
     camera: Tree = with_origins(path, text, tree, f"preset {path.name}")["camera"]
     return camera
+
+
+# `loader.over_base` for located values.
+over_base = functools.partial(loader.over_base, camera_of=preset_camera)
 
 
 def with_preset(camera: Tree) -> Tree:
@@ -140,7 +138,7 @@ def with_preset(camera: Tree) -> Tree:
 
 def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> Tree:
     """The tree of a file with the origin of each value; a list is one value."""
-    lines = lines_of(text)
+    lines = key_lines(text)
 
     def locate(value: Any, keys: tuple[str, ...]) -> Any:
         """The value at nested keys with its origin, or the mapping with those of its values."""
@@ -150,20 +148,6 @@ def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> T
 
     located: Tree = locate(tree, ())
     return located
-
-
-def lines_of(text: str) -> dict[tuple[str, ...], int]:
-    """The line of every key of a YAML text, by nested keys."""
-    lines: dict[tuple[str, ...], int] = {}
-
-    def visit(node: yaml.Node | None, keys: tuple[str, ...]) -> None:
-        """Add the lines below a node at nested keys."""
-        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
-            lines[(*keys, str(key.value))] = key.start_mark.line + 1
-            visit(value, (*keys, str(key.value)))
-
-    visit(parse_yaml(text)[0], ())
-    return lines
 
 
 def put(tree: Any, keys: list[str], value: Any) -> Any:

@@ -296,8 +296,14 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_bodies(self) -> Scene:
-        """Check that the ephemeris is valid at the scene's time."""
+    def check_sky(self) -> Scene:
+        """Check bodies, orbit, satellites and air.
+
+        1. The ephemeris is valid at the scene's time.
+        2. An orbit is under the stars, and satellites have an orbit or a site.
+        3. The air has a site, and its light has the ephemeris of Sun and Moon.
+        """
+        # 1. Ephemeris.
         problem = ephemeris_problem(self.start_time)
         sections = {
             "orbit": self.orbit,
@@ -306,11 +312,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         for key, section in sections.items():
             if section and problem:
                 raise InputError(key, problem)
-        return self
-
-    @model_validator(mode="after")
-    def check_orbit(self) -> Scene:
-        """Check that an orbit is under the stars, and that satellites have an orbit or a site."""
+        # 2. Orbit.
         if self.orbit and not self.stars:
             raise InputError(
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
@@ -325,13 +327,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
             raise InputError(
                 "light.satellites.file", "requires the section orbit, or a site.longitude_deg"
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_air(self) -> Scene:
-        """Check that the air has a site, and that the ephemeris of its light, Sun and Moon, is valid."""
+        # 3. Air.
         air = getattr(self.light, "air", None)
-        problem = ephemeris_problem(self.start_time)
         if air and self.orbit:
             raise InputError(
                 "light.air", "the camera is in an orbit, above the air", "light.air or orbit"

@@ -230,7 +230,7 @@ def check_hardware(study: Study) -> None:
                 f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware"
             )
         for name, factor in study.factors.items():
-            if key in dict(factor.value_at(0.5)[1]):
+            if key in factor.value_at(0.5)[1]:
                 raise InputError(
                     f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two"
                 )
@@ -313,7 +313,7 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
         for other, factor in study.factors.items()
         if any(
             f"{key}.".startswith(f"{error.key}.") or f"{error.key}.".startswith(f"{key}.")
-            for key in dict(factor.value_at(0.5)[1])
+            for key in factor.value_at(0.5)[1]
         )
     ]
     if not owners:

@@ -17,6 +17,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
+    SAMPLED_DESIGNS,
     Distribution,
     Levels,
     Range,
@@ -387,7 +388,6 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
 # Factors of a study as axes, and the points of a figure or a threshold.
 
 
-SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
 GROUPS = 4  # number of groups into which a sampled factor `by` is divided
 LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
 UNITS = {

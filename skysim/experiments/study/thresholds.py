@@ -320,9 +320,13 @@ def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
         for label, one in found
         if math.isfinite(one.value)
     ]
-    beyond = [(label, one) for label, one in found if math.isinf(one.value)]
-    always = [label for label, one in beyond if (one.value > 0) != one.rising]
-    never = [label for label, one in beyond if (one.value > 0) == one.rising]
+    beyond = [
+        (label, (one.value > 0) != one.rising)
+        for label, one in found
+        if math.isinf(one.value)
+    ]
+    always = [label for label, every in beyond if every]
+    never = [label for label, every in beyond if not every]
     parts = []
     if at:
         crosses = "reaches" if any(one.rising for _, one in found) else "falls below"

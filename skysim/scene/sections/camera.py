@@ -430,26 +430,6 @@ class DetectorConfig(ConfigModel):
     bits: Annotated[int, Field(ge=1, le=16)]
     noise: bool = True
 
-    @model_validator(mode="after")
-    def check_bayer(self) -> DetectorConfig:
-        if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
-            raise InputError(
-                "quantum_efficiency",
-                f"{'one' if self.bayer else 'three curves'} with bayer: {self.bayer or 'none'}",
-                "{red: bayer_red, green: bayer_green, blue: bayer_blue} with bayer: RGGB",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def check_temperature(self) -> DetectorConfig:
-        if self.temperature_c is not None and self.doublings > 40:
-            raise InputError(
-                "temperature_c",
-                f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
-                "up to 40",
-            )
-        return self
-
     @property
     def doublings(self) -> float:
         """Number of times that the dark current doubles from dark_temperature_c to temperature_c."""
@@ -458,7 +438,19 @@ class DetectorConfig(ConfigModel):
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
     @model_validator(mode="after")
-    def check_offset(self) -> DetectorConfig:
+    def check_values(self) -> DetectorConfig:
+        if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
+            raise InputError(
+                "quantum_efficiency",
+                f"{'one' if self.bayer else 'three curves'} with bayer: {self.bayer or 'none'}",
+                "{red: bayer_red, green: bayer_green, blue: bayer_blue} with bayer: RGGB",
+            )
+        if self.temperature_c is not None and self.doublings > 40:
+            raise InputError(
+                "temperature_c",
+                f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
+                "up to 40",
+            )
         if self.offset_dn >= 2**self.bits:
             raise InputError(
                 "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"

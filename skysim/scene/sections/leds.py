@@ -330,13 +330,9 @@ class LedLightConfig(ConfigModel):
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
     @model_validator(mode="after")
-    def check_intensity(self) -> Self:
+    def check_light(self) -> Self:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise InputError("", "an LED takes either intensity or radiant_intensity")
-        return self
-
-    @model_validator(mode="after")
-    def check_color(self) -> Self:
         if isinstance(self.spectrum, str) and (
             self.fwhm_m is not None or self.color_scatter_m
         ):
