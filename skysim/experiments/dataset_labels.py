@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +14,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
+from skysim.core.types import Floats, Frame, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import TrialSetup
@@ -140,7 +139,11 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
-    add_radii(sources, truth.bodies, scene.camera.focal_px)
+    # The radii of Sun, Moon and planets, without the lens's distortion.
+    for body in truth.bodies:
+        radius_rad = math.radians(body.diameter_arcsec / 7200)
+        own = sources["id"] == body.id
+        sources["radius_px"][own] = radius_rad * scene.camera.focal_px
     extents = image_extents(
         sources, exposure_window(scene, frame.index), scene.camera.height_px
     )
@@ -188,14 +191,6 @@ def brightest_near(
             chosen[m] = np.argmax(near)
             is_free[chosen[m]] = False
     return chosen
-
-
-def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
-    """Set the radius of Sun, Moon and planets among the sources, in place, without the lens's distortion."""
-    for body in bodies:
-        rows["radius_px"][rows["id"] == body.id] = (
-            math.radians(body.diameter_arcsec / 7200) * focal_px
-        )
 
 
 def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:

@@ -22,7 +22,13 @@ from skysim.core.types import Record
 from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
 from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
-from skysim.experiments.dataset_shards import Storage, TarWriter, shard_name
+from skysim.experiments.dataset_shards import (
+    ZARR,
+    ZARR_ARRAY,
+    Storage,
+    TarWriter,
+    shard_name,
+)
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
 from skysim.experiments.study.execution.runner import Progress
@@ -347,7 +353,8 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         )
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
-    if "zarr" in plan.formats and not dataset_shards.zarr_is_there(storage):
+    # The description of the array is written last.
+    if "zarr" in plan.formats and "zarr.json" not in storage.names(f"{ZARR}/{ZARR_ARRAY}"):
         image = next(labelled_frames(plan, 0))[3].frame.image_dn
         dataset_shards.create_zarr(storage, plan.frames, plan.frames_per_shard, image)
 

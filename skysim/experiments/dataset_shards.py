@@ -368,11 +368,6 @@ def require_zarr() -> Any:
     return zarr
 
 
-def zarr_is_there(storage: Storage) -> bool:
-    """Whether the array was created: its description is written last."""
-    return "zarr.json" in storage.names(f"{ZARR}/{ZARR_ARRAY}")
-
-
 def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
     """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
     shape = image.shape

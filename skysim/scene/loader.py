@@ -108,19 +108,17 @@ def with_heads(tree: Tree) -> Tree:
     heads = tree.get("heads")
     if not isinstance(heads, list):
         return tree
-    return tree | {"heads": [completed_head(tree, head, n) for n, head in enumerate(heads)]}
-
-
-def completed_head(tree: Tree, head: Any, n: int) -> Any:
-    """The raw head n with complete sections; unchanged if it is not a mapping, which validation reports."""
-    if not isinstance(head, dict):
-        return head
-    own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
-    main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
-    try:
-        return head | with_preset(over_base(main, own))
-    except InputError as error:
-        raise error.under(f"heads.{n}") from None
+    completed = list(heads)
+    for n, head in enumerate(heads):
+        if not isinstance(head, dict):  # which validation reports
+            continue
+        own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
+        main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
+        try:
+            completed[n] = head | with_preset(over_base(main, own))
+        except InputError as error:
+            raise error.under(f"heads.{n}") from None
+    return tree | {"heads": completed}
 
 
 CALIBRATED_KEYS = (

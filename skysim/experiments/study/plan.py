@@ -585,15 +585,11 @@ def make_plan(
         chosen = points(study.design, study.factors, study.seed)
         return Plan(path, study, spec, chosen, text=text)
     parts = study.optimize.cost.parts
-    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None, text)
-
-
-def prices_of(parts: str, folder: Path) -> Prices:
-    """The prices of a study's table of parts. Raises InputError."""
     try:
-        return read_prices(find_prices(parts, folder))
+        prices = read_prices(find_prices(parts, folder)) if parts else None
     except InputError as error:
         raise error.within("optimize.cost.parts") from None
+    return Plan(path, study, spec, [], prices, text)
 
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:

@@ -337,15 +337,11 @@ class ControlConfig(ConfigModel):
                 name for name in type(self).model_fields if name not in ("law", "rate_hz")
             ]
         for name in unused:
-            if getattr(self, name) != default_of(self, name):
+            default = type(self).model_fields[name].get_default(call_default_factory=True)
+            if getattr(self, name) != default:
                 key = name.removesuffix("_s")
                 raise InputError("", f"{key} has no effect with law {self.law}", "none")
         return self
-
-
-def default_of(config: ConfigModel, name: str) -> Any:
-    """The default of a field."""
-    return type(config).model_fields[name].get_default(call_default_factory=True)
 
 
 def expand_control(value: Any) -> Any:

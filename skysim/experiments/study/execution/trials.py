@@ -137,15 +137,13 @@ class TrialJob:
 
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
-    """Run all trials of some segments, in order."""
-    return [row for segment in segments for row in run_segment(spec, segment)]
-
-
-def run_segment(spec: TrialSpec, segment: Segment) -> list[Row]:
-    """Run the trials of a segment in order, together in blocks if their kind allows."""
-    key = setup_key(spec, segment.settings)
-    size = block_size(spec, segment, key)
-    return [row for block in divided(segment, size) for row in run_block(spec, block, key)]
+    """Run all trials of some segments in order, together in blocks if their kind allows."""
+    rows = list[Row]()
+    for segment in segments:
+        key = setup_key(spec, segment.settings)
+        for block in divided(segment, block_size(spec, segment, key)):
+            rows += run_block(spec, block, key)
+    return rows
 
 
 def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
