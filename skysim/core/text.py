@@ -128,6 +128,15 @@ def seconds_since(
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
 
 
+def cells_of(lines: Iterable[Line]) -> list[tuple[int, list[str]]]:
+    """The numbered lines of a CSV file, each split at its commas; # begins a comment."""
+    return [
+        (n, [cell.strip() for cell in line.split(",")])
+        for n, line in lines
+        if not line.startswith("#")
+    ]
+
+
 def read_named_rows(
     path: Path,
     name: str,
@@ -155,21 +164,19 @@ def read_named_rows(
     InputError
         For a file that cannot be read in this way.
     """
-    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
-    columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    lines = cells_of(read_lines(path))
+    columns = lines[0][1] if lines else []
     if len(lines) < 2 or len({*columns}) < len(columns) or not {name, *needed} <= {*columns}:
         raise refusal
-    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
-    places = [n for n, _ in lines[1:]]
-    for place, row in zip(places, rows, strict=True):
+    for place, row in lines:
         if len(row) != len(columns):
             raise Where(path, place).error(
                 f"{len(row)} values", f"{len(columns)}, as the first line has"
             )
+    rows = [row for _, row in lines[1:]]
+    places = [n for n, _ in lines[1:]]
     used = [columns.index(one) for one in (*needed, *also) if one in columns]
-    numbers = to_numbers(
-        str(path), places, [[row[k] for k in used] for row in rows], len(used)
-    )
+    numbers = to_numbers(path, places, [[row[k] for k in used] for row in rows], len(used))
     names = [row[columns.index(name)] for row in rows]
     repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
     if repeated is not None:

@@ -24,7 +24,7 @@ import datetime
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, ParseError, XMLPullParser
+from xml.etree.ElementTree import ParseError, XMLPullParser
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -123,7 +123,14 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
                     section = XML_SECTIONS[tag]
                     out.append((n, f"{section}_START"))
             elif tag == "attitudeState":
-                out.append((n, state_line(element)))
+                # A quaternion with its scalar last, others in their order.
+                leaves = [
+                    one for one in element.iter() if not len(one) and one.tag != "COMMENT"
+                ]
+                leaves.sort(key=lambda one: XML_ORDER.get(str(one.tag), len(XML_ORDER)))
+                out.append(
+                    (n, " ".join("".join((one.text or "-").split()) for one in leaves))
+                )
                 element.clear()
             elif tag in XML_SECTIONS:
                 if section == "META":
@@ -134,13 +141,6 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
             elif section == "META":
                 out.append((n, f"{tag} = {(element.text or '').strip()}"))
     return out
-
-
-def state_line(state: Element) -> str:
-    """The epoch and the numbers of an attitude: a quaternion with its scalar last, others in their order."""
-    leaves = [one for one in state.iter() if not len(one) and one.tag != "COMMENT"]
-    leaves.sort(key=lambda one: XML_ORDER.get(str(one.tag), len(XML_ORDER)))
-    return " ".join("".join((one.text or "-").split()) for one in leaves)
 
 
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:

@@ -92,7 +92,16 @@ def to_samples(
     """The samples of the data rows. Raises InputError for values or keywords that are not supported."""
     # 1. Keywords.
     width, columns = SECTIONS[section]
-    rows = rows[: point_count(path, keywords, len(rows))]
+    line, text = keywords.get("NumberOfAttitudePoints", (0, str(len(rows))))
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {excerpt(text)}", "a whole number"
+        )
+    if int(text) > len(rows):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {text}, but there are {len(rows)}: the file is cut off"
+        )
+    rows = rows[: int(text)]
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
         line, value = keywords.get(key, (0, allowed))
         if value.lower() != allowed.lower():
@@ -120,22 +129,6 @@ def to_samples(
         absolute="ScenarioEpoch" in keywords,
     )
     return replace(samples, a_from_b=icrs_from(axes) * samples.a_from_b)
-
-
-def point_count(path: Path, keywords: dict[str, Line], count: int) -> int:
-    """Number of rows to read: NumberOfAttitudePoints, or all. Raises InputError if there are fewer."""
-    if "NumberOfAttitudePoints" not in keywords:
-        return count
-    line, text = keywords["NumberOfAttitudePoints"]
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise Where(path, line).error(
-            f"NumberOfAttitudePoints {excerpt(text)}", "a whole number"
-        )
-    if int(text) > count:
-        raise Where(path, line).error(
-            f"NumberOfAttitudePoints {text}, but there are {count}: the file is cut off"
-        )
-    return int(text)
 
 
 def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where, printable
-from skysim.core.text import Line, excerpt, seconds_since, to_numbers
+from skysim.core.text import Line, cells_of, excerpt, seconds_since, to_numbers
 from skysim.core.types import Floats
 from skysim.dynamics.profile_samples import Samples, from_quaternions
 from skysim.scene.sections.motion import RotationName
@@ -48,11 +48,7 @@ def read_csv(
 ) -> Samples:
     """Samples of a CSV file: a line of column names, then a line for each sample. Lines with # are comments."""
     # 1. Split the lines into cells.
-    rows = [
-        (n, [cell.strip() for cell in line.split(",")])
-        for n, line in lines
-        if not line.startswith("#")
-    ]
+    rows = cells_of(lines)
     if not rows:
         raise InputError(
             path, "empty", "a line of column names, then a line for each attitude"

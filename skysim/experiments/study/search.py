@@ -37,7 +37,6 @@ from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
 from skysim.results.files.parts import parts_list
 from skysim.results.metrics import Columns, Summary
-from skysim.scene.scene import Scene
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -72,14 +71,6 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
                 else "optimize.cost.per, as it is a range"
             )
             raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
-
-
-def check_parts(config: Cost, scene: Scene) -> None:
-    """Raise InputError if a scene whose parts are to be priced has no dome."""
-    if config.parts and not scene.dome:
-        raise InputError(
-            "optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome"
-        )
 
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:

@@ -174,8 +174,9 @@ def check(plan: Plan, to_run: bool) -> None:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
-            if study.optimize:
-                search.check_parts(study.optimize.cost, scene)
+            if study.optimize and study.optimize.cost.parts and not scene.dome:
+                problem = f"light of kind {scene.light.kind} has no parts"
+                raise InputError("optimize.cost.parts", problem, "dome")
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))

@@ -288,7 +288,7 @@ def run_points(
     engine: Engine,
     points: Sequence[Point],
     first: int,
-    watch: Watch | None = None,
+    watch: Watch | None,
 ) -> Progress:
     """Run the missing trials of `points`, numbered from `first`, within the budget of time and failures.
 

@@ -119,18 +119,15 @@ class Store:
         """
         with self.db:
             if grown:
-                self._renumber(*grown)
+                number = "trial / {0} * {1} + trial % {0}".format(*grown)
+                for table in ("trials", "timings"):
+                    # Negative numbers first, since a new number may be the old one of another row.
+                    self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
+                    self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
             self.db.execute("DELETE FROM points")
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
         self._near = NONE_NEAR
-
-    def _renumber(self, replicates: int, more: int) -> None:
-        number = f"trial / {replicates} * {more} + trial % {replicates}"
-        for table in ("trials", "timings"):
-            # Negative numbers first, since a new number may be the old one of another row.
-            self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
-            self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
 
     def scenes(self) -> list[tuple[int, int, str]]:
         """Point, replicate and scene hash of the first and the last trial that did not fail."""

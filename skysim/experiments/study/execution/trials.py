@@ -357,7 +357,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
             zyz(first, tilt, last - first)
             for (first, last), tilt in zip(turns, tilts, strict=True)
         ]
-        return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
+        return Rotation.from_quat(drawn, scalar_first=True)
     near = attitudes.near
     low, high = (math.radians(dec) for dec in attitudes.dec_deg)
     if near:  # a body is the pole
@@ -373,7 +373,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
         lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
     cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
-    return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
+    return Rotation.from_quat(drawn, scalar_first=True)
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:

@@ -482,7 +482,7 @@ def pareto_png(
     other: Panel,
     points: Sequence[int],
     front: Sequence[int],
-    also: Mapping[str, Floats] | None = None,
+    also: Mapping[str, Floats] | None,
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 

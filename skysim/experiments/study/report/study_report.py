@@ -224,7 +224,10 @@ def compose(
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
         *search_figures(lines, study, front, costs, also),
-        *index_figures(found.indices, shares),
+        *(
+            Figure(figures.indices_png(found.indices, one), shares.format(one), name=one)
+            for one in dict.fromkeys(index.response for index in found.indices)
+        ),
         *study_figures(lines, study, store.point_columns, command("replay")),
     ]
     shown = {one.response for one in layout.figures(study, lines)}
@@ -530,15 +533,6 @@ def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
     ]
     heads = [Column(across.tick_label(x)) for x in across.levels]
     return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
-
-
-def index_figures(indices: Sequence[Index], caption: str) -> list[Figure]:
-    """Bar charts of indices, one per response."""
-    named = dict.fromkeys(one.response for one in indices)
-    return [
-        Figure(figures.indices_png(indices, name), caption.format(name), name=name)
-        for name in named
-    ]
 
 
 def search_figures(
