@@ -384,7 +384,7 @@ class ListedConfig(DimmedConfig):
         return self
 
 
-Points = Annotated[
+SingleLeds = (
     FibonacciConfig
     | PoissonDiskConfig
     | RandomPlacesConfig
@@ -392,9 +392,9 @@ Points = Annotated[
     | StringConfig
     | OptimizedConfig
     | CelestialConfig
-    | ListedConfig,
-    Field(discriminator="kind"),
-]
+    | ListedConfig
+)
+Points = Annotated[SingleLeds, Field(discriminator="kind")]
 
 
 class AimingConfig(ConfigModel):
@@ -578,18 +578,4 @@ OnPoints = (
     FibersConfig | LcdConfig | ProjectorConfig
 )  # layouts that show the points of another one
 
-Layout = Annotated[
-    PatchBoardsConfig
-    | FibonacciConfig
-    | PoissonDiskConfig
-    | RandomPlacesConfig
-    | GeodesicConfig
-    | StringConfig
-    | OptimizedConfig
-    | CelestialConfig
-    | ListedConfig
-    | FibersConfig
-    | LcdConfig
-    | ProjectorConfig,
-    Field(discriminator="kind"),
-]
+Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, Field(discriminator="kind")]

@@ -321,10 +321,8 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
         return
     names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
     width = max(map(len, names)) * len(names)
-    if len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH:
-        axes.set_xticks(places, names, rotation=25, ha="right")
-    else:
-        axes.set_xticks(places, names, rotation=0, ha="center")
+    rotated = len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH
+    axes.set_xticks(places, names, rotation=25 * rotated, ha="right" if rotated else "center")
     if x_axis.log:
         axes.tick_params(axis="x", which="minor", length=0)
 

@@ -123,17 +123,15 @@ class Analysis(NamedTuple):
         return [*self.headline, *self.ranges]
 
 
-def study_report(
-    plan: Plan, store: Store, study: str = "", out: Path | None = None
-) -> Report:
-    """The report of a study; `study` and `out` are those of `commands`.
+def study_report(plan: Plan, store: Store) -> Report:
+    """The report of a study.
 
     Raises
     ------
     InputError
         If `where` of a figure names an unknown factor or level.
     """
-    command = commands(plan, store, study, out)
+    command = commands(plan, store)
     return compose(plan.study, store, analyze(plan, store, command), command)
 
 
