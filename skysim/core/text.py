@@ -26,6 +26,8 @@ EPOCH = re.compile(
 )
 
 Line = tuple[int, str]  # number, from 1, and content
+Words = tuple[int, list[str]]  # number of a line, and its words
+Metadata = dict[str, Line]  # values by keyword
 
 
 def read_lines(path: Path) -> list[Line]:
@@ -128,7 +130,7 @@ def seconds_since(
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
 
 
-def cells_of(lines: Iterable[Line]) -> list[tuple[int, list[str]]]:
+def cells_of(lines: Iterable[Line]) -> list[Words]:
     """The numbered lines of a CSV file, each split at its commas; # begins a comment."""
     return [
         (n, [cell.strip() for cell in line.split(",")])
@@ -187,8 +189,8 @@ def read_named_rows(
 class TextSegment(NamedTuple):
     """A segment: metadata with their line numbers by keyword, and data lines split into words."""
 
-    metadata: dict[str, Line]
-    data: list[tuple[int, list[str]]]
+    metadata: Metadata
+    data: list[Words]
 
     def require(self, path: str | Path, keys: Sequence[str]) -> None:
         """Raise InputError for the first keyword that is missing in the metadata."""
@@ -213,9 +215,7 @@ def check_version(
         raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
 
 
-def one_of(
-    path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]
-) -> str:
+def one_of(path: str | Path, metadata: Metadata, key: str, allowed: Iterable[str]) -> str:
     """The value of a keyword in capitals. Raises InputError if it is not allowed."""
     line, value = metadata[key]
     names = list(allowed)

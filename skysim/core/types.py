@@ -215,7 +215,7 @@ class Telemetry:
     manipulability: Floats | None = None
     lab_from_ref: Rotation | None = None
     lab_from_imu: Rotation | None = None
-    saturated: NDArray[np.bool_] | None = None
+    saturated: Bools | None = None
     bias_rad_s: Floats | None = None
     lab_from_filter: Rotation | None = None
     sigma_attitude_rad: Floats | None = None
@@ -256,7 +256,7 @@ class Sources:
         lateral shift at the detector's corner in px; None for a lens without chromatic aberration
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     place: Floats
     normal: Floats
     radius_m: Floats
@@ -264,7 +264,7 @@ class Sources:
     period_s: Floats
     start_s: Floats
     on_s: Floats
-    clock: NDArray[np.int64]
+    clock: Ints
     magnitude: Floats
     motion: Floats | None = None
     chromatic: Floats | None = None
@@ -286,12 +286,12 @@ class StarSources(Sources):
     """Stars sorted for a search by direction, so the time of a frame does not grow with the catalog."""
 
     @cached_property
-    def by_z(self) -> tuple[NDArray[np.int64], Floats]:
+    def by_z(self) -> tuple[Ints, Floats]:
         """Rows in ascending order of z, and their directions (N, 3) in this order."""
         order = np.argsort(self.place[:, 2], kind="stable")
         return order, np.ascontiguousarray(self.place[order, :3])
 
-    def within(self, direction: Floats, angle_rad: float) -> NDArray[np.int64]:
+    def within(self, direction: Floats, angle_rad: float) -> Ints:
         """Ascending rows of the stars within an angle of a unit vector.
 
         Stars in a band of z are tested, which takes half of the time of a search tree for the stars of a field.
@@ -313,7 +313,7 @@ class StarSources(Sources):
 
 
 @jit
-def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]:
+def _closer(place: Floats, direction: Floats, chord: float) -> Ints:
     """Rows of the unit vectors (N, 3) whose distance from another one is at most a chord."""
     found = np.empty(len(place), np.int64)
     count = 0
@@ -365,15 +365,15 @@ class SourceTruth:
         image at one of them
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     xy_px: Floats
     flux_xy_px: Floats
     electrons: Floats
     peak_e: Floats
     streak_px: Floats
     area_px: Floats
-    peak_xy: NDArray[np.int64]
-    saturated: NDArray[np.bool_]
+    peak_xy: Ints
+    saturated: Bools
     snr: Floats
     streak_xy_px: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
@@ -470,7 +470,7 @@ class Truth:
     rate_cam_rad_s: Floats
     mean_rate_cam_rad_s: Floats
     sources: SourceTruth
-    hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    hidden: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     bodies: tuple[BodyTruth, ...] = ()
     satellites: tuple[SatelliteTruth, ...] = ()
 

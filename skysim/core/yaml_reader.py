@@ -30,6 +30,7 @@ from skysim.core.paths import shipped_files
 
 Files = list[tuple[Path, str]]  # paths and texts
 Tree = dict[str, Any]  # nested keys: a file or a section as read, or a JSON schema
+Keys = Mapping[str, Any]  # of a file or a section, as given
 OverrideTexts = Mapping[str, str]  # YAML texts by dotted key
 # Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
 VERSION = 1
@@ -163,7 +164,7 @@ def parse_overrides(
 
 
 def override_texts(
-    overrides: Mapping[str, Any] | None, base: Tree, whole: Sequence[str] = ()
+    overrides: Keys | None, base: Tree, whole: Sequence[str] = ()
 ) -> dict[str, str]:
     """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON.
 
@@ -223,7 +224,7 @@ def as_json(key: object, value: Any) -> str:
         raise InputError(key, error, "text, numbers, lists and mappings") from None
 
 
-def as_tree(keys: Mapping[str, Any]) -> tuple[Tree, str]:
+def as_tree(keys: Keys) -> tuple[Tree, str]:
     """A file's keys given in Python as a tree of YAML values, and its YAML text. Raises InputError as `as_json`."""
     tree = {"schema": VERSION, **{key: json.loads(as_json(key, keys[key])) for key in keys}}
     return tree, yaml.safe_dump(tree, sort_keys=False)
@@ -274,7 +275,7 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
             reject_duplicate_keys(value, path)
 
 
-def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
+def check_version(tree: Keys, path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, so that its keys are not reported as unknown."""
     if "schema" not in tree:
         raise InputError(

@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where
 from skysim.core.text import (
     Line,
+    Metadata,
     TextSegment,
     check_version,
     excerpt,
@@ -227,7 +228,7 @@ def segment_samples(
     return take(to_icrs(samples, names), useable)
 
 
-def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Floats) -> Floats:
+def quaternions(path: Path, metadata: Metadata, kind: str, numbers: Floats) -> Floats:
     """(N, 4) quaternions of a_from_b, scalar last, from the numbers of a type of attitude. Raises InputError."""
     if kind.startswith("QUATERNION"):
         first = (
@@ -249,7 +250,7 @@ def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Float
 
 
 def within_span(
-    path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str
+    path: Path, metadata: Metadata, t_s: Floats, start: datetime.datetime, system: str
 ) -> slice:
     """The range of samples from USEABLE_START_TIME to USEABLE_STOP_TIME; a missing keyword sets no limit."""
     ends_s = [-np.inf, np.inf]

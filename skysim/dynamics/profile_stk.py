@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from skysim.core.errors import InputError, Where, unknown_name
-from skysim.core.text import Line, excerpt, to_numbers
+from skysim.core.text import Line, Metadata, Words, excerpt, to_numbers
 from skysim.dynamics.profile_samples import REFERENCES, Samples, from_quaternions, icrs_from
 
 # By section: count of numbers in a data line, including its time, and the columns of x, y, z, w.
@@ -46,9 +46,9 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     After the version a file has BEGIN Attitude, lines of keyword and value, the name of the data section, rows of
     numbers, and END Attitude.
     """
-    keywords: dict[str, Line] = {}
+    keywords: Metadata = {}
     section = ""
-    rows = list[tuple[int, list[str]]]()
+    rows = list[Words]()
     inside = False
     for n, line in lines[1:]:  # the first has the version
         # Keywords and section names are not case-sensitive.
@@ -84,9 +84,9 @@ def spelled(what: str, name: str, known: Iterable[str], where: Where) -> str:
 
 def to_samples(
     path: Path,
-    keywords: dict[str, Line],
+    keywords: Metadata,
     section: str,
-    rows: list[tuple[int, list[str]]],
+    rows: list[Words],
     start: datetime.datetime,
 ) -> Samples:
     """The samples of the data rows. Raises InputError for values or keywords that are not supported."""

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, Where, printable
 from skysim.core.text import Line, cells_of, excerpt, seconds_since, to_numbers
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.dynamics.profile_samples import Samples, from_quaternions
 from skysim.scene.sections.motion import RotationName
 from skysim.sources.stars import cam_from_icrs
@@ -63,7 +63,7 @@ def read_csv(
             )
     # 2. Convert to columns; epochs stay texts.
     places = [n for n, _ in body]
-    columns = dict[str, Any]()
+    columns = Record()
     if "utc" in names:
         date = names.index("utc")
         columns["utc"] = [cells.pop(date) for _, cells in body]
@@ -102,7 +102,7 @@ def from_table(
             "an astropy Table, a pandas DataFrame or a mapping of columns",
         ) from None
     check_names(Where(source), names, rotation)
-    values: dict[str, Any] = {}
+    values: Record = {}
     for name, column in columns.items():
         unit = getattr(column, "unit", None)
         if unit is not None and str(unit) != UNITS.get(name, ""):

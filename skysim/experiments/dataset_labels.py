@@ -14,7 +14,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.types import Floats, Frame, SourceTruth, Truth
+from skysim.core.types import Bools, Floats, Frame, Ints, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import TrialSetup
@@ -69,7 +69,7 @@ class Extents(NamedTuple):
     along: Floats
     half_px: Floats
 
-    def of(self, which: NDArray[np.bool_]) -> Extents:
+    def of(self, which: Bools) -> Extents:
         """The rectangles of some sources."""
         return Extents(*(part[which] for part in self))
 
@@ -179,9 +179,7 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
     return rows, found_px[chosen < 0]
 
 
-def brightest_near(
-    found_px: Floats, source_px: Floats, reach_px: Floats
-) -> NDArray[np.int64]:
+def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Ints:
     """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
     is_free = np.ones(len(source_px), np.bool_)

@@ -112,6 +112,7 @@ def rounded(value: float, digits: int = 4) -> float:
 
 # The numbers of a data sheet.
 
+Answers = Mapping[str, str]  # typed texts, by the name of the question
 Values = Mapping[str, Any]  # parsed answers, by the name of the question
 
 WELL_E_UM2 = 900.0  # full well per square micrometer of the IMX264, the least of the cameras in data/cameras
@@ -371,7 +372,7 @@ class Sheet(NamedTuple):
     missing: list[Missing]
 
 
-def fill(answers: Mapping[str, str]) -> Sheet:
+def fill(answers: Answers) -> Sheet:
     """The camera of some answers, with assumptions for the rest. Raises InputError with a key `answers.NAME`."""
     # Questions are in an order in which each assumption only needs earlier values.
     values = {name: parsed(name, text) for name, text in answers.items()}
@@ -396,7 +397,7 @@ def fill(answers: Mapping[str, str]) -> Sheet:
     return sheet
 
 
-def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
+def outstanding(answers: Answers) -> dict[str, Missing]:
     """The numbers that are missing in some answers, by name. Raises InputError as `fill`; pixels and pitch may be
     missing.
     """
@@ -435,7 +436,7 @@ def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[SheetLine]
             yield SheetLine("detector.dark_temperature_c", 25, "assumed: room temperature")
 
 
-def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
+def check(sheet: Sheet, answers: Answers) -> None:
     """Validate the camera. Raises InputError for the first wrong answer."""
     from pydantic import ValidationError
 
@@ -456,7 +457,7 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
         raise blame(faults, answers) from None
 
 
-def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
+def blame(faults: list[InputError], answers: Answers) -> InputError:
     """The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault."""
     for name, text in answers.items():
         for fault in faults:

@@ -31,6 +31,7 @@ from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
     MAPPING,
     Files,
+    Keys,
     OverrideTexts,
     Tree,
     check_version,
@@ -292,7 +293,7 @@ def find(name: str) -> Path:
 
 
 def load(
-    name: str | Path | Mapping[str, Any],
+    name: str | Path | Keys,
     overrides: OverrideTexts | None = None,
     refuses_unused: bool = True,
     folder: Path = Path(),
@@ -417,7 +418,7 @@ class Layer(NamedTuple):
     tree: Tree
 
 
-def all_layers(name: str | Path | Mapping[str, Any], folder: Path = Path()) -> list[Layer]:
+def all_layers(name: str | Path | Keys, folder: Path = Path()) -> list[Layer]:
     """The layers of a scene; the arguments are those of `load`. Raises InputError."""
     if isinstance(name, Mapping):
         return layers_of(folder / MAPPING, *yaml_reader.as_tree(name))
@@ -559,7 +560,7 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
 
 def load_camera(
     path: Path,
-    lens: Mapping[str, Any] | None = None,
+    lens: Keys | None = None,
     overrides: OverrideTexts | None = None,
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with only a camera. Raises InputError.

@@ -10,13 +10,14 @@ from __future__ import annotations
 import datetime
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core.units import ConfigModel, si_unit
 from skysim.core.yaml_reader import (
+    Keys,
     OverrideTexts,
     Tree,
     key_lines,
@@ -136,7 +137,7 @@ def with_preset(camera: Tree) -> Tree:
     return own
 
 
-def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> Tree:
+def with_origins(path: Path, text: str, tree: Keys, what: str) -> Tree:
     """The tree of a file with the origin of each value; a list is one value."""
     lines = key_lines(text)
 

@@ -31,7 +31,7 @@ from skysim.core.units import (
     Time,
     Triple,
 )
-from skysim.core.yaml_reader import excerpt, explain, fault_of
+from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
@@ -162,7 +162,7 @@ def ephemeris_problem(start_time: datetime.datetime) -> str:
     return f"start_time {start_time} is outside {first} to {last}"
 
 
-class RawKeys(dict[str, Any]):
+class RawKeys(Tree):
     """The keys from which a scene was loaded. Equal to any other: the values of scenes are compared."""
 
     def __eq__(self, other: object) -> bool:

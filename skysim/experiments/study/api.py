@@ -24,6 +24,7 @@ from skysim.core.files import make_folder, write_text
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.yaml_reader import (
     MAPPING,
+    Keys,
     Tree,
     as_tree,
     excerpt,
@@ -170,7 +171,7 @@ def run_study(
         engine.close()
 
 
-def keys_of(study: Any, path: Path) -> Mapping[str, Any]:
+def keys_of(study: Any, path: Path) -> Keys:
     """The keys of a study's file at `path`, of a mapping, or of a study of a scene. Raises InputError."""
     if isinstance(study, str | Path):
         return read_yaml(path)[0]
@@ -189,7 +190,7 @@ def keys_of(study: Any, path: Path) -> Mapping[str, Any]:
     return {"title": loaded.title, "seed": loaded.seed, "scene": study}
 
 
-def study_texts(changes: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, str]:
+def study_texts(changes: Keys, tree: Keys) -> dict[str, str]:
     """Overrides of a study's keys as YAML texts; those of `set` are added to the study's."""
     if isinstance(changes.get("set"), Mapping):
         changes = {**changes, "set": {**tree.get("set", {}), **changes["set"]}}

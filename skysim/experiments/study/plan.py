@@ -481,7 +481,7 @@ class TrialSpec:
         Digests of these functions and objects
     """
 
-    scene: str | Tree
+    scene: str | dict[str, Any]
     folder: str
     seed: int
     base: Settings

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.types import Record
 from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
@@ -281,7 +282,7 @@ def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[lis
     return ["candidate", *study.factors, *shown], rows
 
 
-def front_columns(result: SearchResult) -> dict[str, Any]:
+def front_columns(result: SearchResult) -> Record:
     """The candidates of the front, and the cost of every candidate; None if it has none."""
     costs = [None if math.isnan(one.cost) else one.cost for one in result.candidates]
     return {"front": [one.number for one in result.front], "costs": costs}

@@ -10,11 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
     SAMPLED_DESIGNS,
@@ -38,7 +37,7 @@ class PointRow(NamedTuple):
     """One point: its number, factor levels, the responses computed from its trials, and the number of its trials."""
 
     point: int
-    levels: dict[str, Any]
+    levels: Record
     responses: dict[str, Summary]
     trials: int = 0
 
@@ -369,7 +368,7 @@ def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:
     return outputs[np.isfinite(outputs).all(axis=1)]
 
 
-def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
+def generalized(a: Floats, b: Floats, ab: Floats) -> Floats:
     """(2, D) first-order and total indices, averaged over the outputs with their variances as weights.
 
     The estimators are those of Saltelli et al. (2010), from SciPy. Outputs without variance have weight zero.

@@ -10,7 +10,7 @@ import json
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from typing import Any
@@ -22,6 +22,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study.execution.engines import (
     AHEAD,
     DIED,
+    Batches,
     Chunk,
     Chunks,
     Job,
@@ -109,7 +110,7 @@ def thread_count(client: Client) -> int:
 
 def collect_rows(
     client: Client, name: str, job: Job, chunks: Chunks, in_flight: dict[Future, Submission]
-) -> Iterator[list[Any]]:
+) -> Batches:
     """Yield rows as chunks complete; chunks that complete together are joined. `in_flight` maps futures to chunks.
 
     Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
@@ -242,7 +243,7 @@ class Dask:
         self.client = connect(scheduler)
         self.workers = thread_count(self.client)
 
-    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
+    def run(self, job: Job, chunks: Chunks) -> Batches:
         """See `Engine`; the client is closed at the end. Raises InputError if the scheduler's connection is lost."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image
-from skysim.core.types import Frame, Truth
+from skysim.core.types import Frame, Ints, Truth
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
@@ -111,7 +110,7 @@ class ChunkQueue:
         self,
         points: Sequence[Point],
         replicates: int,
-        missing: NDArray[np.int64],
+        missing: Ints,
         first: int = 0,
         spec: TrialSpec | None = None,
         seconds: float = CHUNK_S,
@@ -152,7 +151,7 @@ class ChunkQueue:
             if len(trials)
         )
 
-    def _segment(self, trials: NDArray[np.int64]) -> Segment:
+    def _segment(self, trials: Ints) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
         if self.spec:

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, remove
+from skysim.core.types import Bools, Ints, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
@@ -273,7 +273,7 @@ class Store:
             row = (None, time.time() - seconds, engine, workers, trials, seconds)
             self.db.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
 
-    def runs(self) -> list[dict[str, Any]]:
+    def runs(self) -> list[Record]:
         """Every run that was not killed: engine, workers, trials, seconds."""
         rows = self.db.execute(
             "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
@@ -284,7 +284,7 @@ class Store:
             for row in known
         ]
 
-    def done(self, count: int) -> NDArray[np.bool_]:
+    def done(self, count: int) -> Bools:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         with self.snapshot():
@@ -321,7 +321,7 @@ class Store:
                 for trial, error in rows
             ]
 
-    def trial(self, number: int) -> dict[str, Any]:
+    def trial(self, number: int) -> Record:
         """One row by column name. Raises InputError if the trial is not in the store."""
         rows = self._rows([(number, number + 1)])
         if not len(rows["trial"]):
@@ -384,7 +384,7 @@ class Store:
             SQL condition for the rows in SQLite
         """
         sources = list[Source]()
-        numbers = list[NDArray[np.int64]]()
+        numbers = list[Ints]()
         with self.snapshot():
             for part in self.parts():
                 if (source := part.source(ranges, self._replicates())) is not None:

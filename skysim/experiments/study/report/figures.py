@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.study.plan import Curve, Heat, Map, Study
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
@@ -50,7 +50,7 @@ def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> Non
     fig.colorbar(image, label=label(figure.response), **where).minorticks_off()
 
 
-def color_scale(values: Floats, figure: Heat | Map) -> dict[str, Any]:
+def color_scale(values: Floats, figure: Heat | Map) -> Record:
     """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
     from matplotlib.colors import Normalize
 

@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.experiments.study.table import (
     Axis,
@@ -63,8 +62,8 @@ class Series(NamedTuple):
     value: Floats
     low: Floats
     high: Floats
-    values: NDArray[np.int64]
-    few: NDArray[np.bool_]
+    values: Ints
+    few: Bools
 
 
 class Grid(NamedTuple):
@@ -81,8 +80,8 @@ class Grid(NamedTuple):
     x: Axis
     y: Axis
     value: Floats
-    values: NDArray[np.int64]
-    few: NDArray[np.bool_]
+    values: Ints
+    few: Bools
 
 
 class Panel(NamedTuple):

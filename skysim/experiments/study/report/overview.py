@@ -31,6 +31,7 @@ from skysim.simulation import checks
 from skysim.simulation.checks.facts import TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
+Texts = list[tuple[str, str]]  # names with texts, or texts with the names of points
 NUMBER = re.compile(r"\d[\d.]*")
 MAX_CHECKED = (
     16  # maximum number of scenes that are checked: building one takes up to a second
@@ -55,7 +56,7 @@ class Overview(NamedTuple):
         Requirements of the study, or else of its scene
     """
 
-    rows: list[tuple[str, str]]
+    rows: Texts
     findings: list[str]
     may_be_ambiguous: bool
     fixed: tuple[str, ...] = ()
@@ -64,8 +65,8 @@ class Overview(NamedTuple):
 
 def overview(plan: Plan) -> Overview:
     """The overview of a study. Scenes that cannot be built are left out: the rows of their trials have the reason."""
-    rows: list[tuple[str, str]] = []
-    found: dict[str, list[tuple[str, str]]] = {}
+    rows: Texts = []
+    found: dict[str, Texts] = {}
     leds: dict[str, int] = {}
     checked = 0
     may_be_ambiguous = False
@@ -110,7 +111,7 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     return None if drawn is None or not scene.dome else float(np.max(drawn.tilt_deg))
 
 
-def finding_text(at: list[tuple[str, str]], checked: int) -> str:
+def finding_text(at: Texts, checked: int) -> str:
     """Text of a finding that has other numbers at other levels: the first one, and the levels at which it was found."""
     others = [levels for _, levels in at[1:]]
     (line, first) = at[0]
@@ -184,7 +185,7 @@ def options(factor: Factor) -> list[Option]:
 # The table.
 
 
-def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
+def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> Texts:
     """Rows on the scene of a lab, its tracker by the facts of the checks, and how the study varies and repeats it."""
     study = plan.study
     scene = lab.scene
