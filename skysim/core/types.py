@@ -272,7 +272,7 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, which: NDArray[Any]) -> Sources:
+    def take(self, which: NDArray) -> Sources:
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
@@ -499,7 +499,7 @@ class Frame:
     """
 
     index: int
-    image_dn: NDArray[Any]
+    image_dn: NDArray
     t_mid_s: float
     exposure_s: float
     saturation_dn: float

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +42,10 @@ SOURCE = np.dtype(
                 "electrons",
                 "peak_e",
                 "snr",
+                "sigma_px",
+                "radius_px",
             )
         ),
-        *((name, "<f4") for name in ("sigma_px", "radius_px")),
         ("saturated", "?"),
         ("detected", "?"),
         *((name, "<f4") for name in ("detected_x_px", "detected_y_px")),
@@ -91,7 +92,7 @@ class LabelledFrame(NamedTuple):
 
     frame: Frame
     truth: Truth
-    sources: NDArray[Any]
+    sources: NDArray
     extents: Extents
     unmatched_px: Floats
     masks: dict[str, list[int]]
@@ -155,7 +156,7 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
-def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
     """(N,) labels of the sources, brightest first, and the (M, 2) detections that belong to no source.
 
     A detection belongs to the brightest free source whose distance is at most SAME_LIGHT_PX plus half the length of
@@ -191,7 +192,7 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Int
     return chosen
 
 
-def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
+def image_extents(rows: NDArray, window: Window, height_px: int) -> Extents:
     """The rectangle about each source's streak.
 
     On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
@@ -230,7 +231,7 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     return np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi))
 
 
-def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
+def run_lengths(mask: NDArray, least: float = True) -> list[int]:
     """Lengths of the runs of an (H, W) mask, column by column, beginning with pixels that are not set: COCO's code.
 
     Parameters

@@ -345,7 +345,7 @@ def sample_std(values: Floats, axis: int = -1) -> Any:
 
 # Responses: statistics over trials. Each trial is a row; the columns are arrays, NaN where it has no such value.
 
-Columns = Mapping[str, NDArray[Any]]
+Columns = Mapping[str, NDArray]
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
@@ -363,7 +363,7 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }
 # The beginning of a response name. Errors are taken as magnitudes.
-QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
+QUANTITIES: dict[str, Callable[[Columns], NDArray]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
     "angle_arcsec": lambda c: np.sqrt(
@@ -432,7 +432,7 @@ def overconfident(c: Columns) -> Summary:
     return proportion(np.sum(c["nees"][solved] > OVERCONFIDENT_NEES), np.sum(solved))
 
 
-def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
+def proportion_of_frames(hits: NDArray, frames: NDArray) -> Summary:
     """A proportion of all frames.
 
     The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
@@ -488,7 +488,7 @@ LIMIT = re.compile(r"((?:cross|roll|angle)_arcsec)_([\d.]+)")
 OVER = re.compile(r"(\w+)_over_(\d[\d.e+-]*)$")
 
 
-def right_within(name: str, c: Columns) -> NDArray[Any]:
+def right_within(name: str, c: Columns) -> NDArray:
     """(N,) whether each trial is solved in all frames, none of them wrong, with errors up to the limits in a name."""
     right = (c["frames"] > 0) & (c["solved"] == c["frames"]) & (c["wrong"] == 0)
     within = [QUANTITIES[error](c) <= float(limit) for error, limit in LIMIT.findall(name)]

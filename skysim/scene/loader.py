@@ -51,12 +51,12 @@ PRESETS = DATA / "cameras"
 
 def list_cameras() -> list[str]:
     """Names of the camera presets in data/cameras."""
-    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+    return list(shipped_files(PRESETS))
 
 
 def preset_path(name: str) -> Path:
     """The file of a camera preset, which is a name in data/cameras or a path. Raises InputError for an unknown name."""
-    path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
+    path = shipped_files(PRESETS).get(name, Path(name))
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         problem, names = unknown_name("preset", name, list_cameras())
         raise InputError("camera.preset", problem, f"{names}, or a .yaml file with a camera")

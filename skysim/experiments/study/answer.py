@@ -20,11 +20,11 @@ from skysim.experiments.study.table import (
     PointRow,
     PointRows,
     axis,
-    distinct,
     format_level,
     format_summary,
     has_few_values,
     unit_of,
+    varied_factors,
 )
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -266,11 +266,7 @@ def ranges(study: Study, lines: PointRows) -> list[str]:
 
 def placer(study: Study, lines: PointRows) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
-    varied = [
-        name
-        for name in study.factors
-        if len(distinct(line.levels[name] for line in lines)) > 1
-    ]
+    varied = varied_factors(study, lines)
     units = {name: unit_of(axis(study, lines, name)) for name in varied}
 
     def named(name: str, level: Value) -> str:

@@ -105,7 +105,7 @@ def rank_correlations(plan: Plan, columns: Columns) -> list[tuple[str, str, Summ
         count = int(known.sum())
         if count < metrics.FEWEST or np.ptp(y[known]) == 0:
             continue
-        x = [axes[name].coordinate(lines[n].levels[name]) for n in columns["point"][known]]
+        x = [axes[name].at(lines[n]) for n in columns["point"][known]]
         r = float(scipy.stats.spearmanr(x, y[known]).statistic)
         half = metrics.joint_sigmas(len(pairs)) * math.sqrt((1 + r**2 / 2) / (count - 3))
         low, high = np.tanh(np.arctanh(np.clip(r, -1, 1)) + np.array([-half, half])).tolist()
@@ -408,6 +408,7 @@ Shown = Figure | Threshold
 class Axis(NamedTuple):
     """A factor as an axis: label and levels, ascending if they are numbers of one unit, else in the study's order."""
 
+    factor: str
     label: str
     levels: list[Value]
     numeric: bool
@@ -418,6 +419,10 @@ class Axis(NamedTuple):
         if self.numeric:
             return split_quantity(one)[0]
         return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
+
+    def at(self, line: PointRow) -> float:
+        """Coordinate of a point on the axis."""
+        return self.coordinate(line.levels[self.factor])
 
     def tick_label(self, one: Value) -> str:
         """Tick text of a level; a number is written without its unit, which is in the axis label."""
@@ -446,6 +451,15 @@ def same(one: Value, other: Value) -> bool:
 def distinct(levels: Iterable[Value]) -> list[Value]:
     """The levels without duplicates, in order of first appearance."""
     return list({repr(one): one for one in levels}.values())
+
+
+def varied_factors(study: Study, lines: PointRows) -> list[str]:
+    """The factors with more than one level among some points."""
+    return [
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
+    ]
 
 
 def label(name: str, unit: str = "") -> str:
@@ -478,7 +492,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
             log = factor.distribution == "lognormal"
         else:
             log = suits_log_scale(np.sort(numbers))
-        return Axis(label(name, own_unit or unit), levels, True, log)
+        return Axis(name, label(name, own_unit or unit), levels, True, log)
     order = [one for one, _ in factor.options()]
 
     def place(level: Value) -> int:
@@ -486,7 +500,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
 
     levels.sort(key=place)
     has_text = any(isinstance(one, str | bool) for one in levels)
-    return Axis(label(name, "" if has_text else unit), levels, False, False)
+    return Axis(name, label(name, "" if has_text else unit), levels, False, False)
 
 
 def unit_of(axis: Axis) -> str:
@@ -578,13 +592,13 @@ def group_points(
     group_axis = axis(study, all_lines, name)
     # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
     if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
-        ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
+        ordered = sorted(lines, key=group_axis.at)
         bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
         groups = {}
         for begin, end in itertools.pairwise(bounds):
             if begin < end:
-                low = group_axis.coordinate(ordered[begin].levels[name])
-                high = group_axis.coordinate(ordered[end - 1].levels[name])
+                low = group_axis.at(ordered[begin])
+                high = group_axis.at(ordered[end - 1])
                 groups[f"{low:.3g} to {high:.3g}"] = ordered[begin:end]
         return groups
     return {

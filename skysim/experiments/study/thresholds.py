@@ -230,10 +230,7 @@ def crossings(
 
 def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossing | None:
     """The crossing along one series of points; None without trials at two levels."""
-    summaries = [
-        (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
-        for line in lines
-    ]
+    summaries = [(axis.at(line), line.responses[threshold.response]) for line in lines]
     rows = [
         (x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials
     ]

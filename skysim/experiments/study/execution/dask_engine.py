@@ -10,9 +10,9 @@ import json
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from itertools import islice
 from typing import Any
 from uuid import uuid4
 
@@ -126,10 +126,10 @@ def collect_rows(
             capacity = max(thread_count(client), 1) * (1 + AHEAD)
             polled_s = time.monotonic()
         alone = bool(retries)
-        new = take(
-            retries.popleft if alone else chunks.next,
-            (1 if alone else capacity) - len(in_flight),
-        )
+        # An empty chunk is the end.
+        source = iter(retries.popleft if alone else chunks.next, ())
+        room = (1 if alone else capacity) - len(in_flight)
+        new = list(islice(source, max(room, 0)))
         # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
         futures = (
             client.map(
@@ -160,14 +160,6 @@ def collect_rows(
                     retries.extend(split_chunk(chunk))
         if rows:
             yield rows
-
-
-def take(source: Callable[[], Chunk], count: int) -> list[Chunk]:
-    """The next `count` chunks of a source, or fewer at its end."""
-    taken: list[Chunk] = []
-    while len(taken) < count and (chunk := source()):
-        taken.append(chunk)
-    return taken
 
 
 def encode_chunk(chunk: Chunk) -> str:

@@ -396,8 +396,8 @@ def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None
     points = shown_points(lines, figure, study)
     x = axis(study, lines, figure.x)
     y = axis(study, lines, figure.y)
-    across = [x.coordinate(line.levels[figure.x]) for line in points]
-    up = [y.coordinate(line.levels[figure.y]) for line in points]
+    across = list(map(x.at, points))
+    up = list(map(y.at, points))
     values = np.array([line.responses[figure.value].value for line in points])
     size = min(max(6000 / max(len(points), 1), 4), 45)
     set_up_x_axis(axes, x)

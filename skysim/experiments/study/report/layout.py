@@ -17,7 +17,6 @@ from skysim.experiments.study.table import (
     Axis,
     PointRows,
     axis,
-    distinct,
     fixed_levels,
     format_level,
     group_points,
@@ -25,6 +24,7 @@ from skysim.experiments.study.table import (
     is_sampled,
     label,
     shown_points,
+    varied_factors,
 )
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
@@ -153,8 +153,8 @@ def series(lines: PointRows, figure: Curve, study: Study) -> list[Series]:
     for name, group in group_points(lines, figure, study).items():
         if not group:
             continue
-        ordered = sorted(group, key=lambda line: x_axis.coordinate(line.levels[figure.x]))
-        x = np.array([x_axis.coordinate(line.levels[figure.x]) for line in ordered])
+        ordered = sorted(group, key=x_axis.at)
+        x = np.array(list(map(x_axis.at, ordered)))
         summaries = [line.responses[figure.y] for line in ordered]
         value, low, high = np.array([one[:3] for one in summaries], dtype=float).T
         count = np.array([one.trials for one in summaries])
@@ -173,9 +173,7 @@ def grid(lines: PointRows, figure: Heat, study: Study) -> Grid:
     count = np.zeros(shape, int)
     few = np.zeros(shape, bool)
     for line in shown_points(lines, figure, study):
-        row = rows.index(y.coordinate(line.levels[figure.y]))
-        column = columns.index(x.coordinate(line.levels[figure.x]))
-        cell = row, column
+        cell = rows.index(y.at(line)), columns.index(x.at(line))
         value[cell] = line.responses[figure.value].value
         count[cell] = line.responses[figure.value].trials
         few[cell] = has_few_values(line, figure.value)
@@ -292,11 +290,7 @@ def caption_title(figure: Figure) -> str:
 
 def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
-    varied = {
-        name
-        for name in study.factors
-        if len(distinct(line.levels[name] for line in lines)) > 1
-    }
+    varied = varied_factors(study, lines)
     fixed = fixed_levels(figure, study, lines).items()
     at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
     return f", at {at}" if at else ""

@@ -340,7 +340,7 @@ def points_section(
     for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
         keys = [
             line.point,
-            *(axes[name].coordinate(one) for name, one in line.levels.items()),
+            *(one.at(line) for one in axes.values()),
         ]
         keys += [one.value for one in line.responses.values()]
         tone: Tone = "marked" if line.point in front else ""
