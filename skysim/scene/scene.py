@@ -222,15 +222,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
         sky = self.light.kind == "stars"
         tracker = self.tracker
         # Survey errors and maps need LEDs; without LEDs only the focal length is surveyed.
-        lens_only = SurveyErrorsConfig()
-        if tracker.survey.focal_length_sigma_m:
-            lens_only = lens_only.model_copy(
-                update={
-                    "focal_length_sigma_m": tracker.survey.focal_length_sigma_m,
-                    "seed": tracker.survey.seed,
-                }
-            )
-        if not self.dome and (tracker.survey != lens_only or tracker.map):
+        lens = {"focal_length_sigma_m": 0.0, "seed": 0}
+        survey = tracker.survey
+        if survey.focal_length_sigma_m:
+            survey = survey.model_copy(update=lens)
+        if not self.dome and (survey != SurveyErrorsConfig() or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
                 f"tracker.{key}",

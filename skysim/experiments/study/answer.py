@@ -23,7 +23,6 @@ from skysim.experiments.study.table import (
     format_level,
     format_summary,
     has_few_values,
-    unit_of,
     varied_factors,
 )
 from skysim.results import metrics
@@ -267,7 +266,7 @@ def ranges(study: Study, lines: PointRows) -> list[str]:
 def placer(study: Study, lines: PointRows) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
     varied = varied_factors(study, lines)
-    units = {name: unit_of(axis(study, lines, name)) for name in varied}
+    units = {name: axis(study, lines, name).unit for name in varied}
 
     def named(name: str, level: Value) -> str:
         return f"{name} = {format_level(level)}" + (

@@ -29,7 +29,6 @@ from skysim.core.yaml_reader import (
     as_tree,
     excerpt,
     is_file,
-    one_line,
     override_texts,
     read_yaml,
     set_key,
@@ -40,7 +39,7 @@ from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import TRIAL, Plan
+from skysim.experiments.study.plan import Plan, scene_texts
 from skysim.experiments.study.report.study_report import study_report
 from skysim.results.report import Report
 from skysim.scene import loader
@@ -235,8 +234,7 @@ def part_settings(tree: Tree, name: str, part: Any, folder: Path) -> Settings:
     """The settings of a study with a controller, tracker or profile, as `simulation.lab.with_parts` has them."""
     if name == "tracker":
         return {"tracker.name": part}
-    settings = tree.get("set", {}).items()
-    texts = {key: one_line(value) for key, value in settings if not key.startswith(TRIAL)}
+    texts = scene_texts(tree.get("set", {}))
     scene = loader.with_overrides(loader.merged(loader.all_layers(tree["scene"])), texts)
     control = value_at(scene, "motion.control")
     if name == "controller":

@@ -601,11 +601,16 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     local = folder / str(name)
     if local.suffix in {".yaml", ".yml"} and is_file(local):
         name = local
-    overrides = {
-        key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
-    }
     # `unused_options` refuses unused keys, for the whole study.
+    overrides = scene_texts(values)
     return loader.load(name, overrides, refuses_unused=False, folder=folder), trial
+
+
+def scene_texts(settings: Settings) -> dict[str, str]:
+    """The settings of the scene, without those of the trial, as YAML texts."""
+    return {
+        key: one_line(value) for key, value in settings.items() if not key.startswith(TRIAL)
+    }
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:

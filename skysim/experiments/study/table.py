@@ -420,6 +420,12 @@ class Axis(NamedTuple):
             return split_quantity(one)[0]
         return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
 
+    @property
+    def unit(self) -> str:
+        """The unit after a space; empty if there is none."""
+        unit = self.label.partition(" [")[2].rstrip("]")
+        return f" {unit}" if unit else ""
+
     def at(self, line: PointRow) -> float:
         """Coordinate of a point on the axis."""
         return self.coordinate(line.levels[self.factor])
@@ -501,12 +507,6 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
     levels.sort(key=place)
     has_text = any(isinstance(one, str | bool) for one in levels)
     return Axis(name, label(name, "" if has_text else unit), levels, False, False)
-
-
-def unit_of(axis: Axis) -> str:
-    """The unit of an axis after a space; empty if it has none."""
-    unit = axis.label.partition(" [")[2].rstrip("]")
-    return f" {unit}" if unit else ""
 
 
 def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:

@@ -243,14 +243,10 @@ def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossi
 def sentences(threshold: Threshold, study: Study, lines: PointRows) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
     axis = table.axis(study, lines, threshold.along)
-    unit = (
-        table.unit_of(table.axis(study, lines, threshold.by))
-        if threshold.by is not None
-        else ""
-    )
+    by = threshold.by
+    unit = table.axis(study, lines, by).unit if by is not None else ""
     return [
-        (f"{threshold.by} = {label}{unit}: " if label else "")
-        + describe(one, threshold, axis)
+        (f"{by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
     ]
 
@@ -262,7 +258,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     name = threshold.along
     if found is None:
         return f"{response} has no trials at two levels of {name} yet."
-    unit = table.unit_of(axis)
+    unit = axis.unit
     if math.isnan(found.value):
         return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
     first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
@@ -301,7 +297,7 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
 def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
     """The threshold in one sentence without its intervals, all levels of `by` together; "" without trials."""
     axis = table.axis(study, lines, threshold.along)
-    unit = table.unit_of(axis)
+    unit = axis.unit
     found = [
         (f" ({label})" if label else "", one)
         for label, one in crossings(threshold, study, lines).items()

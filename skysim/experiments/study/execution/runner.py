@@ -218,12 +218,11 @@ def prepare_store(
         check_functions(plan, store)
         check_scene(plan, store)
     if stored != plan.digest or not done:
-        file = str(plan.path.resolve())
         store.begin(
             plan.points,
             grown=(kept, plan.study.replicates) if done else None,
             study=plan.text,
-            file=file,
+            file=str(plan.path.resolve()),
             title=plan.study.title,
             code=code_version(),
             digest=plan.digest,
