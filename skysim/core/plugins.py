@@ -163,12 +163,6 @@ class RunningProcess:
             shutil.rmtree(self.folder, ignore_errors=True)
         return code
 
-    def exit_message(self) -> str:
-        """Text on the end of the process, with its last lines of standard error."""
-        code = self.stop()
-        reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
-        return f"the program ended ({reason}): {' | '.join(self.last_lines) or 'nothing on standard error'}"
-
 
 class Program:
     """A program that answers messages.
@@ -296,7 +290,10 @@ class Program:
         """Buffer output of the program. Raises ProgramError if the program ended or an answer is too long."""
         if not chunk:
             assert self.running is not None
-            raise self.fail(self.running.exit_message())
+            code = self.running.stop()
+            reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
+            last = " | ".join(self.running.last_lines) or "nothing on standard error"
+            raise self.fail(f"the program ended ({reason}): {last}")
         self.received += chunk
         if len(self.received) > MAX_ANSWER_BYTES:
             raise self.fail(f"answer of more than {MAX_ANSWER_BYTES} bytes", 0.0)

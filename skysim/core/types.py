@@ -545,11 +545,11 @@ class FrameRow:
     time_ms: float
     wrong: bool
     filter: str = ""
-    cross_sigma_arcsec: float = float("nan")
-    roll_sigma_arcsec: float = float("nan")
-    log10_chance: float = float("nan")
-    exposure_s: float = float("nan")
-    rate_error_deg_s: float = float("nan")
-    rate_sigma_deg_s: float = float("nan")
-    magnitude_error_mag: float = float("nan")
-    magnitude_sigma_mag: float = float("nan")
+    cross_sigma_arcsec: float = math.nan
+    roll_sigma_arcsec: float = math.nan
+    log10_chance: float = math.nan
+    exposure_s: float = math.nan
+    rate_error_deg_s: float = math.nan
+    rate_sigma_deg_s: float = math.nan
+    magnitude_error_mag: float = math.nan
+    magnitude_sigma_mag: float = math.nan

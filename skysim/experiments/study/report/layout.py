@@ -231,9 +231,10 @@ def panels(
 
 def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
     """The panel of one response, or of `cost`, over the candidates."""
-    nan = float("nan")
     if name == "cost":
-        summaries: list[Any] = [(costs.get(line.point, nan), nan, nan) for line in lines]
+        summaries: list[Any] = [
+            (costs.get(line.point, np.nan), np.nan, np.nan) for line in lines
+        ]
     else:
         summaries = [line.responses[name][:3] for line in lines]
     bounds = []
