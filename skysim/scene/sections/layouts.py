@@ -453,11 +453,6 @@ class FibersConfig(ConfigModel):
             )
         return self
 
-    @property
-    def cap_deg(self) -> float:
-        """Greatest angle of points from the zenith."""
-        return self.points.cap_deg
-
 
 class PixelsConfig(ConfigModel):
     """Grid and gray levels of a display, common to an LCD panel, a projector and a collimated micro-display.
@@ -505,11 +500,6 @@ class LcdConfig(PixelsConfig):
     kind: Literal["lcd"]
     points: Points
 
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
-
 
 class ProjectorConfig(PixelsConfig):
     """A projector in the dome that shows any layout of single LEDs on the matt inside, each on the nearest pixels.
@@ -550,11 +540,6 @@ class ProjectorConfig(PixelsConfig):
     focus_m: PositiveLength | None = None
     distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
-
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
 
     @model_validator(mode="after")
     def check_lens(self) -> ProjectorConfig:
