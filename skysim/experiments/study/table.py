@@ -408,11 +408,11 @@ Shown = Figure | Threshold
 class Axis(NamedTuple):
     """A factor as an axis: label and levels, ascending if they are numbers of one unit, else in the study's order."""
 
-    factor: str
     label: str
     levels: list[Value]
     numeric: bool
     log: bool
+    factor: str
 
     def coordinate(self, one: Value) -> float:
         """Coordinate of a level on the axis: its numeric value, or its index if levels are not numeric."""
@@ -498,7 +498,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
             log = factor.distribution == "lognormal"
         else:
             log = suits_log_scale(np.sort(numbers))
-        return Axis(name, label(name, own_unit or unit), levels, True, log)
+        return Axis(label(name, own_unit or unit), levels, True, log, name)
     order = [one for one, _ in factor.options()]
 
     def place(level: Value) -> int:
@@ -506,7 +506,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
 
     levels.sort(key=place)
     has_text = any(isinstance(one, str | bool) for one in levels)
-    return Axis(name, label(name, "" if has_text else unit), levels, False, False)
+    return Axis(label(name, "" if has_text else unit), levels, False, False, name)
 
 
 def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
