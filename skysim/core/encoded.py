@@ -116,12 +116,6 @@ class Tiff:
             return None
         return self.number(INTEGER_TYPES[entry.kind], entry.at)
 
-    def most_bits(self, entry: TiffEntry) -> int:
-        """Bits of the first sample by a BITS_TAG, whose values are in the entry itself or at an offset in it."""
-        inside = entry.values * 2 <= (8 if self.is_big else 4)
-        at = entry.at if inside else self.number("Q" if self.is_big else "I", entry.at)
-        return self.number("H", at)
-
 
 def image_size(data: bytes, at: int | None = None) -> tuple[int, int, int, int, bool] | None:
     """Width, height, samples per pixel, bits per sample, and whether samples are planar; None without a size.
@@ -136,7 +130,10 @@ def image_size(data: bytes, at: int | None = None) -> tuple[int, int, int, int, 
         if entry.tag in values:
             values[entry.tag] = max(values[entry.tag], tiff.value(entry) or 0)
         elif entry.tag == BITS_TAG:
-            bits = max(bits, tiff.most_bits(entry))
+            # The values are in the entry itself, or at an offset in it.
+            inside = entry.values * 2 <= (8 if tiff.is_big else 4)
+            place = entry.at if inside else tiff.number("Q" if tiff.is_big else "I", entry.at)
+            bits = max(bits, tiff.number("H", place))
     width, height, samples, planar = values.values()
     return (
         (width, height, samples, bits, planar == 2) if width and height and samples else None

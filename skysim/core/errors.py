@@ -51,6 +51,10 @@ class Where(NamedTuple):
         place = "" if self.line is None else f", {self.unit} {self.line}"
         return printable(f"{self.file}{place}")
 
+    def error(self, problem: object, allowed: object = "") -> InputError:
+        """An error in the file, at this place."""
+        return InputError(self.file, problem, allowed, self)
+
 
 OVERRIDES = Where("overrides")  # place of a value that the caller gave instead of the file
 

@@ -33,6 +33,7 @@ from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
 from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
+from skysim.core.types import Record
 
 # FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
 # row order and date.
@@ -224,7 +225,7 @@ def planes(path: Path, pixels: NDArray) -> list[NDArray]:
     return [pixels]
 
 
-def header_values(*headers: Any) -> dict[str, Any]:
+def header_values(*headers: Any) -> Record:
     """ViewedImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
     found: dict[str, str] = {}
     for header in reversed(headers):

@@ -35,7 +35,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, printable, unknown_name
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 
 START_LIMIT_S = 120.0  # time limit for the program to report that it is ready
 GRACE_S = 1.0  # time limit for the program to exit after its input is closed
@@ -50,7 +50,7 @@ Programs = Mapping[str, Any]
 NO_PROGRAMS: Programs = {}
 
 # Function from the header of a message, and the stream of the bytes that follow it, to an answer.
-Respond = Callable[[dict[str, Any], IO[bytes]], dict[str, Any]]
+Respond = Callable[[Record, IO[bytes]], Record]
 
 
 class PluginKind(NamedTuple):
@@ -166,12 +166,6 @@ class RunningProcess:
         if self.folder:
             shutil.rmtree(self.folder, ignore_errors=True)
         return code
-
-    def exit_message(self) -> str:
-        """Text on the end of the process, with its last lines of standard error."""
-        code = self.stop()
-        reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
-        return f"the program ended ({reason}): {' | '.join(self.last_lines) or 'nothing on standard error'}"
 
 
 class Program:
@@ -300,7 +294,10 @@ class Program:
         """Buffer output of the program. Raises ProgramError if the program ended or an answer is too long."""
         if not chunk:
             assert self.running is not None
-            raise self.fail(self.running.exit_message())
+            code = self.running.stop()
+            reason = f"code {code}" if code >= 0 else signal.Signals(-code).name
+            last = " | ".join(self.running.last_lines) or "nothing on standard error"
+            raise self.fail(f"the program ended ({reason}): {last}")
         self.received += chunk
         if len(self.received) > MAX_ANSWER_BYTES:
             raise self.fail(f"answer of more than {MAX_ANSWER_BYTES} bytes", 0.0)
@@ -332,7 +329,7 @@ def describe_error(error: Exception) -> str:
     return printable(f"{type(error).__name__}: {error}")
 
 
-def serve(create: Callable[[dict[str, Any]], Respond]) -> None:
+def serve(create: Callable[[Record], Respond]) -> None:
     """Set up the plug-in from the first line of the input, then answer each message until the input ends.
 
     Parameters
@@ -346,7 +343,7 @@ def serve(create: Callable[[dict[str, Any]], Respond]) -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
-    def send(reply: dict[str, Any]) -> None:
+    def send(reply: Record) -> None:
         """Write an answer as one line."""
         answers.write(json.dumps(reply) + "\n")
         answers.flush()

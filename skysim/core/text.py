@@ -26,6 +26,8 @@ EPOCH = re.compile(
 )
 
 Line = tuple[int, str]  # number, from 1, and content
+Words = tuple[int, list[str]]  # number of a line, and its words
+Metadata = dict[str, Line]  # values by keyword
 
 
 def read_lines(path: Path) -> list[Line]:
@@ -41,14 +43,12 @@ def excerpt(text: object) -> str:
 
 
 def to_numbers(
-    source: str, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
+    source: str | Path, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
 ) -> Floats:
     """(N, width) numbers of the words of each line. Raises InputError for the first line without finite numbers."""
     for line, words in zip(places, rows, strict=True):
         if len(words) != width:
-            raise InputError(
-                source, f"{len(words)} numbers", width, where=Where(source, line)
-            )
+            raise Where(source, line).error(f"{len(words)} numbers", width)
     try:
         numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
     except ValueError:
@@ -68,11 +68,11 @@ def check_numbers(where: Where, words: Sequence[str]) -> None:
                 continue
         except ValueError:
             kind = "number"
-        raise InputError(where.file, f"{excerpt(word)} is not a {kind}", where=where)
+        raise where.error(f"{excerpt(word)} is not a {kind}")
 
 
 def seconds_since(
-    source: str,
+    source: str | Path,
     places: Sequence[int],
     epochs: Sequence[str],
     start: datetime.datetime,
@@ -94,11 +94,9 @@ def seconds_since(
         if len(epoch.split("-")) != len(epochs[0].split("-"))
     ]
     if bad:
-        raise InputError(
-            source,
+        raise Where(source, places[min(bad)], unit).error(
             f"{excerpt(epochs[min(bad)])} is not an epoch",
             "2012-06-22T21:00:00.5, or all of the form 2012-174T21:00:00.5",
-            where=Where(source, places[min(bad)], unit),
         )
     # 2. UTC, by astropy.
     texts = [epoch.rstrip("Z").replace(" ", "T") for epoch in epochs]
@@ -119,8 +117,7 @@ def seconds_since(
                     Time(text, format=kind, scale=scale)
                 except ValueError:
                     problem = f"{excerpt(epochs[n])} is not a date and time"
-                    where = Where(source, places[n], unit)
-                    raise InputError(source, problem, where=where) from None
+                    raise Where(source, places[n], unit).error(problem) from None
             raise
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
@@ -131,6 +128,15 @@ def seconds_since(
     except ValueError:
         raise InputError(source, "an epoch within a leap second", "other times") from None
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
+
+
+def cells_of(lines: Iterable[Line]) -> list[Words]:
+    """The numbered lines of a CSV file, each split at its commas; # begins a comment."""
+    return [
+        (n, [cell.strip() for cell in line.split(",")])
+        for n, line in lines
+        if not line.startswith("#")
+    ]
 
 
 def read_named_rows(
@@ -160,24 +166,19 @@ def read_named_rows(
     InputError
         For a file that cannot be read in this way.
     """
-    lines = [(n, line) for n, line in read_lines(path) if not line.startswith("#")]
-    columns = [cell.strip() for cell in lines[0][1].split(",")] if lines else []
+    lines = cells_of(read_lines(path))
+    columns = lines[0][1] if lines else []
     if len(lines) < 2 or len({*columns}) < len(columns) or not {name, *needed} <= {*columns}:
         raise refusal
-    rows = [[cell.strip() for cell in line.split(",")] for _, line in lines[1:]]
-    places = [n for n, _ in lines[1:]]
-    for place, row in zip(places, rows, strict=True):
+    for place, row in lines:
         if len(row) != len(columns):
-            raise InputError(
-                path,
-                f"{len(row)} values",
-                f"{len(columns)}, as the first line has",
-                where=Where(path, place),
+            raise Where(path, place).error(
+                f"{len(row)} values", f"{len(columns)}, as the first line has"
             )
+    rows = [row for _, row in lines[1:]]
+    places = [n for n, _ in lines[1:]]
     used = [columns.index(one) for one in (*needed, *also) if one in columns]
-    numbers = to_numbers(
-        str(path), places, [[row[k] for k in used] for row in rows], len(used)
-    )
+    numbers = to_numbers(path, places, [[row[k] for k in used] for row in rows], len(used))
     names = [row[columns.index(name)] for row in rows]
     repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
     if repeated is not None:
@@ -188,8 +189,8 @@ def read_named_rows(
 class TextSegment(NamedTuple):
     """A segment: metadata with their line numbers by keyword, and data lines split into words."""
 
-    metadata: dict[str, Line]
-    data: list[tuple[int, list[str]]]
+    metadata: Metadata
+    data: list[Words]
 
     def require(self, path: str | Path, keys: Sequence[str]) -> None:
         """Raise InputError for the first keyword that is missing in the metadata."""
@@ -202,9 +203,7 @@ def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
     """The keyword and the value of a line. Raises InputError if it is not KEYWORD = value."""
     key, equals, value = (part.strip() for part in line.partition("="))
     if not equals:
-        raise InputError(
-            path, f"{excerpt(line)} is not KEYWORD = value", where=Where(path, n)
-        )
+        raise Where(path, n).error(f"{excerpt(line)} is not KEYWORD = value")
     return key, value
 
 
@@ -216,14 +215,10 @@ def check_version(
         raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
 
 
-def one_of(
-    path: str | Path, metadata: dict[str, Line], key: str, allowed: Iterable[str]
-) -> str:
+def one_of(path: str | Path, metadata: Metadata, key: str, allowed: Iterable[str]) -> str:
     """The value of a keyword in capitals. Raises InputError if it is not allowed."""
     line, value = metadata[key]
     names = list(allowed)
     if value.upper() not in names:
-        raise InputError(
-            path, f"{key} = {excerpt(value)}", ", ".join(names), where=Where(path, line)
-        )
+        raise Where(path, line).error(f"{key} = {excerpt(value)}", ", ".join(names))
     return value.upper()

@@ -23,7 +23,15 @@ from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.core.units import ConfigModel, Length, Number, Time
+from skysim.core.units import (
+    ConfigModel,
+    Duration,
+    Length,
+    Number,
+    Positive,
+    PositiveLength,
+    Time,
+)
 
 # Tolerance over sigma of a truncated normal distribution whose sigma is not given: 99.73 % (GUM 4.3.9, note 2).
 SIGMAS_OF_TOLERANCE = 3.0
@@ -180,8 +188,8 @@ class LengthToleranceConfig(ToleranceConfig):
     is a third of the tolerance if left out.
     """
 
-    tolerance_m: Annotated[Length, Field(gt=0), SIGNED_QUANTITY] | None = None
-    sigma_m: Annotated[Length, Field(gt=0)] | None = None
+    tolerance_m: Annotated[PositiveLength, SIGNED_QUANTITY] | None = None
+    sigma_m: PositiveLength | None = None
 
 
 class TimeToleranceConfig(ToleranceConfig):
@@ -191,8 +199,8 @@ class TimeToleranceConfig(ToleranceConfig):
     is a third of the tolerance if left out.
     """
 
-    tolerance_s: Annotated[Time, Field(gt=0), SIGNED_QUANTITY] | None = None
-    sigma_s: Annotated[Time, Field(gt=0)] | None = None
+    tolerance_s: Annotated[Duration, SIGNED_QUANTITY] | None = None
+    sigma_s: Duration | None = None
 
 
 class NumberToleranceConfig(ToleranceConfig):
@@ -202,8 +210,8 @@ class NumberToleranceConfig(ToleranceConfig):
     third of the tolerance if left out.
     """
 
-    tolerance: Annotated[Number, Field(gt=0), SIGNED_NUMBER] | None = None
-    sigma: Annotated[Number, Field(gt=0)] | None = None
+    tolerance: Annotated[Positive, SIGNED_NUMBER] | None = None
+    sigma: Positive | None = None
 
 
 def error_of(value: Any) -> Any:

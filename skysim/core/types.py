@@ -217,7 +217,7 @@ class Telemetry:
     manipulability: Floats | None = None
     lab_from_ref: Rotation | None = None
     lab_from_imu: Rotation | None = None
-    saturated: NDArray[np.bool_] | None = None
+    saturated: Bools | None = None
     bias_rad_s: Floats | None = None
     lab_from_filter: Rotation | None = None
     sigma_attitude_rad: Floats | None = None
@@ -260,7 +260,7 @@ class Sources:
         lateral shift at the detector's corner in px; None for a lens without chromatic aberration
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     place: Floats
     normal: Floats
     radius_m: Floats
@@ -268,7 +268,7 @@ class Sources:
     period_s: Floats
     start_s: Floats
     on_s: Floats
-    clock: NDArray[np.int64]
+    clock: Ints
     magnitude: Floats
     motion: Floats | None = None
     chromatic: Floats | None = None
@@ -276,7 +276,7 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, which: NDArray[Any]) -> Sources:
+    def take(self, which: NDArray) -> Sources:
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
@@ -290,12 +290,12 @@ class StarSources(Sources):
     """Stars sorted for a search by direction, so the time of a frame does not grow with the catalog."""
 
     @cached_property
-    def by_z(self) -> tuple[NDArray[np.int64], Floats]:
+    def by_z(self) -> tuple[Ints, Floats]:
         """Rows in ascending order of z, and their directions (N, 3) in this order."""
         order = np.argsort(self.place[:, 2], kind="stable")
         return order, np.ascontiguousarray(self.place[order, :3])
 
-    def within(self, direction: Floats, angle_rad: float) -> NDArray[np.int64]:
+    def within(self, direction: Floats, angle_rad: float) -> Ints:
         """Ascending rows of the stars within an angle of a unit vector.
 
         Stars in a band of z are tested, which takes half of the time of a search tree for the stars of a field.
@@ -317,7 +317,7 @@ class StarSources(Sources):
 
 
 @jit
-def _closer(place: Floats, direction: Floats, chord: float) -> NDArray[np.int64]:
+def _closer(place: Floats, direction: Floats, chord: float) -> Ints:
     """Rows of the unit vectors (N, 3) whose distance from another one is at most a chord."""
     found = np.empty(len(place), np.int64)
     count = 0
@@ -369,15 +369,15 @@ class SourceTruth:
         image at one of them
     """
 
-    id: NDArray[np.int64]
+    id: Ints
     xy_px: Floats
     flux_xy_px: Floats
     electrons: Floats
     peak_e: Floats
     streak_px: Floats
     area_px: Floats
-    peak_xy: NDArray[np.int64]
-    saturated: NDArray[np.bool_]
+    peak_xy: Ints
+    saturated: Bools
     snr: Floats
     streak_xy_px: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
@@ -474,7 +474,7 @@ class Truth:
     rate_cam_rad_s: Floats
     mean_rate_cam_rad_s: Floats
     sources: SourceTruth
-    hidden: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    hidden: Ints = field(default_factory=lambda: np.zeros(0, np.int64))
     bodies: tuple[BodyTruth, ...] = ()
     satellites: tuple[SatelliteTruth, ...] = ()
 
@@ -503,7 +503,7 @@ class Frame:
     """
 
     index: int
-    image_dn: NDArray[Any]
+    image_dn: NDArray
     t_mid_s: float
     exposure_s: float
     saturation_dn: float
@@ -553,13 +553,13 @@ class FrameRow:
     time_ms: float
     wrong: bool
     filter: str = ""
-    cross_sigma_arcsec: float = float("nan")
-    roll_sigma_arcsec: float = float("nan")
-    log10_chance: float = float("nan")
-    exposure_s: float = float("nan")
-    rate_error_deg_s: float = float("nan")
-    rate_sigma_deg_s: float = float("nan")
-    magnitude_error_mag: float = float("nan")
-    magnitude_sigma_mag: float = float("nan")
-    nees: float = float("nan")
-    survey_share: float = float("nan")
+    cross_sigma_arcsec: float = math.nan
+    roll_sigma_arcsec: float = math.nan
+    log10_chance: float = math.nan
+    exposure_s: float = math.nan
+    rate_error_deg_s: float = math.nan
+    rate_sigma_deg_s: float = math.nan
+    magnitude_error_mag: float = math.nan
+    magnitude_sigma_mag: float = math.nan
+    nees: float = math.nan
+    survey_share: float = math.nan

@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Self, get_args
 
 import numpy as np
 from pydantic import (
@@ -94,7 +94,6 @@ def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
 # Factors of common units, equal to those of astropy to the bit, because astropy takes 0.2 s to import.
 COMMON_UNITS = {
     "m": {
-        "m": 1.0,
         "cm": 0.01,
         "mm": 1e-3,
         "um": 1e-6,
@@ -102,14 +101,9 @@ COMMON_UNITS = {
         "in": math.nextafter(INCH_M, 1),
         "ft": 0.3048,
     },
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
-    "kg": {"kg": 1.0, "g": 1e-3},
-    "kg m2": {"kg m2": 1.0},
-    "cd": {"cd": 1.0, "mcd": 1e-3, "ucd": 1e-6},
-    "N": {"N": 1.0},
-    "N m": {"N m": 1.0},
-    "N m s": {"N m s": 1.0},
-    "N m s2": {"N m s2": 1.0},
+    "s": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
+    "kg": {"g": 1e-3},
+    "cd": {"mcd": 1e-3, "ucd": 1e-6},
 }
 COMMON_QUANTITY = re.compile(r"([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?([a-zA-Z][a-zA-Z2 ]*)")
 
@@ -117,8 +111,11 @@ COMMON_QUANTITY = re.compile(r"([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?) ?([a-zA-Z][a-z
 def in_si(value: str, si_unit: str | None = None) -> float:
     """The value of a quantity such as "48 in" in `si_unit`, or in SI base units. Raises InputError."""
     match = COMMON_QUANTITY.fullmatch(value) if len(value) <= MAX_CHARACTERS else None
-    if match and (factor := COMMON_UNITS.get(si_unit or "", {}).get(match[2])) is not None:
-        return float(match[1]) * factor
+    if match and si_unit:
+        if match[2] == si_unit:
+            return float(match[1])
+        if factor := COMMON_UNITS.get(si_unit, {}).get(match[2]):
+            return float(match[1]) * factor
     from astropy import units
 
     # astropy spells it `inch`; scenes write `in`.
@@ -260,7 +257,7 @@ def keeps_null(field: FieldInfo) -> bool:
 
 
 def check_table(
-    first: Sequence[float], values: Sequence[float], name: str, first_name: str = "angle_deg"
+    first: Sequence[float], values: Sequence[float], name: str, first_name: str
 ) -> None:
     """Raise InputError unless two columns have equal length and the first one ascends strictly."""
     if len(first) != len(values):
@@ -269,3 +266,13 @@ def check_table(
         )
     if any(b <= a for a, b in itertools.pairwise(first)):
         raise InputError("", f"{first_name} is not strictly ascending")
+
+
+class TableConfig(ConfigModel):
+    """Base of a section whose last two keys are the columns of a table: of equal length, the first ascending."""
+
+    @model_validator(mode="after")
+    def check_columns(self) -> Self:
+        *_, first, second = type(self).model_fields
+        check_table(getattr(self, first), getattr(self, second), second, first)
+        return self

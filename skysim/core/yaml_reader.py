@@ -30,6 +30,7 @@ from skysim.core.paths import shipped_files
 
 Files = list[tuple[Path, str]]  # paths and texts
 Tree = dict[str, Any]  # nested keys: a file or a section as read, or a JSON schema
+Keys = Mapping[str, Any]  # of a file or a section, as given
 OverrideTexts = Mapping[str, str]  # YAML texts by dotted key
 # Version of scene and study files. An incompatible change increases it and adds a conversion of old files here.
 VERSION = 1
@@ -163,7 +164,7 @@ def parse_overrides(
 
 
 def override_texts(
-    overrides: Mapping[str, Any] | None, base: Tree, whole: Sequence[str] = ()
+    overrides: Keys | None, base: Tree, whole: Sequence[str] = ()
 ) -> dict[str, str]:
     """The values of overrides as YAML texts, like those of `--set`: strings unchanged, other values as JSON.
 
@@ -223,7 +224,7 @@ def as_json(key: object, value: Any) -> str:
         raise InputError(key, error, "text, numbers, lists and mappings") from None
 
 
-def as_tree(keys: Mapping[str, Any]) -> tuple[Tree, str]:
+def as_tree(keys: Keys) -> tuple[Tree, str]:
     """A file's keys given in Python as a tree of YAML values, and its YAML text. Raises InputError as `as_json`."""
     tree = {"schema": VERSION, **{key: json.loads(as_json(key, keys[key])) for key in keys}}
     return tree, yaml.safe_dump(tree, sort_keys=False)
@@ -274,7 +275,7 @@ def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
             reject_duplicate_keys(value, path)
 
 
-def check_version(tree: Mapping[str, Any], path: Path, text: str) -> None:
+def check_version(tree: Keys, path: Path, text: str) -> None:
     """Raise InputError for a file of another schema version, so that its keys are not reported as unknown."""
     if "schema" not in tree:
         raise InputError(
@@ -321,12 +322,21 @@ def set_key(tree: Tree, key: str, value: str) -> None:
         ) from error
 
 
-def shared_depth(first: Sequence[str], second: Sequence[str]) -> int:
-    """Number of leading keys that two nested keys have in common."""
-    depth = 0
-    while depth < min(len(first), len(second)) and first[depth] == second[depth]:
-        depth += 1
-    return depth
+def one_line(value: Any, sort_keys: bool = True) -> str:
+    """A value as YAML on one line."""
+    dumped = yaml.safe_dump(
+        value, default_flow_style=True, width=1_000_000, sort_keys=sort_keys
+    )
+    return dumped.removesuffix("...\n").strip()
+
+
+def opened_sections(before: list[str], sections: list[str]) -> list[str]:
+    """The lines of YAML that open the nested sections of a key, without those that it shares with the key before."""
+    return [
+        f"{'  ' * n}{name}:"
+        for n, name in enumerate(sections)
+        if before[: n + 1] != sections[: n + 1]
+    ]
 
 
 def list_index(values: list[Any], component: str, key: str) -> int:
@@ -519,19 +529,24 @@ def suggestion(word: str, allowed: Sequence[str]) -> str:
 
 def line_of(text: str, keys: list[str]) -> tuple[int, int | None]:
     """The number of leading components of a dotted key that are in the text, and the line of the last of them."""
-    node = yaml.compose(text, yaml.SafeLoader)
-    depth = 0
-    line = None
-    for key in keys:
-        entry = None
-        if isinstance(node, yaml.MappingNode):
-            entry = next(((k, v) for k, v in node.value if k.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and key.isascii() and key.isdigit():
-            item = node.value[int(key)] if int(key) < len(node.value) else None
-            entry = item and (item, item)
-        if not entry:
-            break
-        depth += 1
-        line = entry[0].start_mark.line + 1
-        node = entry[1]
-    return depth, line
+    lines = key_lines(text)
+    depth = max((n for n in range(len(keys) + 1) if tuple(keys[:n]) in lines), default=0)
+    return depth, lines.get(tuple(keys[:depth]))
+
+
+def key_lines(text: str) -> dict[tuple[str, ...], int]:
+    """The line of every key of a YAML text, and of every item of its lists, by nested keys."""
+    lines: dict[tuple[str, ...], int] = {}
+
+    def visit(node: yaml.Node | None, keys: tuple[str, ...]) -> None:
+        """Add the lines below a node at nested keys."""
+        found = node.value if isinstance(node, yaml.MappingNode) else ()
+        inner = [(str(key.value), key, value) for key, value in found]
+        if isinstance(node, yaml.SequenceNode):
+            inner = [(str(n), item, item) for n, item in enumerate(node.value)]
+        for name, place, value in inner:
+            lines[(*keys, name)] = place.start_mark.line + 1
+            visit(value, (*keys, name))
+
+    visit(yaml.compose(text, yaml.SafeLoader), ())
+    return lines

@@ -24,7 +24,7 @@ import datetime
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, ParseError, XMLPullParser
+from xml.etree.ElementTree import ParseError, XMLPullParser
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where
 from skysim.core.text import (
     Line,
+    Metadata,
     TextSegment,
     check_version,
     excerpt,
@@ -65,6 +66,13 @@ TYPES = {
     "SPIN": 4,
     "SPIN/NUTATION": 7,
     "SPIN/NUTATION_MOM": 7,
+}
+# Keywords that begin or end a part, and those after which each may come; the header has none.
+AFTER = {
+    "META_START": ("", "DATA_STOP"),
+    "META_STOP": ("META_START",),
+    "DATA_START": ("META_STOP",),
+    "DATA_STOP": ("DATA_START",),
 }
 NUMBERED = str.maketrans("123", "XYZ")
 # Elements of an XML message, and what their keywords begin with.
@@ -101,12 +109,12 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
     parser: Any = XMLPullParser(("start", "end"))
     for n, line in lines:
         if "<!DOCTYPE" in line:  # it may declare entities that expand
-            raise InputError(path, "XML with a document type", "none", Where(path, n))
+            raise Where(path, n).error("XML with a document type", "none")
         try:
             parser.feed(f"{line}\n")
             events = list(parser.read_events())
         except ParseError as error:
-            raise InputError(path, f"not XML: {error}", where=Where(path, n)) from None
+            raise Where(path, n).error(f"not XML: {error}") from None
         for event, element in events:
             tag = element.tag
             if event == "start":
@@ -116,7 +124,14 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
                     section = XML_SECTIONS[tag]
                     out.append((n, f"{section}_START"))
             elif tag == "attitudeState":
-                out.append((n, state_line(element)))
+                # A quaternion with its scalar last, others in their order.
+                leaves = [
+                    one for one in element.iter() if not len(one) and one.tag != "COMMENT"
+                ]
+                leaves.sort(key=lambda one: XML_ORDER.get(str(one.tag), len(XML_ORDER)))
+                out.append(
+                    (n, " ".join("".join((one.text or "-").split()) for one in leaves))
+                )
                 element.clear()
             elif tag in XML_SECTIONS:
                 if section == "META":
@@ -129,13 +144,6 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
     return out
 
 
-def state_line(state: Element) -> str:
-    """The epoch and the numbers of an attitude: a quaternion with its scalar last, others in their order."""
-    leaves = [one for one in state.iter() if not len(one) and one.tag != "COMMENT"]
-    leaves.sort(key=lambda one: XML_ORDER.get(str(one.tag), len(XML_ORDER)))
-    return " ".join("".join((one.text or "-").split()) for one in leaves)
-
-
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
     """The version and the segments of the message. Raises InputError for a line out of place."""
     version = ""
@@ -145,8 +153,10 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
         if line.split(maxsplit=1)[0] == "COMMENT":
             continue
         # A keyword that begins or ends a part, a data line, or KEYWORD = value of the header or the metadata.
-        if line in ("META_START", "META_STOP", "DATA_START", "DATA_STOP"):
-            section = next_section(Where(path, n), section, line)
+        if line in AFTER:
+            if section not in AFTER[line]:
+                raise Where(path, n).error(f"{line} after {section or 'the header'}")
+            section = line
             if line == "META_START":
                 segments.append(TextSegment({}, []))
         elif section == "DATA_START":
@@ -158,27 +168,13 @@ def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment
             elif key == VERSION:
                 version = value
         else:
-            raise InputError(
-                path,
-                f"{excerpt(line)} after {section}",
-                "DATA_START or META_START",
-                where=Where(path, n),
+            raise Where(path, n).error(
+                f"{excerpt(line)} after {section}", "DATA_START or META_START"
             )
     check_version(path, VERSION, version, VERSIONS)
     if section not in ("", "DATA_STOP"):
         raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
     return version, segments
-
-
-def next_section(where: Where, section: str, keyword: str) -> str:
-    """The section that a keyword begins or ends. Raises InputError if it is out of order."""
-    after = {"META_START": ("", "DATA_STOP"), "META_STOP": ("META_START",)}
-    after |= {"DATA_START": ("META_STOP",), "DATA_STOP": ("DATA_START",)}
-    if section not in after[keyword]:
-        raise InputError(
-            where.file, f"{keyword} after {section or 'the header'}", where=where
-        )
-    return keyword
 
 
 def segment_samples(
@@ -193,7 +189,6 @@ def segment_samples(
     """
     # 1. Metadata.
     metadata = segment.metadata
-    source = str(path)
     segment.require(path, (*REQUIRED, *(("ATTITUDE_DIR",) if version == "1.0" else ())))
     system = one_of(path, metadata, "TIME_SYSTEM", SCALES)
     kind = one_of(path, metadata, "ATTITUDE_TYPE", TYPES)
@@ -207,24 +202,19 @@ def segment_samples(
     ]
     names = [metadata[key][1] for key in REQUIRED[:2]]
     if sum(name.upper() in REFERENCES for name in names) != 1:
-        raise InputError(
-            path,
+        raise Where(path, metadata["REF_FRAME_B"][0]).error(
             f"the attitude of {names[1]} in {names[0]}",
             "one of the two an inertial or laboratory frame, the other of the vehicle",
-            where=Where(path, metadata["REF_FRAME_B"][0]),
         )
     # 2. Data lines: an epoch, and the numbers.
     for n, words in segment.data:
         if len(words) != width + 1:
-            raise InputError(
-                path,
-                f"{len(words)} values",
-                f"an epoch and {width} numbers",
-                where=Where(path, n),
+            raise Where(path, n).error(
+                f"{len(words)} values", f"an epoch and {width} numbers"
             )
     lines = [n for n, _ in segment.data]
-    numbers = to_numbers(source, lines, [words[1:] for _, words in segment.data], width)
-    t_s = seconds_since(source, lines, [words[0] for _, words in segment.data], start, system)
+    numbers = to_numbers(path, lines, [words[1:] for _, words in segment.data], width)
+    t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
     # 3. Conventions: scalar last and A to B, unless the keywords say otherwise.
     xyzw = quaternions(path, metadata, kind, numbers)
     reverse = (
@@ -232,13 +222,13 @@ def segment_samples(
         and one_of(path, metadata, "ATTITUDE_DIR", DIRECTIONS) == "B2A"
     )
     a, b = frames[::-1] if reverse else frames
-    samples = from_quaternions(source, "line", lines, t_s, (a, b), xyzw, absolute=True)
+    samples = from_quaternions(path, "line", lines, t_s, (a, b), xyzw, absolute=True)
     # 4. Frame bias and useable span.
     useable = within_span(path, metadata, t_s, start, system)
     return take(to_icrs(samples, names), useable)
 
 
-def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Floats) -> Floats:
+def quaternions(path: Path, metadata: Metadata, kind: str, numbers: Floats) -> Floats:
     """(N, 4) quaternions of a_from_b, scalar last, from the numbers of a type of attitude. Raises InputError."""
     if kind.startswith("QUATERNION"):
         first = (
@@ -254,23 +244,20 @@ def quaternions(path: Path, metadata: dict[str, Line], kind: str, numbers: Float
         axes = sequence.upper().translate(NUMBERED)
         return np.asarray(Rotation.from_euler(axes, angles_deg, degrees=True).as_quat())
     except ValueError:
-        raise InputError(
-            path,
-            f"EULER_ROT_SEQ = {excerpt(sequence)}",
-            "three axes, such as 321 or ZYX",
-            Where(path, line),
+        raise Where(path, line).error(
+            f"EULER_ROT_SEQ = {excerpt(sequence)}", "three axes, such as 321 or ZYX"
         ) from None
 
 
 def within_span(
-    path: Path, metadata: dict[str, Line], t_s: Floats, start: datetime.datetime, system: str
+    path: Path, metadata: Metadata, t_s: Floats, start: datetime.datetime, system: str
 ) -> slice:
     """The range of samples from USEABLE_START_TIME to USEABLE_STOP_TIME; a missing keyword sets no limit."""
     ends_s = [-np.inf, np.inf]
     for side, key in enumerate(("USEABLE_START_TIME", "USEABLE_STOP_TIME")):
         if key in metadata:
             line, epoch = metadata[key]
-            ends_s[side] = float(seconds_since(str(path), [line], [epoch], start, system)[0])
+            ends_s[side] = float(seconds_since(path, [line], [epoch], start, system)[0])
     # A nanosecond allows for the rounding of epochs.
     inside = np.flatnonzero((t_s >= ends_s[0] - 1e-9) & (t_s <= ends_s[1] + 1e-9))
     return slice(int(inside[0]), int(inside[-1]) + 1) if len(inside) else slice(0, 0)

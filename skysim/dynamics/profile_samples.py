@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,7 +46,7 @@ class Samples:
         Whether the samples have epochs
     """
 
-    source: str
+    source: str | Path
     unit: str
     places: Ints
     t_s: Floats
@@ -56,9 +57,7 @@ class Samples:
 
     def error(self, n: int, problem: str, allowed: str = "") -> InputError:
         """The error for sample n, with its line or row."""
-        return InputError(
-            self.source, problem, allowed, Where(self.source, int(self.places[n]), self.unit)
-        )
+        return Where(self.source, int(self.places[n]), self.unit).error(problem, allowed)
 
     @property
     def direction(self) -> str:
@@ -71,7 +70,7 @@ class Samples:
 
 
 def from_quaternions(
-    source: str,
+    source: str | Path,
     unit: str,
     places: Sequence[int] | Ints,
     t_s: Floats,
@@ -84,11 +83,8 @@ def from_quaternions(
     norm = np.linalg.norm(xyzw, axis=1) if len(xyzw) else np.empty(0)
     bad = np.flatnonzero(~(np.abs(norm - 1) <= UNIT_TOLERANCE))  # NaN is bad, too
     if len(bad):
-        raise InputError(
-            source,
-            f"a quaternion of norm {norm[bad[0]]:.6g}",
-            f"1, to {UNIT_TOLERANCE:g}",
-            where=Where(source, int(places[bad[0]]), unit),
+        raise Where(source, int(places[bad[0]]), unit).error(
+            f"a quaternion of norm {norm[bad[0]]:.6g}", f"1, to {UNIT_TOLERANCE:g}"
         )
     rotation = Rotation.from_quat(xyzw) if len(xyzw) else Rotation.identity(0)
     return Samples(source, unit, places, t_s, *frames, rotation, absolute)
@@ -145,9 +141,7 @@ def frame_of(where: Where, name: str) -> str:
     """The frame (icrs, lab, body or cam) with this name in a file. Raises InputError for an unknown name."""
     frames = REFERENCES | VEHICLES
     if name.upper() not in frames:
-        raise InputError(
-            where.file, f"unknown frame {excerpt(name)}", ", ".join(frames), where
-        )
+        raise where.error(f"unknown frame {excerpt(name)}", ", ".join(frames))
     return frames[name.upper()]
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from skysim.core.errors import InputError, Where, unknown_name
-from skysim.core.text import Line, excerpt, to_numbers
+from skysim.core.text import Line, Metadata, Words, excerpt, to_numbers
 from skysim.dynamics.profile_samples import REFERENCES, Samples, from_quaternions, icrs_from
 
 # By section: count of numbers in a data line, including its time, and the columns of x, y, z, w.
@@ -46,9 +46,9 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     After the version a file has BEGIN Attitude, lines of keyword and value, the name of the data section, rows of
     numbers, and END Attitude.
     """
-    keywords: dict[str, Line] = {}
+    keywords: Metadata = {}
     section = ""
-    rows = list[tuple[int, list[str]]]()
+    rows = list[Words]()
     inside = False
     for n, line in lines[1:]:  # the first has the version
         # Keywords and section names are not case-sensitive.
@@ -60,7 +60,7 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
             break
         if not inside:
             if lower.split() != ["begin", "attitude"]:
-                raise InputError(path, excerpt(line), "BEGIN Attitude", where=Where(path, n))
+                raise Where(path, n).error(excerpt(line), "BEGIN Attitude")
             inside = True
         elif section:
             rows.append((n, words))
@@ -79,42 +79,48 @@ def spelled(what: str, name: str, known: Iterable[str], where: Where) -> str:
     for one in known:
         if one.lower() == name.lower():
             return one
-    raise InputError(where.file, *unknown_name(what, name, list(known)), where)
+    raise where.error(*unknown_name(what, name, known))
 
 
 def to_samples(
     path: Path,
-    keywords: dict[str, Line],
+    keywords: Metadata,
     section: str,
-    rows: list[tuple[int, list[str]]],
+    rows: list[Words],
     start: datetime.datetime,
 ) -> Samples:
     """The samples of the data rows. Raises InputError for values or keywords that are not supported."""
     # 1. Keywords.
     width, columns = SECTIONS[section]
-    rows = rows[: point_count(path, keywords, len(rows))]
+    line, text = keywords.get("NumberOfAttitudePoints", (0, str(len(rows))))
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {excerpt(text)}", "a whole number"
+        )
+    if int(text) > len(rows):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {text}, but there are {len(rows)}: the file is cut off"
+        )
+    rows = rows[: int(text)]
     for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
         line, value = keywords.get(key, (0, allowed))
         if value.lower() != allowed.lower():
-            raise InputError(
-                path, f"{key} {excerpt(value)}", allowed, where=Where(path, line)
-            )
+            raise Where(path, line).error(f"{key} {excerpt(value)}", allowed)
     line, axes = keywords.get("CoordinateAxes", (0, ""))
     if axes.upper() not in REFERENCES:
-        where = Where(path, line) if line else None
-        raise InputError(
-            path, f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES), where
+        raise Where(path, line or None).error(
+            f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES)
         )
     # 2. Numbers; times count from the scene's start if the file has an epoch.
     places = [n for n, _ in rows]
-    values = to_numbers(str(path), places, [words for _, words in rows], width)
+    values = to_numbers(path, places, [words for _, words in rows], width)
     t_s = values[:, 0]
     if "ScenarioEpoch" in keywords:
         t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()
     # 3. Quaternions, with the frame bias of J2000.
     frames = (REFERENCES[axes.upper()], "body")
     samples = from_quaternions(
-        str(path),
+        path,
         "line",
         places,
         t_s,
@@ -123,27 +129,6 @@ def to_samples(
         absolute="ScenarioEpoch" in keywords,
     )
     return replace(samples, a_from_b=icrs_from(axes) * samples.a_from_b)
-
-
-def point_count(path: Path, keywords: dict[str, Line], count: int) -> int:
-    """Number of rows to read: NumberOfAttitudePoints, or all. Raises InputError if there are fewer."""
-    if "NumberOfAttitudePoints" not in keywords:
-        return count
-    line, text = keywords["NumberOfAttitudePoints"]
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise InputError(
-            path,
-            f"NumberOfAttitudePoints {excerpt(text)}",
-            "a whole number",
-            where=Where(path, line),
-        )
-    if int(text) > count:
-        raise InputError(
-            path,
-            f"NumberOfAttitudePoints {text}, but there are {count}: the file is cut off",
-            where=Where(path, line),
-        )
-    return int(text)
 
 
 def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
@@ -157,9 +142,6 @@ def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
         )
         return date + datetime.timedelta(seconds=int(fraction or 0) / 10 ** len(fraction))
     except ValueError:
-        raise InputError(
-            path,
-            f"ScenarioEpoch {excerpt(text)}",
-            "1 Jul 2005 12:00:00.00",
-            where=Where(path, line),
+        raise Where(path, line).error(
+            f"ScenarioEpoch {excerpt(text)}", "1 Jul 2005 12:00:00.00"
         ) from None

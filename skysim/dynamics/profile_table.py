@@ -15,26 +15,19 @@ from __future__ import annotations
 import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core import files
 from skysim.core.errors import InputError, Where, printable
-from skysim.core.text import Line, excerpt, seconds_since, to_numbers
-from skysim.core.types import Floats
+from skysim.core.text import Line, cells_of, excerpt, seconds_since, to_numbers
+from skysim.core.types import Floats, Record
 from skysim.dynamics.profile_samples import Samples, from_quaternions
+from skysim.scene.sections.motion import RotationName
 from skysim.sources.stars import cam_from_icrs
 
-QUATERNIONS = (
-    "lab_from_body",
-    "body_from_lab",
-    "icrs_from_body",
-    "body_from_icrs",
-    "icrs_from_cam",
-    "cam_from_icrs",
-)
+QUATERNIONS = get_args(RotationName)
 BARE = ("q_x", "q_y", "q_z", "q_w")
 BODY_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 GIMBAL_ANGLES = ("azimuth_deg", "elevation_deg")
@@ -55,11 +48,7 @@ def read_csv(
 ) -> Samples:
     """Samples of a CSV file: a line of column names, then a line for each sample. Lines with # are comments."""
     # 1. Split the lines into cells.
-    rows = [
-        (n, [cell.strip() for cell in line.split(",")])
-        for n, line in lines
-        if not line.startswith("#")
-    ]
+    rows = cells_of(lines)
     if not rows:
         raise InputError(
             path, "empty", "a line of column names, then a line for each attitude"
@@ -69,31 +58,23 @@ def read_csv(
     check_names(Where(path, head), names, rotation)
     for n, cells in body:
         if len(cells) != len(names):
-            raise InputError(
-                path,
-                f"{len(cells)} values",
-                f"{len(names)}, one for each column",
-                where=Where(path, n),
+            raise Where(path, n).error(
+                f"{len(cells)} values", f"{len(names)}, one for each column"
             )
     # 2. Convert to columns; epochs stay texts.
     places = [n for n, _ in body]
-    columns = dict[str, Any]()
+    columns = Record()
     if "utc" in names:
         date = names.index("utc")
         columns["utc"] = [cells.pop(date) for _, cells in body]
         names = names[:date] + names[date + 1 :]
-    numbers = to_numbers(str(path), places, [cells for _, cells in body], len(names))
+    numbers = to_numbers(path, places, [cells for _, cells in body], len(names))
     columns |= dict(zip(names, numbers.T, strict=True))
-    return to_samples(str(path), "line", places, columns, start, rotation)
-
-
-def read_ecsv(path: Path, start: datetime.datetime, rotation: str | None) -> Samples:
-    """Samples of an ECSV file. Raises InputError, also for wrong units of the columns."""
-    return from_table(files.read_table(path), str(path), start, rotation)
+    return to_samples(path, "line", places, columns, start, rotation)
 
 
 def from_table(
-    table: Any, source: str, start: datetime.datetime, rotation: str | None = None
+    table: Any, source: str | Path, start: datetime.datetime, rotation: str | None = None
 ) -> Samples:
     """Samples of an astropy Table, a pandas DataFrame or a mapping of columns. Raises InputError.
 
@@ -121,7 +102,7 @@ def from_table(
             "an astropy Table, a pandas DataFrame or a mapping of columns",
         ) from None
     check_names(Where(source), names, rotation)
-    values: dict[str, Any] = {}
+    values: Record = {}
     for name, column in columns.items():
         unit = getattr(column, "unit", None)
         if unit is not None and str(unit) != UNITS.get(name, ""):
@@ -138,7 +119,7 @@ def from_table(
     return to_samples(source, "row", range(1, count + 1), values, start, rotation)
 
 
-def to_column(source: str, name: str, column: Any) -> Floats:
+def to_column(source: str | Path, name: str, column: Any) -> Floats:
     """(N,) numbers of a column. Raises InputError that names the first row without a finite number."""
     try:
         numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
@@ -149,11 +130,7 @@ def to_column(source: str, name: str, column: Any) -> Floats:
             source, f"column {name} has shape {numbers.shape}", "one number in each row"
         )
     if len(bad := np.flatnonzero(~np.isfinite(numbers))):
-        raise InputError(
-            source,
-            f"{name} is not a finite number",
-            where=Where(source, int(bad[0]) + 1, "row"),
-        )
+        raise Where(source, int(bad[0]) + 1, "row").error(f"{name} is not a finite number")
     return np.asarray(numbers, dtype=np.float64)
 
 
@@ -176,40 +153,31 @@ def check_names(where: Where, names: Sequence[str], rotation: str | None) -> Non
     """Raise InputError unless the columns are exactly one time and one attitude."""
     repeated = [name for n, name in enumerate(names) if name in names[:n]]
     if repeated:
-        raise InputError(where.file, f"two columns {excerpt(repeated[0])}", "one", where)
+        raise where.error(f"two columns {excerpt(repeated[0])}", "one")
     # The sets of columns that make an attitude.
     attitudes = [tuple(f"{name}_q{end}" for end in "xyzw") for name in QUATERNIONS]
     attitudes += [BARE, BODY_ANGLES, GIMBAL_ANGLES, CAMERA_ANGLES]
     known = {*TIMES, *(name for columns in attitudes for name in columns)}
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise InputError(where.file, f"unknown column {excerpt(unknown[0])}", COLUMNS, where)
+        raise where.error(f"unknown column {excerpt(unknown[0])}", COLUMNS)
     found = {name for name in names if name not in TIMES}
     if len(found) + 1 != len(names) or not any(
         set(columns) == found for columns in attitudes
     ):
         given = ", ".join(printable(name) for name in names)
-        raise InputError(
-            where.file, f"columns {given} are not one time and one attitude", COLUMNS, where
-        )
+        raise where.error(f"columns {given} are not one time and one attitude", COLUMNS)
     if found == set(BARE) and rotation is None:
-        raise InputError(
-            where.file,
+        raise where.error(
             "q_x, q_y, q_z, q_w do not say which rotation they are",
             f"rotation: {QUATERNIONS[0]} in the maneuver, or columns {QUATERNIONS[0]}_qx, ...",
-            where,
         )
     if found != set(BARE) and rotation is not None:
-        raise InputError(
-            where.file,
-            "the columns name the rotation",
-            "no key rotation in the maneuver",
-            where,
-        )
+        raise where.error("the columns name the rotation", "no key rotation in the maneuver")
 
 
 def to_samples(
-    source: str,
+    source: str | Path,
     unit: str,
     places: Sequence[int],
     columns: Mapping[str, Any],
@@ -232,11 +200,8 @@ def to_samples(
     # Right ascension, declination and roll of the camera.
     if "ra_deg" in columns:
         if len(bad := np.flatnonzero(np.abs(columns["dec_deg"]) > 90)):
-            raise InputError(
-                source,
-                "dec_deg is beyond a pole",
-                "-90 to 90",
-                where=Where(source, places[bad[0]], unit),
+            raise Where(source, places[bad[0]], unit).error(
+                "dec_deg is beyond a pole", "-90 to 90"
             )
         camera = cam_from_icrs(*stack(columns, CAMERA_ANGLES).T)
         return Samples(source, unit, ends, t_s, "cam", "icrs", camera, absolute)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from skysim.core.errors import InputError
+from skysim.core.files import read_table
 from skysim.core.text import read_lines
 from skysim.core.time import in_utc
 from skysim.core.types import Mount
@@ -97,7 +98,7 @@ def read_profile(
     if is_stk:
         return profile_stk.read_stk(source, lines, start)
     if first.startswith("# %ECSV"):
-        return profile_table.read_ecsv(source, start, rotation)
+        return profile_table.from_table(read_table(source), source, start, rotation)
     if is_xml:
         raise InputError(source, "XML", "CSV, ECSV, CCSDS AEM, or STK (.a)")
     return profile_table.read_csv(source, lines, start, rotation)

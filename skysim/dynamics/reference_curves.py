@@ -250,7 +250,7 @@ def fit_spline(samples: Samples) -> AttitudeSpline:
     sign = np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
     cubic = CubicSpline(samples.t_s, wxyz * sign[:, None])
     return AttitudeSpline(
-        samples.source,
+        str(samples.source),
         samples.t_s,
         np.ascontiguousarray(cubic.c.transpose(1, 0, 2)),
         samples.absolute,

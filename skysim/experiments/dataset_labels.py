@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.types import BodyTruth, Floats, Frame, SourceTruth, Truth
+from skysim.core.types import Bools, Floats, Frame, Ints, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.experiments.study.execution.setups import TrialSetup
@@ -43,9 +42,10 @@ SOURCE = np.dtype(
                 "electrons",
                 "peak_e",
                 "snr",
+                "sigma_px",
+                "radius_px",
             )
         ),
-        *((name, "<f4") for name in ("sigma_px", "radius_px")),
         ("saturated", "?"),
         ("detected", "?"),
         *((name, "<f4") for name in ("detected_x_px", "detected_y_px")),
@@ -70,7 +70,7 @@ class Extents(NamedTuple):
     along: Floats
     half_px: Floats
 
-    def of(self, which: NDArray[np.bool_]) -> Extents:
+    def of(self, which: Bools) -> Extents:
         """The rectangles of some sources."""
         return Extents(*(part[which] for part in self))
 
@@ -92,7 +92,7 @@ class LabelledFrame(NamedTuple):
 
     frame: Frame
     truth: Truth
-    sources: NDArray[Any]
+    sources: NDArray
     extents: Extents
     unmatched_px: Floats
     masks: dict[str, list[int]]
@@ -140,25 +140,23 @@ def label_frame(setup: TrialSetup, seed: int, by: Labeller | None = None) -> Lab
     except ImageError:  # a saturated frame
         found = Centroids.empty()
     sources, unmatched = source_rows(truth.sources, found.xy_px)
-    add_radii(sources, truth.bodies, scene.camera.focal_px)
+    # The radii of Sun, Moon and planets, without the lens's distortion.
+    for body in truth.bodies:
+        radius_rad = math.radians(body.diameter_arcsec / 7200)
+        own = sources["id"] == body.id
+        sources["radius_px"][own] = radius_rad * scene.camera.focal_px
     extents = image_extents(
         sources, exposure_window(scene, frame.index), scene.camera.height_px
     )
-    runs = {SATURATED: run_lengths(frame.image_dn, least_value(frame))}
+    least_dn = frame.saturation_dn
+    if frame.image_dn.dtype.kind == "u":
+        least_dn = math.ceil(least_dn)  # an integer compares faster
+    runs = {SATURATED: run_lengths(frame.image_dn, least_dn)}
     runs |= {name: run_lengths(added.masks[name]) for name in MASKS if name in added.masks}
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
-def least_value(frame: Frame) -> float:
-    """The least value of a saturated pixel; an integer if pixels are, since this compares faster."""
-    return (
-        math.ceil(frame.saturation_dn)
-        if frame.image_dn.dtype.kind == "u"
-        else frame.saturation_dn
-    )
-
-
-def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Floats]:
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
     """(N,) labels of the sources, brightest first, and the (M, 2) detections that belong to no source.
 
     A detection belongs to the brightest free source whose distance is at most SAME_LIGHT_PX plus half the length of
@@ -182,9 +180,7 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray[Any], Flo
     return rows, found_px[chosen < 0]
 
 
-def brightest_near(
-    found_px: Floats, source_px: Floats, reach_px: Floats
-) -> NDArray[np.int64]:
+def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Ints:
     """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
     is_free = np.ones(len(source_px), np.bool_)
@@ -196,15 +192,7 @@ def brightest_near(
     return chosen
 
 
-def add_radii(rows: NDArray[Any], bodies: Sequence[BodyTruth], focal_px: float) -> None:
-    """Set the radius of Sun, Moon and planets among the sources, in place, without the lens's distortion."""
-    for body in bodies:
-        rows["radius_px"][rows["id"] == body.id] = (
-            math.radians(body.diameter_arcsec / 7200) * focal_px
-        )
-
-
-def image_extents(rows: NDArray[Any], window: Window, height_px: int) -> Extents:
+def image_extents(rows: NDArray, window: Window, height_px: int) -> Extents:
     """The rectangle about each source's streak.
 
     On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
@@ -243,7 +231,7 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     return np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi))
 
 
-def run_lengths(mask: NDArray[Any], least: float = True) -> list[int]:
+def run_lengths(mask: NDArray, least: float = True) -> list[int]:
     """Lengths of the runs of an (H, W) mask, column by column, beginning with pixels that are not set: COCO's code.
 
     Parameters

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +19,16 @@ from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Record
-from skysim.core.yaml_reader import check_version, parse_yaml, read_yaml
+from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
 from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
-from skysim.experiments.dataset_shards import Storage, TarWriter, shard_name
+from skysim.experiments.dataset_shards import (
+    ZARR,
+    ZARR_ARRAY,
+    Storage,
+    TarWriter,
+    shard_name,
+)
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
 from skysim.experiments.study.execution.runner import Progress
@@ -137,7 +143,7 @@ def load(
     frames: int,
     *,
     seed: int | None = None,
-    overrides: Mapping[str, str] | None = None,
+    overrides: OverrideTexts | None = None,
     frames_per_shard: int = 64,
     formats: tuple[str, ...] = ("webdataset", "coco"),
     compress: bool = False,
@@ -174,7 +180,7 @@ def load(
 
 
 def study_plan(
-    scene: str, vary: Path | None, seed: int | None, overrides: Mapping[str, str]
+    scene: str, vary: Path | None, seed: int | None, overrides: OverrideTexts
 ) -> Plan:
     """The plan of a study with this scene and these variations, validated as a study is. Raises InputError."""
     tree, text = read_yaml(vary) if vary else ({"schema": 1}, "")
@@ -347,7 +353,8 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         )
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
-    if "zarr" in plan.formats and not dataset_shards.zarr_is_there(storage):
+    # The description of the array is written last.
+    if "zarr" in plan.formats and "zarr.json" not in storage.names(f"{ZARR}/{ZARR_ARRAY}"):
         image = next(labelled_frames(plan, 0))[3].frame.image_dn
         dataset_shards.create_zarr(storage, plan.frames, plan.frames_per_shard, image)
 

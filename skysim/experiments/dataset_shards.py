@@ -125,7 +125,7 @@ SOURCE_JSON = (
 )
 
 
-def to_npy(array: NDArray[Any]) -> bytes:
+def to_npy(array: NDArray) -> bytes:
     """The header of an array in NumPy's format, version 1."""
     file = io.BytesIO()
     description = np.lib.format.header_data_from_array_1_0(array)
@@ -344,7 +344,7 @@ def index_table(rows: list[Record]) -> bytes:
     return parquet({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def sources_table(frames: list[int], sources: list[NDArray[Any]]) -> bytes:
+def sources_table(frames: list[int], sources: list[NDArray]) -> bytes:
     """The sources of a shard: a row for each source of each frame."""
     rows = np.concatenate(sources)
     number = np.repeat(frames, [len(one) for one in sources])
@@ -368,12 +368,7 @@ def require_zarr() -> Any:
     return zarr
 
 
-def zarr_is_there(storage: Storage) -> bool:
-    """Whether the array was created: its description is written last."""
-    return "zarr.json" in storage.names(f"{ZARR}/{ZARR_ARRAY}")
-
-
-def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[Any]) -> None:
+def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray) -> None:
     """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
     shape = image.shape
     group = require_zarr().create_group(
@@ -390,7 +385,7 @@ def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray[An
     )
 
 
-def write_zarr(storage: Storage, first: int, images: list[NDArray[Any]], shard: int) -> None:
+def write_zarr(storage: Storage, first: int, images: list[NDArray], shard: int) -> None:
     """Write the images of one shard, which is one object. Raises InputError for an image of another size."""
     array = require_zarr().open_group(storage.zarr_store(ZARR), mode="r+")[ZARR_ARRAY]
     for n, image in enumerate(images):

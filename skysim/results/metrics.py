@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -197,21 +198,16 @@ def without_resampling(values: Floats, value: float) -> Summary:
 
 
 def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Summary:
-    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`."""
-    if len(values) <= MANY_VALUES:
-        return bootstrap_of_few(values, function)
-    found = bootstrap_of_many(values)
-    value, low, high = map(float, function(found[:3]))
-    return found._replace(value=value, low=low, high=high)
+    """A function of the mean with its bootstrap interval: of `resampled`, or beyond MANY_VALUES `bootstrap_of_many`.
 
-
-def bootstrap_of_few(values: Floats, function: Callable[[Any], Any]) -> Summary:
-    """A function of the mean, with the interval of `resampled` from the same draws.
-
-    A resample's sum is that of the values times how often it draws each, and the seed is fixed, so these numbers are
-    the same for all samples of a size.
+    The draws are those of `resampled`: a resample's sum is that of the values times how often it draws each, and the
+    seed is fixed, so these numbers are the same for all samples of a size.
     """
     count = len(values)
+    if count > MANY_VALUES:
+        found = bootstrap_of_many(values)
+        value, low, high = map(float, function(found[:3]))
+        return found._replace(value=value, low=low, high=high)
     value = float(function(np.mean(values)))
     if count < 2 or np.ptp(values) == 0:
         return without_resampling(values, value)
@@ -349,7 +345,7 @@ def sample_std(values: Floats, axis: int = -1) -> Any:
 
 # Responses: statistics over trials. Each trial is a row; the columns are arrays, NaN where it has no such value.
 
-Columns = Mapping[str, NDArray[Any]]
+Columns = Mapping[str, NDArray]
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
@@ -361,23 +357,20 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "mean": mean_of,
     "rms": lambda values: mean_of(np.square(values), np.sqrt),
     "sd": lambda values: resampled(values, sample_std),
-    **{
-        name: lambda values, share=share: quantile(values, share)  # type: ignore[misc]
-        for name, share in QUANTILES.items()
-    },
-    "tol95": lambda values: tolerance_limit(values, 0.95),
+    **{name: partial(quantile, probability=share) for name, share in QUANTILES.items()},
+    "tol95": partial(tolerance_limit, probability=0.95),
     "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
     "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }
 # The beginning of a response name. Errors are taken as magnitudes.
-QUANTITIES: dict[str, Callable[[Columns], NDArray[Any]]] = {
+QUANTITIES: dict[str, Callable[[Columns], NDArray]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
     "angle_arcsec": lambda c: np.sqrt(
         c["x_arcsec"] ** 2 + c["y_arcsec"] ** 2 + c["roll_arcsec"] ** 2
     ),
     **{
-        name: lambda c, name=name: np.asarray(c[name])  # type: ignore[misc]
+        name: itemgetter(name)
         for name in (
             "nees",
             "stars",
@@ -444,7 +437,7 @@ def overconfident(c: Columns) -> Summary:
     return proportion(np.sum(c["nees"][solved] > OVERCONFIDENT_NEES), np.sum(solved))
 
 
-def proportion_of_frames(hits: NDArray[Any], frames: NDArray[Any]) -> Summary:
+def proportion_of_frames(hits: NDArray, frames: NDArray) -> Summary:
     """A proportion of all frames.
 
     The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
@@ -500,7 +493,7 @@ LIMIT = re.compile(r"((?:cross|roll|angle)_arcsec)_([\d.]+)")
 OVER = re.compile(r"(\w+)_over_(\d[\d.e+-]*)$")
 
 
-def right_within(name: str, c: Columns) -> NDArray[Any]:
+def right_within(name: str, c: Columns) -> NDArray:
     """(N,) whether each trial is solved in all frames, none of them wrong, with errors up to the limits in a name."""
     right = (c["frames"] > 0) & (c["solved"] == c["frames"]) & (c["wrong"] == 0)
     within = [QUANTITIES[error](c) <= float(limit) for error, limit in LIMIT.findall(name)]

@@ -12,8 +12,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-import yaml
-
 from skysim.core.errors import InputError, printable
 
 # Parsers of the answers, from a typed text to a value of the file. Each raises InputError with the allowed values.
@@ -114,6 +112,7 @@ def rounded(value: float, digits: int = 4) -> float:
 
 # The numbers of a data sheet.
 
+Answers = Mapping[str, str]  # typed texts, by the name of the question
 Values = Mapping[str, Any]  # parsed answers, by the name of the question
 
 WELL_E_UM2 = 900.0  # full well per square micrometer of the IMX264, the least of the cameras in data/cameras
@@ -373,7 +372,7 @@ class Sheet(NamedTuple):
     missing: list[Missing]
 
 
-def fill(answers: Mapping[str, str]) -> Sheet:
+def fill(answers: Answers) -> Sheet:
     """The camera of some answers, with assumptions for the rest. Raises InputError with a key `answers.NAME`."""
     # Questions are in an order in which each assumption only needs earlier values.
     values = {name: parsed(name, text) for name, text in answers.items()}
@@ -398,7 +397,7 @@ def fill(answers: Mapping[str, str]) -> Sheet:
     return sheet
 
 
-def outstanding(answers: Mapping[str, str]) -> dict[str, Missing]:
+def outstanding(answers: Answers) -> dict[str, Missing]:
     """The numbers that are missing in some answers, by name. Raises InputError as `fill`; pixels and pitch may be
     missing.
     """
@@ -437,26 +436,16 @@ def lines_of(values: Values, comments: Mapping[str, str]) -> Iterator[SheetLine]
             yield SheetLine("detector.dark_temperature_c", 25, "assumed: room temperature")
 
 
-def tree_of(lines: list[SheetLine]) -> dict[str, Any]:
-    """The section `camera` as nested mappings."""
-    tree: dict[str, Any] = {}
-    for line in lines:
-        *parents, last = line.key.split(".")
-        section = tree
-        for parent in parents:
-            section = section.setdefault(parent, {})
-        section[last] = line.value
-    return tree
-
-
-def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
+def check(sheet: Sheet, answers: Answers) -> None:
     """Validate the camera. Raises InputError for the first wrong answer."""
     from pydantic import ValidationError
 
-    from skysim.core.yaml_reader import fault_of, yaml_keys
+    from skysim.core.yaml_reader import fault_of, set_key, yaml_keys
     from skysim.scene.sections.camera import CameraConfig
 
-    tree = tree_of(sheet.lines)
+    tree: dict[str, Any] = {}
+    for line in sheet.lines:
+        set_key(tree, line.key, yaml_value(line.value))
     try:
         CameraConfig.model_validate(PLACEHOLDER_LENS | tree)
     except ValidationError as error:
@@ -468,7 +457,7 @@ def check(sheet: Sheet, answers: Mapping[str, str]) -> None:
         raise blame(faults, answers) from None
 
 
-def blame(faults: list[InputError], answers: Mapping[str, str]) -> InputError:
+def blame(faults: list[InputError], answers: Answers) -> InputError:
     """The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault."""
     for name, text in answers.items():
         for fault in faults:
@@ -496,22 +485,21 @@ def yaml_value(value: Any) -> str:
     """A value as one line of YAML; a text with spaces is quoted."""
     if isinstance(value, str):
         return f'"{value}"' if " " in value else value
-    dumped = yaml.safe_dump(value, default_flow_style=True, width=math.inf)
-    return dumped.removesuffix("\n").removesuffix("\n...")
+    from skysim.core.yaml_reader import one_line
+
+    return one_line(value)
 
 
 def yaml_lines(camera: list[SheetLine]) -> list[str]:
     """The lines of a section `camera` in YAML, with the comment of each value."""
-    from skysim.core.yaml_reader import shared_depth
+    from skysim.core.yaml_reader import opened_sections
 
-    lines = ["camera:"]
+    lines = list[str]()
     open_ = list[str]()
     for line in camera:
-        *parents, last = line.key.split(".")
-        # Open the sections that the previous value does not share.
-        shared = shared_depth(open_, parents)
-        lines += [f"{'  ' * (n + 1)}{parents[n]}:" for n in range(shared, len(parents))]
-        open_ = parents
-        written = f"{'  ' * (len(parents) + 1)}{last}: {yaml_value(line.value)}"
+        *sections, last = f"camera.{line.key}".split(".")
+        lines += opened_sections(open_, sections)
+        open_ = sections
+        written = f"{'  ' * len(sections)}{last}: {yaml_value(line.value)}"
         lines.append(f"{written.ljust(COMMENT_COLUMN)} # {line.comment}")
     return lines

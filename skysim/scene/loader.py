@@ -31,6 +31,7 @@ from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
     MAPPING,
     Files,
+    Keys,
     OverrideTexts,
     Tree,
     check_version,
@@ -50,12 +51,12 @@ PRESETS = DATA / "cameras"
 
 def list_cameras() -> list[str]:
     """Names of the camera presets in data/cameras."""
-    return sorted(path.stem for path in PRESETS.glob("*.yaml"))
+    return list(shipped_files(PRESETS))
 
 
 def preset_path(name: str) -> Path:
     """The file of a camera preset, which is a name in data/cameras or a path. Raises InputError for an unknown name."""
-    path = PRESETS / f"{name}.yaml" if name in list_cameras() else Path(name)
+    path = shipped_files(PRESETS).get(name, Path(name))
     if path.suffix not in (".yaml", ".yml") or not is_file(path):
         problem, names = unknown_name("preset", name, list_cameras())
         raise InputError("camera.preset", problem, f"{names}, or a .yaml file with a camera")
@@ -108,19 +109,17 @@ def with_heads(tree: Tree) -> Tree:
     heads = tree.get("heads")
     if not isinstance(heads, list):
         return tree
-    return tree | {"heads": [completed_head(tree, head, n) for n, head in enumerate(heads)]}
-
-
-def completed_head(tree: Tree, head: Any, n: int) -> Any:
-    """The raw head n with complete sections; unchanged if it is not a mapping, which validation reports."""
-    if not isinstance(head, dict):
-        return head
-    own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
-    main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
-    try:
-        return head | with_preset(over_base(main, own))
-    except InputError as error:
-        raise error.under(f"heads.{n}") from None
+    completed = list(heads)
+    for n, head in enumerate(heads):
+        if not isinstance(head, dict):  # which validation reports
+            continue
+        own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
+        main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
+        try:
+            completed[n] = head | with_preset(over_base(main, own))
+        except InputError as error:
+            raise error.under(f"heads.{n}") from None
+    return tree | {"heads": completed}
 
 
 CALIBRATED_KEYS = (
@@ -301,7 +300,7 @@ def find(name: str) -> Path:
 
 
 def load(
-    name: str | Path | Mapping[str, Any],
+    name: str | Path | Keys,
     overrides: OverrideTexts | None = None,
     refuses_unused: bool = True,
     folder: Path = Path(),
@@ -429,7 +428,7 @@ class Layer(NamedTuple):
     tree: Tree
 
 
-def all_layers(name: str | Path | Mapping[str, Any], folder: Path = Path()) -> list[Layer]:
+def all_layers(name: str | Path | Keys, folder: Path = Path()) -> list[Layer]:
     """The layers of a scene; the arguments are those of `load`. Raises InputError."""
     if isinstance(name, Mapping):
         return layers_of(folder / MAPPING, *yaml_reader.as_tree(name))
@@ -571,7 +570,7 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
 
 def load_camera(
     path: Path,
-    lens: Mapping[str, Any] | None = None,
+    lens: Keys | None = None,
     overrides: OverrideTexts | None = None,
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with only a camera. Raises InputError.

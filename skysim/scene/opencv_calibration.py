@@ -192,14 +192,14 @@ def matrix(
             ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
-    if not isinstance(data, list) or len(data) != count or not all(map(is_number, data)):
+    # Below 1e12 excludes infinity and NaN.
+    if (
+        not isinstance(data, list)
+        or len(data) != count
+        or not all(type(one) in (int, float) and abs(one) < 1e12 for one in data)
+    ):
         raise InputError(path, f"{key}: other data", f"{count} finite numbers")
     return [float(value) for value in data]
-
-
-def is_number(value: Any) -> bool:
-    """Whether the value is a number below 1e12, which excludes infinity and NaN."""
-    return type(value) in (int, float) and abs(value) < 1e12
 
 
 def text(calibration: OpencvCalibration) -> str:

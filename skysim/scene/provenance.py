@@ -10,16 +10,24 @@ from __future__ import annotations
 import datetime
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from skysim.core.units import ConfigModel, si_unit
-from skysim.core.yaml_reader import OverrideTexts, Tree, parse_yaml, read_yaml, shared_depth
+from skysim.core.yaml_reader import (
+    Keys,
+    OverrideTexts,
+    Tree,
+    key_lines,
+    one_line,
+    opened_sections,
+    parse_yaml,
+    read_yaml,
+)
 from skysim.scene import loader, unused
+from skysim.scene.camera_sheet import rounded
 from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
 from skysim.scene.scene import NAME_ALIAS
 
@@ -101,11 +109,6 @@ def located_tree(layers: list[Layer], overrides: OverrideTexts) -> Tree:
     return tree | {"camera": with_preset(camera)} if isinstance(camera, dict) else tree
 
 
-def over_base(base: Tree, own: Tree) -> Tree:
-    """`loader.over_base` for located values."""
-    return loader.over_base(base, own, preset_camera)
-
-
 def preset_camera(preset: Located) -> Tree:
     """The camera section of a preset with the origin of each value; empty if there is no preset."""
     if preset.value is None:
@@ -114,6 +117,10 @@ def preset_camera(preset: Located) -> Tree:
     tree, text = read_yaml(path)
     camera: Tree = with_origins(path, text, tree, f"preset {path.name}")["camera"]
     return camera
+
+
+# `loader.over_base` for located values.
+over_base = functools.partial(loader.over_base, camera_of=preset_camera)
 
 
 def with_preset(camera: Tree) -> Tree:
@@ -130,9 +137,9 @@ def with_preset(camera: Tree) -> Tree:
     return own
 
 
-def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> Tree:
+def with_origins(path: Path, text: str, tree: Keys, what: str) -> Tree:
     """The tree of a file with the origin of each value; a list is one value."""
-    lines = lines_of(text)
+    lines = key_lines(text)
 
     def locate(value: Any, keys: tuple[str, ...]) -> Any:
         """The value at nested keys with its origin, or the mapping with those of its values."""
@@ -142,20 +149,6 @@ def with_origins(path: Path, text: str, tree: Mapping[str, Any], what: str) -> T
 
     located: Tree = locate(tree, ())
     return located
-
-
-def lines_of(text: str) -> dict[tuple[str, ...], int]:
-    """The line of every key of a YAML text, by nested keys."""
-    lines: dict[tuple[str, ...], int] = {}
-
-    def visit(node: yaml.Node | None, keys: tuple[str, ...]) -> None:
-        """Add the lines below a node at nested keys."""
-        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
-            lines[(*keys, str(key.value))] = key.start_mark.line + 1
-            visit(value, (*keys, str(key.value)))
-
-    visit(parse_yaml(text)[0], ())
-    return lines
 
 
 def put(tree: Any, keys: list[str], value: Any) -> Any:
@@ -223,17 +216,13 @@ def plain(value: Any, name: str) -> Any:
         }
     if isinstance(value, tuple):
         return [plain(item, name) for item in value]
-    if value is None or isinstance(value, dict | bool | datetime.datetime):
+    if not isinstance(value, float):
         return value
-    if isinstance(value, float) and (unit := si_unit(name)):
-        return f"{tidy(value)} {unit}" if math.isfinite(value) else "infinity"
-    return tidy(value) if isinstance(value, float) else value
-
-
-def tidy(value: float) -> float | int:
-    """The number rounded to 15 digits, without the rounding error of its unit's conversion."""
-    short = float(f"{value:.15g}")
-    return int(short) if short.is_integer() and abs(short) < 1e15 else short
+    # 15 digits are without the rounding error of the unit's conversion.
+    unit = si_unit(name)
+    if unit and math.isinf(value):
+        return "infinity"
+    return f"{rounded(value, 15)} {unit}" if unit else rounded(value, 15)
 
 
 def as_dicts(found: list[Entry]) -> list[Tree]:
@@ -255,26 +244,16 @@ def text(found: list[Entry]) -> str:
     open_: list[str] = []
     for path, value, origin, no_effect in found:
         *parents, key = path
-        # Open the sections that the previous key does not share.
-        shared = shared_depth(open_, parents)
-        lines += [
-            (f"{'  ' * depth}{parents[depth]}:", "") for depth in range(shared, len(parents))
-        ]
+        lines += [(line, "") for line in opened_sections(open_, parents)]
         open_ = parents
         indent = "  " * len(parents)
         comment = f"{origin}; no effect" if no_effect else str(origin)
         if not (isinstance(value, list) and value and isinstance(value[0], dict)):
-            lines.append((f"{indent}{key}: {flow(value)}", comment))
+            lines.append((f"{indent}{key}: {one_line(value, sort_keys=False)}", comment))
             continue
         lines.append((f"{indent}{key}:", comment))
-        lines += [(f"{indent}  - {flow(item)}", "") for item in value]
+        lines += [(f"{indent}  - {one_line(item, sort_keys=False)}", "") for item in value]
     return "".join(
         f"{line.ljust(COMMENT_COLUMN)}  # {note}\n" if note else f"{line}\n"
         for line, note in lines
     )
-
-
-def flow(value: Any) -> str:
-    """A value as YAML on one line."""
-    dumped = yaml.safe_dump(value, default_flow_style=True, width=1_000_000, sort_keys=False)
-    return dumped.removesuffix("\n...\n").strip()

@@ -31,7 +31,7 @@ from skysim.core.units import (
     Time,
     Triple,
 )
-from skysim.core.yaml_reader import excerpt, explain, fault_of
+from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
@@ -162,7 +162,7 @@ def ephemeris_problem(start_time: datetime.datetime) -> str:
     return f"start_time {start_time} is outside {first} to {last}"
 
 
-class RawKeys(dict[str, Any]):
+class RawKeys(Tree):
     """The keys from which a scene was loaded. Equal to any other: the values of scenes are compared.
 
     Attributes
@@ -230,15 +230,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
         sky = self.light.kind == "stars"
         tracker = self.tracker
         # Survey errors and maps need LEDs; without LEDs only the focal length is surveyed.
-        lens_only = SurveyErrorsConfig()
-        if tracker.survey.focal_length_sigma_m:
-            lens_only = lens_only.model_copy(
-                update={
-                    "focal_length_sigma_m": tracker.survey.focal_length_sigma_m,
-                    "seed": tracker.survey.seed,
-                }
-            )
-        if not self.dome and (tracker.survey != lens_only or tracker.map):
+        lens = {"focal_length_sigma_m": 0.0, "seed": 0}
+        survey = tracker.survey
+        if survey.focal_length_sigma_m:
+            survey = survey.model_copy(update=lens)
+        if not self.dome and (survey != SurveyErrorsConfig() or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
                 f"tracker.{key}",
@@ -279,14 +275,10 @@ class Scene(ConfigModel, metaclass=SceneKind):
         points = dome.points
         nested = dome.layout is not points
         camera_m = points.camera_m or self.vehicle.camera_m
-        chip = (self.camera.width_px, self.camera.height_px)
         if camera_m is None:
             key = f"light.layout.{'points.' if nested else ''}camera"
             raise InputError(key, "missing", "that, or vehicle.camera")
-        field_deg = tuple(
-            math.degrees(2 * math.atan(side_px / 2 / self.camera.focal_px))
-            for side_px in chip
-        )
+        field_deg = self.camera.calibration().field_deg[:2]
         points = points.model_copy(
             update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
         )
@@ -308,8 +300,14 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_bodies(self) -> Scene:
-        """Check that the ephemeris is valid at the scene's time."""
+    def check_sky(self) -> Scene:
+        """Check bodies, orbit, satellites and air.
+
+        1. The ephemeris is valid at the scene's time.
+        2. An orbit is under the stars, and satellites have an orbit or a site.
+        3. The air has a site, and its light has the ephemeris of Sun and Moon.
+        """
+        # 1. Ephemeris.
         problem = ephemeris_problem(self.start_time)
         sections = {
             "orbit": self.orbit,
@@ -318,11 +316,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         for key, section in sections.items():
             if section and problem:
                 raise InputError(key, problem)
-        return self
-
-    @model_validator(mode="after")
-    def check_orbit(self) -> Scene:
-        """Check that an orbit is under the stars, and that satellites have an orbit or a site."""
+        # 2. Orbit.
         if self.orbit and not self.stars:
             raise InputError(
                 "orbit", f"light of kind {self.light.kind} is in a laboratory", "stars"
@@ -337,13 +331,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
             raise InputError(
                 "light.satellites.file", "requires the section orbit, or a site.longitude_deg"
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_air(self) -> Scene:
-        """Check that the air has a site, and that the ephemeris of its light, Sun and Moon, is valid."""
+        # 3. Air.
         air = getattr(self.light, "air", None)
-        problem = ephemeris_problem(self.start_time)
         if air and self.orbit:
             raise InputError(
                 "light.air", "the camera is in an orbit, above the air", "light.air or orbit"

@@ -9,20 +9,20 @@ Studies have further rules (experiments/study/unused_options.py), which `find` s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
 from skysim.core.errors import OVERRIDES, InputError
 from skysim.core.units import ConfigModel
-from skysim.core.yaml_reader import Files, OverrideTexts, parse_yaml, where_of
+from skysim.core.yaml_reader import Files, Keys, OverrideTexts, parse_yaml, where_of
 from skysim.scene.scene import HEAD_SECTIONS, Scene
 from skysim.scene.unused_rules import RULES, Rule
 
 
 def check(
     scene: Scene,
-    own: Mapping[str, Any],
+    own: Keys,
     overrides: OverrideTexts,
     files: Files,
     without_overrides: Callable[[], Scene],
@@ -51,7 +51,7 @@ def check(
         check_heads(scene, own, files)
 
 
-def check_heads(scene: Scene, own: Mapping[str, Any], files: Files) -> None:
+def check_heads(scene: Scene, own: Keys, files: Files) -> None:
     """Raise InputError for the first key of a head in the scene's own file that has no effect in the head's scene."""
     for n, head in enumerate(own.get("heads") or ()):
         sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
@@ -138,7 +138,7 @@ def field_names(model: type[ConfigModel]) -> dict[str, str]:
     return {field.alias or name: name for name, field in model.model_fields.items()}
 
 
-def set_keys(tree: Mapping[str, Any], parent: str = "") -> Iterator[str]:
+def set_keys(tree: Keys, parent: str = "") -> Iterator[str]:
     """Yield the dotted keys that a raw section sets; a list is a value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value:

@@ -51,6 +51,11 @@ class Rule(NamedTuple):
 # Conditions of the rules.
 
 
+def without_dome(scene: Scene) -> bool:
+    """Whether there are no LEDs."""
+    return scene.dome is None
+
+
 def steady(scene: Scene) -> bool:
     """Whether all light is steady."""
     return scene.dome is not None and isinstance(scene.dome.led.drive, DirectConfig)
@@ -194,7 +199,7 @@ RULES = (
     ),
     Rule(
         ("tracker.assumed_camera_body",),
-        lambda scene: scene.dome is None,
+        without_dome,
         "the tracker takes stars to be at infinity, whatever the camera's place",
         "light of kind dome",
     ),
@@ -230,7 +235,7 @@ RULES = (
     ),
     Rule(
         ("tracker.brightness_sigma",),
-        lambda scene: scene.dome is None,
+        without_dome,
         "stars are identified by their places",
         "a dome",
     ),
@@ -481,7 +486,7 @@ RULES = (
     ),
     Rule(
         ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
-        lambda scene: scene.dome is None,
+        without_dome,
         "there is no dome to move",
         "light of kind dome",
     ),

@@ -102,7 +102,7 @@ def mjcf(
     if on_earth:
         add_room(spec, dome.room if dome else None)
     if dome:
-        rings_m = shell_m(inside, np.radians(dome.layout.cap_deg))
+        rings_m = shell_m(inside, np.radians(dome.points.cap_deg))
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:

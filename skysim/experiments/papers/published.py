@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Floats
-from skysim.core.units import ConfigModel, NotNegative, Number
+from skysim.core.units import ConfigModel, NotNegative, Number, PositiveInt
 from skysim.core.yaml_reader import explain, read_yaml
 
 FOLDER = DATA / "published"
@@ -97,8 +97,8 @@ class Experiment(ConfigModel):
     source: str
     command: Literal["run", "calibrate", "study"]
     file: str
-    runs: Annotated[int, Field(ge=1)] = 1
-    quick_runs: Annotated[int, Field(ge=1)] = 1
+    runs: PositiveInt = 1
+    quick_runs: PositiveInt = 1
     clicks: Annotated[int, Field(ge=0)] | None = None
     hardware: tuple[str, ...] = ()
     wrong: str = ""

@@ -42,7 +42,6 @@ from skysim.experiments.study.table import PointRow
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.metrics import SIGMAS
 from skysim.scene import loader
-from skysim.scene.scene import Scene
 from skysim.simulation.flight import Progress, open_flight
 
 Verdict = Literal["agrees", "undecided", "disagrees"]
@@ -180,10 +179,15 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         scene = loader.load(experiment.file, overrides)
         if experiment.command == "calibrate":
             measured = home_calibration.measure_scene(scene)
-            found = home_calibration.calibrated(*measured, clicks)
-            results.append(home_calibration.statistics(found))
+            calibrated = home_calibration.calibrated(*measured, clicks)
+            results.append(home_calibration.statistics(calibrated))
         else:
-            results.append(run_result(scene))
+            # What `skysim run --json` prints of a flight, without the files.
+            with open_flight(scene) as flight:
+                rows = [scoring.score(shot).row for shot in flight.shots()]
+                motion = telemetry_report.summary(flight.telemetry())
+            found = {"flight": motion, "rows": [asdict(row) for row in rows]}
+            results.append(run_report.summary(rows) | found)
         options.watch(n + 1, runs)
 
     def number(path: str, levels: str) -> Ours:
@@ -196,17 +200,6 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         return Ours(float(values.mean()), deviation / math.sqrt(count), deviation, count)
 
     return commands, number
-
-
-def run_result(scene: Scene) -> Record:
-    """What `skysim run --json` prints of a flight, without the files."""
-    with open_flight(scene) as flight:
-        rows = [scoring.score(shot).row for shot in flight.shots()]
-        motion = telemetry_report.summary(flight.telemetry())
-    return run_report.summary(rows) | {
-        "flight": motion,
-        "rows": [asdict(row) for row in rows],
-    }
 
 
 def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Number]:

@@ -20,11 +20,10 @@ from skysim.experiments.study.table import (
     PointRow,
     PointRows,
     axis,
-    distinct,
     format_level,
     format_summary,
     has_few_values,
-    unit_of,
+    varied_factors,
 )
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -306,12 +305,8 @@ def ranges(study: Study, lines: PointRows) -> list[str]:
 
 def placer(study: Study, lines: PointRows) -> Place:
     """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
-    varied = [
-        name
-        for name in study.factors
-        if len(distinct(line.levels[name] for line in lines)) > 1
-    ]
-    units = {name: unit_of(axis(study, lines, name)) for name in varied}
+    varied = varied_factors(study, lines)
+    units = {name: axis(study, lines, name).unit for name in varied}
 
     def named(name: str, level: Value) -> str:
         return f"{name} = {format_level(level)}" + (

@@ -24,6 +24,7 @@ from skysim.core.files import make_folder, write_text
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.yaml_reader import (
     MAPPING,
+    Keys,
     Tree,
     as_tree,
     excerpt,
@@ -38,7 +39,7 @@ from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.factors import Settings
-from skysim.experiments.study.plan import TRIAL, Plan, one_line
+from skysim.experiments.study.plan import Plan, scene_texts
 from skysim.experiments.study.report.study_report import study_report
 from skysim.results.report import Report
 from skysim.scene import loader
@@ -169,26 +170,26 @@ def run_study(
         engine.close()
 
 
-def keys_of(study: Any, path: Path) -> Mapping[str, Any]:
+def keys_of(study: Any, path: Path) -> Keys:
     """The keys of a study's file at `path`, of a mapping, or of a study of a scene. Raises InputError."""
     if isinstance(study, str | Path):
         return read_yaml(path)[0]
-    if isinstance(study, Mapping) and STUDY_KEYS & set(study):
+    if isinstance(study, Scene):
+        return {"title": study.title, "seed": study.seed, "scene": loader.keys_of(study)}
+    if not isinstance(study, Mapping):
+        raise InputError(
+            "study", excerpt(repr(study)), "a name, a path, a mapping of keys, a Scene"
+        )
+    if STUDY_KEYS & set(study):
         scene = study.get("scene")
         return (
             {**study, "scene": loader.keys_of(scene)} if isinstance(scene, Scene) else study
         )
-    if not isinstance(study, Scene | Mapping):
-        raise InputError(
-            "study", excerpt(repr(study)), "a name, a path, a mapping of keys, a Scene"
-        )
-    if isinstance(study, Scene):
-        return {"title": study.title, "seed": study.seed, "scene": loader.keys_of(study)}
     loaded = loader.load(own_code.with_names(study, {}), refuses_unused=False)
     return {"title": loaded.title, "seed": loaded.seed, "scene": study}
 
 
-def study_texts(changes: Mapping[str, Any], tree: Mapping[str, Any]) -> dict[str, str]:
+def study_texts(changes: Keys, tree: Keys) -> dict[str, str]:
     """Overrides of a study's keys as YAML texts; those of `set` are added to the study's."""
     if isinstance(changes.get("set"), Mapping):
         changes = {**changes, "set": {**tree.get("set", {}), **changes["set"]}}
@@ -208,7 +209,10 @@ def with_part(
         isinstance(given, Mapping) and not set(profile_table.TIMES) & set(given)
     )
     names = given if many and isinstance(given, Mapping) else {}
-    named = names or {level_name(one): one for one in (given if many else [given])}
+    named = names or {
+        Path(one).stem if isinstance(one, str | Path) else name_of(one): one
+        for one in (given if many else [given])
+    }
     levels = {}
     for key, one in named.items():
         if name == "tracker":
@@ -226,25 +230,17 @@ def with_part(
     tree["factors"] = tree.get("factors", {}) | {name: {"levels": levels}}
 
 
-def level_name(part: Any) -> str:
-    """Name of a part among several."""
-    return Path(part).stem if isinstance(part, str | Path) else name_of(part)
-
-
 def part_settings(tree: Tree, name: str, part: Any, folder: Path) -> Settings:
     """The settings of a study with a controller, tracker or profile, as `simulation.lab.with_parts` has them."""
     if name == "tracker":
         return {"tracker.name": part}
-    settings = tree.get("set", {}).items()
-    texts = {key: one_line(value) for key, value in settings if not key.startswith(TRIAL)}
+    texts = scene_texts(tree.get("set", {}))
     scene = loader.with_overrides(loader.merged(loader.all_layers(tree["scene"])), texts)
     control = value_at(scene, "motion.control")
     if name == "controller":
-        law = {"law": part}
+        has_section = isinstance(control, dict) and control
         return (
-            {"motion.control.law": part}
-            if isinstance(control, dict) and control
-            else {"motion.control": law}
+            {"motion.control.law": part} if has_section else {"motion.control": {"law": part}}
         )
     file = part if isinstance(part, str | Path) else table_file(part, folder)
     maneuver = [{"kind": "profile", "file": str(Path(file).resolve())}]

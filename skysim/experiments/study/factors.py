@@ -239,6 +239,9 @@ Factor = Annotated[
 # Experimental designs: full factorial, one factor at a time, and samples of the factors' unit cube.
 
 
+SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
+
+
 class Point(NamedTuple):
     """One combination of factor levels: the level of each factor, and all settings together."""
 
@@ -270,7 +273,8 @@ Factors = Mapping[str, Factor]
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     """All points of a design, in order. Raises InputError if factors and design are incompatible."""
-    sampled = design.kind in ("lhs", "sobol", "saltelli")
+    sampled = design.kind in SAMPLED_DESIGNS
+    count = design.points or 0
     if sampled != (design.points is not None):
         allowed = "a number of points" if sampled else "none (the levels define the points)"
         raise InputError("design.points", f"{design.points} for {design.kind}", allowed)
@@ -278,11 +282,7 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
         raise InputError(
             "factors", f"missing: {design.kind} draws their values", "one or more"
         )
-    if (
-        design.kind in ("sobol", "saltelli")
-        and design.points is not None
-        and design.points & (design.points - 1)
-    ):
+    if design.kind in ("sobol", "saltelli") and count & (count - 1):
         raise InputError(
             "design.points", f"{design.points} for {design.kind}", "a power of two"
         )

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import yaml
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -38,7 +37,7 @@ from skysim.core.units import (
     Seed,
     Triple,
 )
-from skysim.core.yaml_reader import Tree, explain, is_file, set_key
+from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
 from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
 from skysim.experiments.study.own_code import digests_of
 from skysim.results.files.parts import Prices, find_prices, read_prices
@@ -482,7 +481,7 @@ class TrialSpec:
         Digests of these functions and objects
     """
 
-    scene: str | Tree
+    scene: str | dict[str, Any]
     folder: str
     seed: int
     base: Settings
@@ -586,15 +585,11 @@ def make_plan(
         chosen = points(study.design, study.factors, study.seed)
         return Plan(path, study, spec, chosen, text=text)
     parts = study.optimize.cost.parts
-    return Plan(path, study, spec, [], prices_of(parts, folder) if parts else None, text)
-
-
-def prices_of(parts: str, folder: Path) -> Prices:
-    """The prices of a study's table of parts. Raises InputError."""
     try:
-        return read_prices(find_prices(parts, folder))
+        prices = read_prices(find_prices(parts, folder)) if parts else None
     except InputError as error:
         raise error.within("optimize.cost.parts") from None
+    return Plan(path, study, spec, [], prices, text)
 
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
@@ -606,11 +601,16 @@ def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:
     local = folder / str(name)
     if local.suffix in {".yaml", ".yml"} and is_file(local):
         name = local
-    overrides = {
-        key: one_line(value) for key, value in values.items() if not key.startswith(TRIAL)
-    }
     # `unused_options` refuses unused keys, for the whole study.
+    overrides = scene_texts(values)
     return loader.load(name, overrides, refuses_unused=False, folder=folder), trial
+
+
+def scene_texts(settings: Settings) -> dict[str, str]:
+    """The settings of the scene, without those of the trial, as YAML texts."""
+    return {
+        key: one_line(value) for key, value in settings.items() if not key.startswith(TRIAL)
+    }
 
 
 def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
@@ -624,13 +624,6 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     except ValidationError as error:
         # One line without file and line number; the caller adds the factor.
         raise explain(error, TrialSection, tree, [(Path(), "")], {}).at(None) from None
-
-
-def one_line(value: Value) -> str:
-    """A value as YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=1_000_000).removesuffix(
-        "\n...\n"
-    )
 
 
 class TrialSection(ConfigModel):

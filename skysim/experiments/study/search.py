@@ -17,13 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, unknown_name
+from skysim.core.types import Record
 from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
-from skysim.experiments.study.execution.outcomes import FAILED
 from skysim.experiments.study.execution.runner import Progress, Watch, run_points
-from skysim.experiments.study.execution.setups import code_version, seed_of
 from skysim.experiments.study.execution.store import TIMES, Store
-from skysim.experiments.study.execution.trials import REFUSED, Row
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import (
     Distribution,
     Factor,
@@ -39,7 +38,6 @@ from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
 from skysim.results.files.parts import parts_list
 from skysim.results.metrics import Columns, Summary
-from skysim.scene.scene import Scene
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -74,14 +72,6 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
                 else "optimize.cost.per, as it is a range"
             )
             raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
-
-
-def check_parts(config: Cost, scene: Scene) -> None:
-    """Raise InputError if a scene whose parts are to be priced has no dome."""
-    if config.parts and not scene.dome:
-        raise InputError(
-            "optimize.cost.parts", f"light of kind {scene.light.kind} has no parts", "dome"
-        )
 
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
@@ -294,7 +284,7 @@ def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[lis
     return ["candidate", *study.factors, *shown], rows
 
 
-def front_columns(result: SearchResult) -> dict[str, Any]:
+def front_columns(result: SearchResult) -> Record:
     """The candidates of the front, and the cost of every candidate; None if it has none."""
     costs = [None if math.isnan(one.cost) else one.cost for one in result.candidates]
     return {"front": [one.number for one in result.front], "costs": costs}
@@ -473,9 +463,8 @@ def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     columns = store.point_columns(number)
     replicates = plan.study.replicates
     missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    failed = Row(0, number, 0, 0, REFUSED, code_version(), FAILED, scene_error(columns), 0.0)
-    rows = []
-    for k in missing:
-        seed = seed_of(plan.spec, number, k)
-        rows.append(failed._replace(trial=number * replicates + k, replicate=k, seed=seed))
-    return rows
+    job = TrialJob(plan.spec)
+    first = number * replicates
+    segments = (Segment(number, {}, first + k, range(k, k + 1)) for k in missing)
+    error = scene_error(columns)
+    return [job.failed(one, error)._replace(scene=REFUSED) for one in segments]

@@ -174,8 +174,9 @@ def check(plan: Plan, to_run: bool) -> None:
         try:
             scene, trial = resolve_point(plan.spec, plan.spec.trial_settings(settings, 0))
             check_trial(plan, scene, trial, to_run)
-            if study.optimize:
-                search.check_parts(study.optimize.cost, scene)
+            if study.optimize and study.optimize.cost.parts and not scene.dome:
+                problem = f"light of kind {scene.light.kind} has no parts"
+                raise InputError("optimize.cost.parts", problem, "dome")
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
@@ -230,7 +231,7 @@ def check_hardware(study: Study) -> None:
                 f"hardware.{n}", f"{key} is no hardware", "seeds of the scene's hardware"
             )
         for name, factor in study.factors.items():
-            if key in dict(factor.value_at(0.5)[1]):
+            if key in factor.value_at(0.5)[1]:
                 raise InputError(
                     f"hardware.{n}", f"{key} is set by factors.{name} too", "one of the two"
                 )
@@ -318,7 +319,7 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
         for other, factor in study.factors.items()
         if any(
             f"{key}.".startswith(f"{error.key}.") or f"{error.key}.".startswith(f"{key}.")
-            for key in dict(factor.value_at(0.5)[1])
+            for key in factor.value_at(0.5)[1]
         )
     ]
     if not owners:

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
+    SAMPLED_DESIGNS,
     Distribution,
     Levels,
     Range,
@@ -37,7 +37,7 @@ class PointRow(NamedTuple):
     """One point: its number, factor levels, the responses computed from its trials, and the number of its trials."""
 
     point: int
-    levels: dict[str, Any]
+    levels: Record
     responses: dict[str, Summary]
     trials: int = 0
 
@@ -105,7 +105,7 @@ def rank_correlations(plan: Plan, columns: Columns) -> list[tuple[str, str, Summ
         count = int(known.sum())
         if count < metrics.FEWEST or np.ptp(y[known]) == 0:
             continue
-        x = [axes[name].coordinate(lines[n].levels[name]) for n in columns["point"][known]]
+        x = [axes[name].at(lines[n]) for n in columns["point"][known]]
         r = float(scipy.stats.spearmanr(x, y[known]).statistic)
         half = metrics.joint_sigmas(len(pairs)) * math.sqrt((1 + r**2 / 2) / (count - 3))
         low, high = np.tanh(np.arctanh(np.clip(r, -1, 1)) + np.array([-half, half])).tolist()
@@ -368,7 +368,7 @@ def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:
     return outputs[np.isfinite(outputs).all(axis=1)]
 
 
-def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
+def generalized(a: Floats, b: Floats, ab: Floats) -> Floats:
     """(2, D) first-order and total indices, averaged over the outputs with their variances as weights.
 
     The estimators are those of Saltelli et al. (2010), from SciPy. Outputs without variance have weight zero.
@@ -387,7 +387,6 @@ def generalized(a: Floats, b: Floats, ab: Floats) -> NDArray[np.float64]:
 # Factors of a study as axes, and the points of a figure or a threshold.
 
 
-SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
 GROUPS = 4  # number of groups into which a sampled factor `by` is divided
 LOG_FACTOR_RATIO = 10  # minimum ratio of last to first level for a logarithmic factor axis
 UNITS = {
@@ -413,12 +412,23 @@ class Axis(NamedTuple):
     levels: list[Value]
     numeric: bool
     log: bool
+    factor: str
 
     def coordinate(self, one: Value) -> float:
         """Coordinate of a level on the axis: its numeric value, or its index if levels are not numeric."""
         if self.numeric:
             return split_quantity(one)[0]
         return float(next(n for n, other in enumerate(self.levels) if same(one, other)))
+
+    @property
+    def unit(self) -> str:
+        """The unit after a space; empty if there is none."""
+        unit = self.label.partition(" [")[2].rstrip("]")
+        return f" {unit}" if unit else ""
+
+    def at(self, line: PointRow) -> float:
+        """Coordinate of a point on the axis."""
+        return self.coordinate(line.levels[self.factor])
 
     def tick_label(self, one: Value) -> str:
         """Tick text of a level; a number is written without its unit, which is in the axis label."""
@@ -447,6 +457,15 @@ def same(one: Value, other: Value) -> bool:
 def distinct(levels: Iterable[Value]) -> list[Value]:
     """The levels without duplicates, in order of first appearance."""
     return list({repr(one): one for one in levels}.values())
+
+
+def varied_factors(study: Study, lines: PointRows) -> list[str]:
+    """The factors with more than one level among some points."""
+    return [
+        name
+        for name in study.factors
+        if len(distinct(line.levels[name] for line in lines)) > 1
+    ]
 
 
 def label(name: str, unit: str = "") -> str:
@@ -479,7 +498,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
             log = factor.distribution == "lognormal"
         else:
             log = suits_log_scale(np.sort(numbers))
-        return Axis(label(name, own_unit or unit), levels, True, log)
+        return Axis(label(name, own_unit or unit), levels, True, log, name)
     order = [one for one, _ in factor.options()]
 
     def place(level: Value) -> int:
@@ -487,13 +506,7 @@ def axis(study: Study, lines: PointRows, name: str) -> Axis:
 
     levels.sort(key=place)
     has_text = any(isinstance(one, str | bool) for one in levels)
-    return Axis(label(name, "" if has_text else unit), levels, False, False)
-
-
-def unit_of(axis: Axis) -> str:
-    """The unit of an axis after a space; empty if it has none."""
-    unit = axis.label.partition(" [")[2].rstrip("]")
-    return f" {unit}" if unit else ""
+    return Axis(label(name, "" if has_text else unit), levels, False, False, name)
 
 
 def as_numbers(levels: Sequence[Value]) -> tuple[Floats | None, str]:
@@ -579,13 +592,13 @@ def group_points(
     group_axis = axis(study, all_lines, name)
     # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
     if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
-        ordered = sorted(lines, key=lambda line: group_axis.coordinate(line.levels[name]))
+        ordered = sorted(lines, key=group_axis.at)
         bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
         groups = {}
         for begin, end in itertools.pairwise(bounds):
             if begin < end:
-                low = group_axis.coordinate(ordered[begin].levels[name])
-                high = group_axis.coordinate(ordered[end - 1].levels[name])
+                low = group_axis.at(ordered[begin])
+                high = group_axis.at(ordered[end - 1])
                 groups[f"{low:.3g} to {high:.3g}"] = ordered[begin:end]
         return groups
     return {

@@ -230,10 +230,7 @@ def crossings(
 
 def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossing | None:
     """The crossing along one series of points; None without trials at two levels."""
-    summaries = [
-        (axis.coordinate(line.levels[threshold.along]), line.responses[threshold.response])
-        for line in lines
-    ]
+    summaries = [(axis.at(line), line.responses[threshold.response]) for line in lines]
     rows = [
         (x, round(one.value * one.trials), one.trials) for x, one in summaries if one.trials
     ]
@@ -246,14 +243,10 @@ def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossi
 def sentences(threshold: Threshold, study: Study, lines: PointRows) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
     axis = table.axis(study, lines, threshold.along)
-    unit = (
-        table.unit_of(table.axis(study, lines, threshold.by))
-        if threshold.by is not None
-        else ""
-    )
+    by = threshold.by
+    unit = table.axis(study, lines, by).unit if by is not None else ""
     return [
-        (f"{threshold.by} = {label}{unit}: " if label else "")
-        + describe(one, threshold, axis)
+        (f"{by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
         for label, one in crossings(threshold, study, lines).items()
     ]
 
@@ -265,7 +258,7 @@ def describe(found: Crossing | None, threshold: Threshold, axis: Axis) -> str:
     name = threshold.along
     if found is None:
         return f"{response} has no trials at two levels of {name} yet."
-    unit = table.unit_of(axis)
+    unit = axis.unit
     if math.isnan(found.value):
         return f"{response} neither rises nor falls along {name}, so no level of it is a threshold."
     first, last = (axis.coordinate(one) for one in (axis.levels[0], axis.levels[-1]))
@@ -314,7 +307,7 @@ def certain_text(found: Crossing) -> str:
 def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
     """The threshold in one sentence with its intervals, all levels of `by` together; "" without trials."""
     axis = table.axis(study, lines, threshold.along)
-    unit = table.unit_of(axis)
+    unit = axis.unit
     found = [
         (f" ({label})" if label else "", one)
         for label, one in crossings(threshold, study, lines).items()
@@ -330,9 +323,13 @@ def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
         for label, one in found
         if math.isfinite(one.value)
     ]
-    beyond = [(label, one) for label, one in found if math.isinf(one.value)]
-    always = [label for label, one in beyond if (one.value > 0) != one.rising]
-    never = [label for label, one in beyond if (one.value > 0) == one.rising]
+    beyond = [
+        (label, (one.value > 0) != one.rising)
+        for label, one in found
+        if math.isinf(one.value)
+    ]
+    always = [label for label, every in beyond if every]
+    never = [label for label, every in beyond if not every]
     parts = []
     if at:
         crosses = "reaches" if any(one.rising for _, one in found) else "falls below"

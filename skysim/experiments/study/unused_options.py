@@ -47,6 +47,11 @@ DYNAMICS = (
 )
 
 
+def without_flight(scene: Scene, trial: Trial) -> bool:
+    """Whether a trial is of one attitude."""
+    return not isinstance(trial, FlightTrial)
+
+
 def on_ground(scene: Scene, trial: Trial) -> bool:
     """Whether the view of a trial depends on the site."""
     near = getattr(trial, "near", None)
@@ -123,7 +128,7 @@ RULES = (
     ),
     Rule(
         DYNAMICS,
-        lambda scene, trial: not isinstance(trial, FlightTrial),
+        without_flight,
         "a trial of one attitude does not simulate the motion",
         "trial.kind: flight",
     ),
@@ -145,7 +150,7 @@ RULES = (
     ),
     Rule(
         ("exposure.time_tag_offset", "exposure.time_tag_jitter", "tracker.exposure_control"),
-        lambda scene, trial: not isinstance(trial, FlightTrial),
+        without_flight,
         "a trial is one frame, whose time is not used",
         "trial.kind: flight",
     ),

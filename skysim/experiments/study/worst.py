@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import PointRow, points_at
@@ -133,9 +132,7 @@ def worst_trials(
     return chosen
 
 
-def worst_first(
-    keys: Sequence[Floats], rows: NDArray[np.int64]
-) -> Iterator[NDArray[np.int64]]:
+def worst_first(keys: Sequence[Floats], rows: Ints) -> Iterator[Ints]:
     """Rows in the order of their keys, in blocks: about FIRST, then ten times as many, since few are needed."""
     most = FIRST
     while len(rows) and keys:

@@ -298,7 +298,7 @@ def build_design(scene: Scene) -> DomeDesign:
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
     return DomeDesign(
-        light, surface, leds, max(light.layout.cap_deg, max_tilt_deg(leds.place[:, :3]))
+        light, surface, leds, max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
     )
 
 

@@ -191,9 +191,7 @@ def dome_of(lab: Lab) -> Dome:
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, lab.camera.band)
     # Boards stand out.
-    cap_deg = max(
-        float(getattr(light.layout, "cap_deg", 0.0)), max_tilt_deg(leds.place[:, :3])
-    )
+    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
     return Dome(
         lab.scene.name,
         surface,

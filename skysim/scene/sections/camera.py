@@ -29,6 +29,7 @@ from skysim.core.units import (
     Number,
     PositiveFraction,
     Seed,
+    TableConfig,
     Temperature,
     check_table,
     quantity,
@@ -123,17 +124,12 @@ class TwoStopsConfig(ConfigModel):
     cutoff_deg: Annotated[Number, Field(gt=0, lt=90)]
 
 
-class VignettingTableConfig(ConfigModel):
+class VignettingTableConfig(TableConfig):
     """Measured transmission against field angle, 1 on the axis."""
 
     kind: Literal["table"]
     angle_deg: Ascending
     transmission: Fractions
-
-    @model_validator(mode="after")
-    def check_columns(self) -> VignettingTableConfig:
-        check_table(self.angle_deg, self.transmission, "transmission")
-        return self
 
 
 class ChromaticConfig(ConfigModel):
@@ -221,7 +217,7 @@ class GlareConfig(ConfigModel):
     core_px: Annotated[Number, Field(ge=2, le=1000)]
 
 
-class BaffleConfig(ConfigModel):
+class BaffleConfig(TableConfig):
     """Point source transmittance (PST) of baffle and lens for the light of bodies outside the field.
 
     Attributes
@@ -235,8 +231,7 @@ class BaffleConfig(ConfigModel):
     pst: Fractions
 
     @model_validator(mode="after")
-    def check_columns(self) -> BaffleConfig:
-        check_table(self.angle_deg, self.pst, "pst")
+    def check_angles(self) -> BaffleConfig:
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
         return self
@@ -435,26 +430,6 @@ class DetectorConfig(ConfigModel):
     bits: Annotated[int, Field(ge=1, le=16)]
     noise: bool = True
 
-    @model_validator(mode="after")
-    def check_bayer(self) -> DetectorConfig:
-        if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
-            raise InputError(
-                "quantum_efficiency",
-                f"{'one' if self.bayer else 'three curves'} with bayer: {self.bayer or 'none'}",
-                "{red: bayer_red, green: bayer_green, blue: bayer_blue} with bayer: RGGB",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def check_temperature(self) -> DetectorConfig:
-        if self.temperature_c is not None and self.doublings > 40:
-            raise InputError(
-                "temperature_c",
-                f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
-                "up to 40",
-            )
-        return self
-
     @property
     def doublings(self) -> float:
         """Number of times that the dark current doubles from dark_temperature_c to temperature_c."""
@@ -463,7 +438,19 @@ class DetectorConfig(ConfigModel):
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
     @model_validator(mode="after")
-    def check_offset(self) -> DetectorConfig:
+    def check_values(self) -> DetectorConfig:
+        if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
+            raise InputError(
+                "quantum_efficiency",
+                f"{'one' if self.bayer else 'three curves'} with bayer: {self.bayer or 'none'}",
+                "{red: bayer_red, green: bayer_green, blue: bayer_blue} with bayer: RGGB",
+            )
+        if self.temperature_c is not None and self.doublings > 40:
+            raise InputError(
+                "temperature_c",
+                f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
+                "up to 40",
+            )
         if self.offset_dn >= 2**self.bits:
             raise InputError(
                 "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"

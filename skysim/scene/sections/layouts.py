@@ -384,7 +384,7 @@ class ListedConfig(DimmedConfig):
         return self
 
 
-Points = Annotated[
+SingleLeds = (
     FibonacciConfig
     | PoissonDiskConfig
     | RandomPlacesConfig
@@ -392,9 +392,9 @@ Points = Annotated[
     | StringConfig
     | OptimizedConfig
     | CelestialConfig
-    | ListedConfig,
-    Field(discriminator="kind"),
-]
+    | ListedConfig
+)
+Points = Annotated[SingleLeds, Field(discriminator="kind")]
 
 
 class AimingConfig(ConfigModel):
@@ -453,11 +453,6 @@ class FibersConfig(ConfigModel):
             )
         return self
 
-    @property
-    def cap_deg(self) -> float:
-        """Greatest angle of points from the zenith."""
-        return self.points.cap_deg
-
 
 class PixelsConfig(ConfigModel):
     """Grid and gray levels of a display, common to an LCD panel, a projector and a collimated micro-display.
@@ -505,11 +500,6 @@ class LcdConfig(PixelsConfig):
     kind: Literal["lcd"]
     points: Points
 
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
-
 
 class ProjectorConfig(PixelsConfig):
     """A projector in the dome that shows any layout of single LEDs on the matt inside, each on the nearest pixels.
@@ -551,11 +541,6 @@ class ProjectorConfig(PixelsConfig):
     distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
-    @property
-    def cap_deg(self) -> float:
-        """Angle from the zenith to which there are points."""
-        return self.points.cap_deg
-
     @model_validator(mode="after")
     def check_lens(self) -> ProjectorConfig:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
@@ -578,18 +563,4 @@ OnPoints = (
     FibersConfig | LcdConfig | ProjectorConfig
 )  # layouts that show the points of another one
 
-Layout = Annotated[
-    PatchBoardsConfig
-    | FibonacciConfig
-    | PoissonDiskConfig
-    | RandomPlacesConfig
-    | GeodesicConfig
-    | StringConfig
-    | OptimizedConfig
-    | CelestialConfig
-    | ListedConfig
-    | FibersConfig
-    | LcdConfig
-    | ProjectorConfig,
-    Field(discriminator="kind"),
-]
+Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, Field(discriminator="kind")]

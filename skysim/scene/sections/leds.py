@@ -10,7 +10,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    field_validator,
     model_validator,
 )
 
@@ -30,8 +29,8 @@ from skysim.core.units import (
     PositiveFraction,
     PositiveInt,
     RadiantIntensity,
+    TableConfig,
     Time,
-    check_table,
     with_unit,
 )
 
@@ -43,7 +42,7 @@ class CosineLobeConfig(ConfigModel):
     exponent: NotNegative = 1.0
 
 
-class LobeTableConfig(ConfigModel):
+class LobeTableConfig(TableConfig):
     """Measured relative intensity against angle, 1 on the axis, zero beyond the last angle."""
 
     kind: Literal["table"]
@@ -51,8 +50,7 @@ class LobeTableConfig(ConfigModel):
     intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def check_columns(self) -> LobeTableConfig:
-        check_table(self.angle_deg, self.intensity, "intensity")
+    def check_axis(self) -> LobeTableConfig:
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
         return self
@@ -224,6 +222,17 @@ Code = Annotated[
 ]
 
 
+def below_one(effect: str) -> AfterValidator:
+    """A validator of a relative scatter, which refuses a tolerance of 1 or more; `effect` is that of such a one."""
+
+    def check(value: float) -> float:
+        if isinstance(value, Tolerance) and value.half_width >= 1:
+            raise InputError("", f"a tolerance of {value.half_width:g} {effect}", "below 1")
+        return value
+
+    return AfterValidator(check)
+
+
 class AgingConfig(ConfigModel):
     """Loss of light over the hours of operation: exp(-a hours) is left, a = ln(1 / 0.7) / life_hours (IES TM-21).
 
@@ -240,16 +249,7 @@ class AgingConfig(ConfigModel):
 
     hours: Annotated[Number, Field(gt=0, le=1e6)]
     life_hours: Annotated[Number, Field(gt=0, le=1e7)]
-    scatter: Annotated[NumberError, Field(lt=1)] = 0.0
-
-    @field_validator("scatter")
-    @classmethod
-    def check_scatter(cls, value: float) -> float:
-        if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise InputError(
-                "", f"a tolerance of {value.half_width:g} makes light", "below 1"
-            )
-        return value
+    scatter: Annotated[NumberError, Field(lt=1), below_one("makes light")] = 0.0
 
 
 class WarmUpConfig(ConfigModel):
@@ -330,13 +330,9 @@ class LedLightConfig(ConfigModel):
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
     @model_validator(mode="after")
-    def check_intensity(self) -> Self:
+    def check_light(self) -> Self:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise InputError("", "an LED takes either intensity or radiant_intensity")
-        return self
-
-    @model_validator(mode="after")
-    def check_color(self) -> Self:
         if isinstance(self.spectrum, str) and (
             self.fwhm_m is not None or self.color_scatter_m
         ):
@@ -379,7 +375,7 @@ class LedConfig(LedLightConfig):
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     types: dict[str, LedTypeConfig] = Field(default_factory=dict)
-    scatter: Annotated[NumberError, Field(lt=0.5)] = 0.0
+    scatter: Annotated[NumberError, Field(lt=0.5), below_one("leaves no light")] = 0.0
     aging: AgingConfig | None = None
     warm_up: WarmUpConfig | None = None
     drive: Drive = PwmConfig()
@@ -400,12 +396,3 @@ class LedConfig(LedLightConfig):
                 "frame, or kind cyclic",
             )
         return self
-
-    @field_validator("scatter")
-    @classmethod
-    def check_scatter(cls, value: float) -> float:
-        if isinstance(value, Tolerance) and value.half_width >= 1:
-            raise InputError(
-                "", f"a tolerance of {value.half_width:g} leaves no light", "below 1"
-            )
-        return value

@@ -378,19 +378,15 @@ class DomeConfig(ConfigModel):
         return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
     @model_validator(mode="after")
-    def check_controller(self) -> DomeConfig:
-        controller = getattr(self.led.drive, "controller", None)
-        if controller == "board" and self.layout.kind != "patch_boards":
-            raise InputError(
-                "led.drive.controller",
-                f"{self.layout.kind} has no boards",
-                "dome, or a number of LEDs",
-            )
-        return self
-
-    @model_validator(mode="after")
-    def check_types(self) -> DomeConfig:
+    def check_layout(self) -> DomeConfig:
+        """Check that the layout fits the LEDs' controller, types and drive, and the surface."""
         layout = self.layout
+        kind = layout.kind
+        controller = getattr(self.led.drive, "controller", None)
+        if controller == "board" and kind != "patch_boards":
+            raise InputError(
+                "led.drive.controller", f"{kind} has no boards", "dome, or a number of LEDs"
+            )
         used = {
             name
             for part in (layout, *getattr(layout, "boards", ()))
@@ -404,26 +400,21 @@ class DomeConfig(ConfigModel):
             raise InputError(
                 "led.types", "not all are used", "names in a list's or board's types"
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_panel(self) -> DomeConfig:
-        layout = self.layout.kind
         drive = self.led.drive.kind
-        display = layout in ("lcd", "projector")
-        if layout == "lcd" and self.surface.kind != "flat":
+        display = kind in ("lcd", "projector")
+        if kind == "lcd" and self.surface.kind != "flat":
             raise InputError(
                 "layout", f"lcd does not fit a surface of kind {self.surface.kind}", "flat"
             )
         if display and drive not in ("direct", "refresh"):
-            article = "an" if layout == "lcd" else "a"
+            article = "an" if kind == "lcd" else "a"
             raise InputError(
-                "led.drive", f"{drive} cannot drive {article} {layout}", "direct, refresh"
+                "led.drive", f"{drive} cannot drive {article} {kind}", "direct, refresh"
             )
         if not display and drive == "refresh":
             raise InputError(
                 "led.drive",
-                f"refresh requires a layout of kind lcd or projector, not {layout}",
+                f"refresh requires a layout of kind lcd or projector, not {kind}",
             )
         return self
 

@@ -203,6 +203,17 @@ class ChirpConfig(ConfigModel):
         return self
 
 
+# The rotation of a profile's quaternions.
+RotationName = Literal[
+    "lab_from_body",
+    "body_from_lab",
+    "icrs_from_body",
+    "body_from_icrs",
+    "icrs_from_cam",
+    "cam_from_icrs",
+]
+
+
 class ProfileConfig(ConfigModel):
     """Follow the attitudes of a file, interpolated by a spline with continuous rate and acceleration.
 
@@ -220,17 +231,7 @@ class ProfileConfig(ConfigModel):
     kind: Literal["profile"]
     file: Annotated[str, AfterValidator(existing_file)]
     begin: Literal["zero", "first_sample"] = "zero"
-    rotation: (
-        Literal[
-            "lab_from_body",
-            "body_from_lab",
-            "icrs_from_body",
-            "body_from_icrs",
-            "icrs_from_cam",
-            "cam_from_icrs",
-        ]
-        | None
-    ) = None
+    rotation: RotationName | None = None
 
 
 class ShakeConfig(ConfigModel):
@@ -355,15 +356,11 @@ class ControlConfig(ConfigModel):
                 name for name in type(self).model_fields if name not in ("law", "rate_hz")
             ]
         for name in unused:
-            if getattr(self, name) != default_of(self, name):
+            default = type(self).model_fields[name].get_default(call_default_factory=True)
+            if getattr(self, name) != default:
                 key = name.removesuffix("_s")
                 raise InputError("", f"{key} has no effect with law {self.law}", "none")
         return self
-
-
-def default_of(config: ConfigModel, name: str) -> Any:
-    """The default of a field."""
-    return type(config).model_fields[name].get_default(call_default_factory=True)
 
 
 def expand_control(value: Any) -> Any:
@@ -408,7 +405,7 @@ class MotionConfig(ConfigModel):
         return self.control is not None and self.control.law == PRESCRIBED
 
     @model_validator(mode="after")
-    def check_controller(self) -> MotionConfig:
+    def check_motion(self) -> MotionConfig:
         if self.rate_deg_s == SIDEREAL and self.control is not None:
             raise InputError(
                 "rate_deg_s", "sidereal conflicts with a controller", "no control"
@@ -420,11 +417,7 @@ class MotionConfig(ConfigModel):
                 "a maneuver requires a controller, such as control: pid",
                 "maneuver: [] without one",
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_prescribed(self) -> MotionConfig:
-        """Check that a prescribed motion, which has no dynamics, has neither an impulse nor a jump of the attitude."""
+        # A prescribed motion, which has no dynamics, has neither an impulse nor a jump of the attitude.
         refused = [leg.kind for leg in self.maneuver if leg.kind in ("bump", "step")]
         if self.is_prescribed and refused:
             raise InputError(
@@ -432,10 +425,6 @@ class MotionConfig(ConfigModel):
                 f"{refused[0]} is not possible with control: prescribed",
                 "control: pid",
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_start(self) -> MotionConfig:
         if self.start != "profile":
             return self
         if not self.maneuver or self.maneuver[0].kind != "profile":

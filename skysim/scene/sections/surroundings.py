@@ -23,8 +23,8 @@ from skysim.core.units import (
     RightAscension,
     Seed,
     Spin,
+    TableConfig,
     Temperature,
-    check_table,
 )
 from skysim.core.yaml_reader import existing_file
 
@@ -34,7 +34,7 @@ NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
 
 
-class HorizonConfig(ConfigModel):
+class HorizonConfig(TableConfig):
     """A skyline: apparent altitudes below which nothing is visible, by azimuth from north through east.
 
     The altitude is linear between the azimuths, also from the last row to the first.
@@ -44,8 +44,7 @@ class HorizonConfig(ConfigModel):
     altitude_deg: Annotated[tuple[Altitude, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def check_columns(self) -> Self:
-        check_table(self.azimuth_deg, self.altitude_deg, "altitude_deg")
+    def check_azimuths(self) -> Self:
         if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
             raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
         return self
@@ -139,17 +138,12 @@ class SineTemperatureConfig(ConfigModel):
     phase_deg: Spin = 0.0
 
 
-class TemperatureTableConfig(ConfigModel):
+class TemperatureTableConfig(TableConfig):
     """A measured history, linear between its times and constant beyond them."""
 
     kind: Literal["table"]
     hours: Ascending
     temperature_c: Annotated[tuple[Temperature, ...], Field(min_length=2)]
-
-    @model_validator(mode="after")
-    def check_columns(self) -> TemperatureTableConfig:
-        check_table(self.hours, self.temperature_c, "temperature_c", "hours")
-        return self
 
 
 Temperatures = Annotated[
@@ -404,7 +398,7 @@ class MoonGlowConfig(ConfigModel):
     field_zenith_deg: ZenithDistance
 
 
-class StrayLightConfig(ConfigModel):
+class StrayLightConfig(TableConfig):
     """Stray light of a bright body outside the field, by the point source transmittance of baffle and lens.
 
     Attributes
@@ -423,11 +417,6 @@ class StrayLightConfig(ConfigModel):
     v_mag: Number = SUN_V_MAG
     angle_deg: Ascending
     pst: Fractions
-
-    @model_validator(mode="after")
-    def check_columns(self) -> StrayLightConfig:
-        check_table(self.angle_deg, self.pst, "pst")
-        return self
 
 
 class FaintStarsGlowConfig(ConfigModel):

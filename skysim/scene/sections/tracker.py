@@ -276,10 +276,6 @@ class TrackerConfig(ConfigModel):
                 "conflicts with assumed_focal_length",
                 "one of the two",
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_map(self) -> TrackerConfig:
         values = {
             "assumed_focal_length": self.assumed_focal_length_m,
             "assumed_camera_body": self.assumed_camera_body_m,

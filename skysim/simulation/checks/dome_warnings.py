@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.layouts import OnPoints
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import Context, threshold_e
@@ -233,7 +232,7 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
     """Warn if many fields look like another one."""
     if found.share <= MAX_ALIKE:
         return ""
-    points = light.layout.points if isinstance(light.layout, OnPoints) else light.layout
+    points = light.points
     key = "light.layout.kind" if points is light.layout else "light.layout.points.kind"
     random = points.kind in ("poisson_disk", "random", "optimized")
     change = "add LEDs" if random else "change it to poisson_disk"

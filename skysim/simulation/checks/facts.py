@@ -262,20 +262,18 @@ def cap_margin(
     camera = context.camera.optics.camera
     if not isinstance(light, DomeConfig) or context.surface is None:
         return None
-    points = getattr(light.layout, "points", light.layout)
+    points = light.points
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
     cap_deg = (
-        max_tilt_deg(context.lab.camera.sources.place[:, :3])
-        if listed
-        else float(points.cap_deg)
+        max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
     )
     if tilt_deg is None:
         tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
     edge = field_reach_deg(context, max(camera.width_px, camera.height_px) / 2, tilt_deg)
     corner = field_reach_deg(context, camera.corner_px, tilt_deg)
-    return CapMargin(cap_deg, tilt_deg, edge, corner, float(points.cap_deg))
+    return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)
 
 
 def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> float:
@@ -337,7 +335,7 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
     if not isinstance(light, DomeConfig) or light.room is None or surface is None:
         return None
     limits = light.room
-    values = fit(light.room, surface, light.layout.cap_deg)
+    values = fit(light.room, surface, light.points.cap_deg)
     x_m, y_m, z_m = values["extent_m"]
     floor = [
         f"{size:.2f} m" if size is not None else "any"
@@ -366,7 +364,7 @@ def wall(context: Context, samples: CheckedSamples) -> Fact | None:
     if config is None or not isinstance(light, DomeConfig):
         return None
     assert isinstance(context.surface, Radial)
-    size = wall_size(context.surface, light.layout.cap_deg)
+    size = wall_size(context.surface, light.points.cap_deg)
     text = f"inside {size.area_m2:.3f} m², volume {1e3 * size.volume_m3:.2f} L"
     values = size._asdict()
     if config.density_kg_m3 is not None:

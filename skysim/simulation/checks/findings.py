@@ -382,7 +382,7 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     ):
         return ""
     # No key changes the positions of listed LEDs.
-    if getattr(light.layout, "points", light.layout).kind == "listed":
+    if light.points.kind == "listed":
         return ""
     key = f"light.layout{'.points' * hasattr(light.layout, 'points')}.cap_deg"
     uncovered = (

@@ -25,5 +25,5 @@ def sources(config: light.DomeConfig, band: Band) -> Sources:
     """
     surface = build_surface(config.surface)
     if config.room is not None:
-        check_room(config.room, surface, config.layout.cap_deg)
+        check_room(config.room, surface, config.points.cap_deg)
     return LAYOUTS[config.layout.kind](config.layout, surface, config.led, band)

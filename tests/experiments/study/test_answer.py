@@ -565,7 +565,9 @@ def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
     plan = loaded(tmp_path, figures=[{"kind": "map", "value": "stars_least"}])
     assert done(plan, tmp_path / "study.sqlite").failed == 0
     with store.open_store(tmp_path / "study.sqlite") as kept:
-        report = study_report.study_report(plan, kept, "again")
+        command = study_report.commands(plan, kept, "again")
+        found = study_report.analyze(plan, kept, command)
+        report = study_report.compose(plan.study, kept, found, command)
     text = report.save(tmp_path / "r.html").read_text(encoding="utf-8")
     parts = (
         'class="verdict good"',

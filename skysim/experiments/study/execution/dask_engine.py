@@ -10,9 +10,9 @@ import json
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from itertools import islice
 from typing import Any
 from uuid import uuid4
 
@@ -22,6 +22,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.study.execution.engines import (
     AHEAD,
     DIED,
+    Batches,
     Chunk,
     Chunks,
     Job,
@@ -109,7 +110,7 @@ def thread_count(client: Client) -> int:
 
 def collect_rows(
     client: Client, name: str, job: Job, chunks: Chunks, in_flight: dict[Future, Submission]
-) -> Iterator[list[Any]]:
+) -> Batches:
     """Yield rows as chunks complete; chunks that complete together are joined. `in_flight` maps futures to chunks.
 
     Dask gives up a task (KilledWorker) after several of its workers died, whether the task was the cause or was only
@@ -125,10 +126,10 @@ def collect_rows(
             capacity = max(thread_count(client), 1) * (1 + AHEAD)
             polled_s = time.monotonic()
         alone = bool(retries)
-        new = take(
-            retries.popleft if alone else chunks.next,
-            (1 if alone else capacity) - len(in_flight),
-        )
+        # An empty chunk is the end.
+        source = iter(retries.popleft if alone else chunks.next, ())
+        room = (1 if alone else capacity) - len(in_flight)
+        new = list(islice(source, max(room, 0)))
         # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
         futures = (
             client.map(
@@ -159,14 +160,6 @@ def collect_rows(
                     retries.extend(split_chunk(chunk))
         if rows:
             yield rows
-
-
-def take(source: Callable[[], Chunk], count: int) -> list[Chunk]:
-    """The next `count` chunks of a source, or fewer at its end."""
-    taken: list[Chunk] = []
-    while len(taken) < count and (chunk := source()):
-        taken.append(chunk)
-    return taken
 
 
 def encode_chunk(chunk: Chunk) -> str:
@@ -242,7 +235,7 @@ class Dask:
         self.client = connect(scheduler)
         self.workers = thread_count(self.client)
 
-    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
+    def run(self, job: Job, chunks: Chunks) -> Batches:
         """See `Engine`; the client is closed at the end. Raises InputError if the scheduler's connection is lost."""
         if self.client.status != "running":  # a previous run closed it
             self.client = connect(self.scheduler)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Centroids
@@ -22,7 +21,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import OcclusionTest, Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Floats, Ints, Trajectory
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
@@ -51,7 +50,7 @@ class VisibleSources(NamedTuple):
         (N,) photo-electrons of an exposure
     """
 
-    rows: NDArray[np.int64]
+    rows: Ints
     xy_px: Floats
     electrons: Floats
 
@@ -191,7 +190,7 @@ def solve_coded(
     return xy_px, Report(attitude, detections)
 
 
-def brightness(lab: Lab, rows: NDArray[np.int64], frame: int) -> Floats:
+def brightness(lab: Lab, rows: Ints, frame: int) -> Floats:
     """(K,) light of LEDs in the exposure of a frame over their mean light: the effect of codes, pulses and filters."""
     window = exposure_window(lab.scene, frame)
     steady = lab.camera.sources.take(rows)

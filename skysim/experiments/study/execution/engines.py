@@ -27,6 +27,7 @@ MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
 DIED = f"its worker process died, {MAX_ATTEMPTS} times"
 
 Chunk = tuple[Segment, ...]
+Batches = Iterator[list[Any]]  # rows, as chunks complete
 TimedRows = tuple[list[Any], float]  # rows of a chunk, and the seconds it took
 
 
@@ -53,7 +54,7 @@ class Engine(Protocol):
     name: str
     workers: int
 
-    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]: ...
+    def run(self, job: Job, chunks: Chunks) -> Batches: ...
 
     def close(self) -> None:
         """Release the resources kept between runs."""
@@ -65,7 +66,7 @@ class Serial:
     name = "serial"
     workers = 1
 
-    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
+    def run(self, job: Job, chunks: Chunks) -> Batches:
         while chunk := chunks.next():
             rows, seconds = run_timed(job, chunk)
             chunks.report_time(chunk, seconds)
@@ -90,7 +91,7 @@ class Pool:
         self._pool: ProcessPoolExecutor | None = None
         self._job: Job | None = None
 
-    def run(self, job: Job, chunks: Chunks) -> Iterator[list[Any]]:
+    def run(self, job: Job, chunks: Chunks) -> Batches:
         retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
         done = False
@@ -144,7 +145,7 @@ class Pool:
         chunks: Chunks,
         retries: deque[Chunk],
         in_flight: dict[Future[TimedRows], Chunk],
-    ) -> Iterator[list[Any]]:
+    ) -> Batches:
         """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
 
         Rows of chunks that are complete at the same time come together, so that the store takes one transaction for

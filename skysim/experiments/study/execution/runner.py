@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image
-from skysim.core.types import Frame, Telemetry, Truth
+from skysim.core.types import Frame, Ints, Telemetry, Truth
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
@@ -112,7 +111,7 @@ class ChunkQueue:
         self,
         points: Sequence[Point],
         replicates: int,
-        missing: NDArray[np.int64],
+        missing: Ints,
         first: int = 0,
         spec: TrialSpec | None = None,
         seconds: float = CHUNK_S,
@@ -153,7 +152,7 @@ class ChunkQueue:
             if len(trials)
         )
 
-    def _segment(self, trials: NDArray[np.int64]) -> Segment:
+    def _segment(self, trials: Ints) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
         if self.spec:
@@ -298,7 +297,7 @@ def run_points(
     engine: Engine,
     points: Sequence[Point],
     first: int,
-    watch: Watch | None = None,
+    watch: Watch | None,
 ) -> Progress:
     """Run the missing trials of `points`, numbered from `first`, within the budget of time and failures.
 

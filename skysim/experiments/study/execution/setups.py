@@ -108,9 +108,9 @@ def scene_hash(scene: Scene, digests: Mapping[str, str] = NO_PROGRAMS) -> str:
         TRACKERS.release(scene.tracker.name),
         *(PLUGINS.release(light.kind) for light in scene.lights),
     ]
-    if scene.motion.control and (release := CONTROLLERS.release(scene.motion.control.law)):
-        releases.append(release)
     law = scene.motion.control.law if scene.motion.control else ""
+    if release := CONTROLLERS.release(law):
+        releases.append(release)
     releases += [digests[name] for name in (scene.tracker.name, law) if name in digests]
     return digest([tree, contents, *releases])
 

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, remove
+from skysim.core.types import Bools, Ints, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
@@ -119,18 +119,15 @@ class Store:
         """
         with self.db:
             if grown:
-                self._renumber(*grown)
+                number = "trial / {0} * {1} + trial % {0}".format(*grown)
+                for table in ("trials", "timings"):
+                    # Negative numbers first, since a new number may be the old one of another row.
+                    self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
+                    self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
             self.db.execute("DELETE FROM points")
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
         self._near = NONE_NEAR
-
-    def _renumber(self, replicates: int, more: int) -> None:
-        number = f"trial / {replicates} * {more} + trial % {replicates}"
-        for table in ("trials", "timings"):
-            # Negative numbers first, since a new number may be the old one of another row.
-            self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
-            self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
 
     def scenes(self) -> list[tuple[int, int, str]]:
         """Point, replicate and scene hash of the first and the last trial that did not fail."""
@@ -244,13 +241,6 @@ class Store:
         """The file of a part."""
         return self.parts_folder / f"{number:06d}.parquet"
 
-    def remove_unlisted_parts(self) -> None:
-        """Remove part files of a run that was killed before it listed them."""
-        listed = {part.path for part in self.parts()}
-        for path in self.parts_folder.glob("*"):
-            if path not in listed:
-                remove(path)
-
     def parts(self) -> list[Part]:
         """All parts, in the order in which they were written."""
         # A store of an earlier skysim has no such table.
@@ -283,7 +273,7 @@ class Store:
             row = (None, time.time() - seconds, engine, workers, trials, seconds)
             self.db.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
 
-    def runs(self) -> list[dict[str, Any]]:
+    def runs(self) -> list[Record]:
         """Every run that was not killed: engine, workers, trials, seconds."""
         rows = self.db.execute(
             "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
@@ -294,7 +284,7 @@ class Store:
             for row in known
         ]
 
-    def done(self, count: int) -> NDArray[np.bool_]:
+    def done(self, count: int) -> Bools:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         with self.snapshot():
@@ -331,7 +321,7 @@ class Store:
                 for trial, error in rows
             ]
 
-    def trial(self, number: int) -> dict[str, Any]:
+    def trial(self, number: int) -> Record:
         """One row by column name. Raises InputError if the trial is not in the store."""
         rows = self._rows([(number, number + 1)])
         if not len(rows["trial"]):
@@ -394,7 +384,7 @@ class Store:
             SQL condition for the rows in SQLite
         """
         sources = list[Source]()
-        numbers = list[NDArray[np.int64]]()
+        numbers = list[Ints]()
         with self.snapshot():
             for part in self.parts():
                 if (source := part.source(ranges, self._replicates())) is not None:
@@ -571,6 +561,8 @@ def writing(path: Path) -> Iterator[Store]:
                     db.execute(statement)
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))
             check_format(store)
-            store.remove_unlisted_parts()
+            # Part files of a run that was killed before it listed them.
+            for part in {*store.parts_folder.glob("*")} - {one.path for one in store.parts()}:
+                remove(part)
             store.move_rows()
             yield store

@@ -137,15 +137,13 @@ class TrialJob:
 
 
 def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
-    """Run all trials of some segments, in order."""
-    return [row for segment in segments for row in run_segment(spec, segment)]
-
-
-def run_segment(spec: TrialSpec, segment: Segment) -> list[Row]:
-    """Run the trials of a segment in order, together in blocks if their kind allows."""
-    key = setup_key(spec, segment.settings)
-    size = block_size(spec, segment, key)
-    return [row for block in divided(segment, size) for row in run_block(spec, block, key)]
+    """Run all trials of some segments in order, together in blocks if their kind allows."""
+    rows = list[Row]()
+    for segment in segments:
+        key = setup_key(spec, segment.settings)
+        for block in divided(segment, block_size(spec, segment, key)):
+            rows += run_block(spec, block, key)
+    return rows
 
 
 def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
@@ -359,7 +357,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
             zyz(first, tilt, last - first)
             for (first, last), tilt in zip(turns, tilts, strict=True)
         ]
-        return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
+        return Rotation.from_quat(drawn, scalar_first=True)
     near = attitudes.near
     low, high = (math.radians(dec) for dec in attitudes.dec_deg)
     if near:  # a body is the pole
@@ -375,7 +373,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
         lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
     cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
     drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
-    return Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]])
+    return Rotation.from_quat(drawn, scalar_first=True)
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:

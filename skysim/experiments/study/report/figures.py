@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.experiments.study.plan import Curve, Heat, Map, Study
 from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
@@ -50,7 +50,7 @@ def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> Non
     fig.colorbar(image, label=label(figure.response), **where).minorticks_off()
 
 
-def color_scale(values: Floats, figure: Heat | Map) -> dict[str, Any]:
+def color_scale(values: Floats, figure: Heat | Map) -> Record:
     """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
     from matplotlib.colors import Normalize
 
@@ -213,7 +213,7 @@ def draw_line(
 
     offset = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
     low, high = drawn_interval(axes, one)
-    if layout.draws_bands(x_axis):
+    if x_axis.numeric and len(x_axis.levels) > layout.MAX_X_WITH_BARS:
         offset = axes.transData
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
@@ -321,10 +321,8 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
         return
     names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
     width = max(map(len, names)) * len(names)
-    if len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH:
-        axes.set_xticks(places, names, rotation=25, ha="right")
-    else:
-        axes.set_xticks(places, names, rotation=0, ha="center")
+    rotated = len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH
+    axes.set_xticks(places, names, rotation=25 * rotated, ha="right" if rotated else "center")
     if x_axis.log:
         axes.tick_params(axis="x", which="minor", length=0)
 
@@ -398,8 +396,8 @@ def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None
     points = shown_points(lines, figure, study)
     x = axis(study, lines, figure.x)
     y = axis(study, lines, figure.y)
-    across = [x.coordinate(line.levels[figure.x]) for line in points]
-    up = [y.coordinate(line.levels[figure.y]) for line in points]
+    across = list(map(x.at, points))
+    up = list(map(y.at, points))
     values = np.array([line.responses[figure.value].value for line in points])
     size = min(max(6000 / max(len(points), 1), 4), 45)
     set_up_x_axis(axes, x)
@@ -422,35 +420,33 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
     """Bar chart of the first-order and total indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
-    return png(
-        lambda fig: draw_indices(fig, selected, response), (7.0, 1.1 + 0.42 * len(selected))
-    )
 
+    def draw(fig: Any) -> None:
+        """Two bars per factor, with their intervals."""
+        axes = fig.subplots()
+        rows = np.arange(len(selected))
+        for shift, name, ink, parts in (
+            (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
+            (0.19, "total", GRAY, [one.total[:3] for one in selected]),
+        ):
+            value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
+            axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
+            ends = np.clip([low, high], -9, 9)
+            axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
+        bounds = np.array(
+            [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
+        )
+        bounds = bounds[np.isfinite(bounds)]
+        left = min(1.05 * bounds.min(), 0.0)
+        right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
+        axes.set_xlim(left, right)
+        axes.set_yticks(rows, [one.factor for one in selected])
+        axes.set_ylim(len(selected) - 0.4, -0.6)
+        axes.grid(False, axis="y")
+        axes.set_xlabel(f"share of the variance, {label(response).partition(' [')[0]}")
+        fig.legend(loc="outside right upper")
 
-def draw_indices(fig: Any, selected: Sequence[Index], response: str) -> None:
-    """Draw two bars per factor, with their intervals."""
-    axes = fig.subplots()
-    rows = np.arange(len(selected))
-    for shift, name, ink, parts in (
-        (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
-        (0.19, "total", GRAY, [one.total[:3] for one in selected]),
-    ):
-        value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
-        axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
-        ends = np.clip([low, high], -9, 9)
-        axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
-    bounds = np.array(
-        [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
-    )
-    bounds = bounds[np.isfinite(bounds)]
-    left = min(1.05 * bounds.min(), 0.0)
-    right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
-    axes.set_xlim(left, right)
-    axes.set_yticks(rows, [one.factor for one in selected])
-    axes.set_ylim(len(selected) - 0.4, -0.6)
-    axes.grid(False, axis="y")
-    axes.set_xlabel(f"share of the variance, {label(response).partition(' [')[0]}")
-    fig.legend(loc="outside right upper")
+    return png(draw, (7.0, 1.1 + 0.42 * len(selected)))
 
 
 # Optimizations.
@@ -484,7 +480,7 @@ def pareto_png(
     other: Panel,
     points: Sequence[int],
     front: Sequence[int],
-    also: Mapping[str, Floats] | None = None,
+    also: Mapping[str, Floats] | None,
 ) -> bytes:
     """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
 

@@ -10,15 +10,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Ints
 from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
 from skysim.experiments.study.table import (
     Axis,
     PointRows,
     axis,
-    distinct,
     fixed_levels,
     format_level,
     group_points,
@@ -26,6 +24,7 @@ from skysim.experiments.study.table import (
     is_sampled,
     label,
     shown_points,
+    varied_factors,
 )
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
@@ -63,8 +62,8 @@ class Series(NamedTuple):
     value: Floats
     low: Floats
     high: Floats
-    values: NDArray[np.int64]
-    few: NDArray[np.bool_]
+    values: Ints
+    few: Bools
 
 
 class Grid(NamedTuple):
@@ -81,8 +80,8 @@ class Grid(NamedTuple):
     x: Axis
     y: Axis
     value: Floats
-    values: NDArray[np.int64]
-    few: NDArray[np.bool_]
+    values: Ints
+    few: Bools
 
 
 class Panel(NamedTuple):
@@ -93,11 +92,6 @@ class Panel(NamedTuple):
     low: Floats
     high: Floats
     bounds: list[float]
-
-
-def draws_bands(x_axis: Axis) -> bool:
-    """Whether intervals are drawn as a band: a numeric axis with more than MAX_X_WITH_BARS levels."""
-    return x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS
 
 
 def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
@@ -159,8 +153,8 @@ def series(lines: PointRows, figure: Curve, study: Study) -> list[Series]:
     for name, group in group_points(lines, figure, study).items():
         if not group:
             continue
-        ordered = sorted(group, key=lambda line: x_axis.coordinate(line.levels[figure.x]))
-        x = np.array([x_axis.coordinate(line.levels[figure.x]) for line in ordered])
+        ordered = sorted(group, key=x_axis.at)
+        x = np.array(list(map(x_axis.at, ordered)))
         summaries = [line.responses[figure.y] for line in ordered]
         value, low, high = np.array([one[:3] for one in summaries], dtype=float).T
         count = np.array([one.trials for one in summaries])
@@ -179,9 +173,7 @@ def grid(lines: PointRows, figure: Heat, study: Study) -> Grid:
     count = np.zeros(shape, int)
     few = np.zeros(shape, bool)
     for line in shown_points(lines, figure, study):
-        row = rows.index(y.coordinate(line.levels[figure.y]))
-        column = columns.index(x.coordinate(line.levels[figure.x]))
-        cell = row, column
+        cell = rows.index(y.at(line)), columns.index(x.at(line))
         value[cell] = line.responses[figure.value].value
         count[cell] = line.responses[figure.value].trials
         few[cell] = has_few_values(line, figure.value)
@@ -239,9 +231,10 @@ def panels(
 
 def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
     """The panel of one response, or of `cost`, over the candidates."""
-    nan = float("nan")
     if name == "cost":
-        summaries: list[Any] = [(costs.get(line.point, nan), nan, nan) for line in lines]
+        summaries: list[Any] = [
+            (costs.get(line.point, np.nan), np.nan, np.nan) for line in lines
+        ]
     else:
         summaries = [line.responses[name][:3] for line in lines]
     bounds = []
@@ -298,11 +291,7 @@ def caption_title(figure: Figure) -> str:
 
 def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
-    varied = {
-        name
-        for name in study.factors
-        if len(distinct(line.levels[name] for line in lines)) > 1
-    }
+    varied = varied_factors(study, lines)
     fixed = fixed_levels(figure, study, lines).items()
     at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
     return f", at {at}" if at else ""

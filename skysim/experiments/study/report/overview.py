@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.study.execution.trials import rate_axis
@@ -44,6 +43,7 @@ from skysim.simulation.checks.expected_error import CENTROIDS
 from skysim.simulation.checks.facts import SURVEYED, TRACKER_KNOWS, Fact
 from skysim.simulation.lab import Lab, UserParts, build_lab
 
+Texts = list[tuple[str, str]]  # names with texts, or texts with the names of points
 NUMBER = re.compile(r"\d[\d.]*")
 MAX_CHECKED = (
     16  # maximum number of scenes that are checked: building one takes up to a second
@@ -70,7 +70,7 @@ class Overview(NamedTuple):
         Largest share of a survey that all trials share in the expected variance
     """
 
-    rows: list[tuple[str, str]]
+    rows: Texts
     findings: list[str]
     may_be_ambiguous: bool
     fixed: tuple[str, ...] = ()
@@ -80,8 +80,8 @@ class Overview(NamedTuple):
 
 def overview(plan: Plan) -> Overview:
     """The overview of a study. The finding of a scene that cannot be built is the reason."""
-    rows: list[tuple[str, str]] = []
-    found: dict[str, list[tuple[str, str]]] = {}
+    rows: Texts = []
+    found: dict[str, Texts] = {}
     leds: dict[str, int] = {}
     checked = 0
     may_be_ambiguous = False
@@ -119,10 +119,13 @@ def overview(plan: Plan) -> Overview:
         rows = rows or scene_rows(plan, lab, found_here.facts)
         for line in found_here.findings:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
-    findings = [
-        finding_text([(line, with_leds(at, leds)) for line, at in one], checked)
-        for one in found.values()
-    ]
+    # The number of LEDs is in the name of a checked point if the points of the study differ in it.
+    if len(set(leds.values())) > 1:
+        found = {
+            key: [(line, f"{at}, {leds[at]} LEDs" if at in leds else at) for line, at in one]
+            for key, one in found.items()
+        }
+    findings = [finding_text(one, checked) for one in found.values()]
     return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require, share)
 
 
@@ -148,22 +151,7 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
     return None if drawn is None or not scene.dome else float(np.max(drawn.tilt_deg))
 
 
-def with_leds(levels: str, leds: Mapping[str, int]) -> str:
-    """The name of a checked point, with its number of LEDs if the points of the study differ in it.
-
-    Parameters
-    ----------
-    leds
-        Number of LEDs of each checked point under a dome
-    """
-    return (
-        f"{levels}, {leds[levels]} LEDs"
-        if levels in leds and len(set(leds.values())) > 1
-        else levels
-    )
-
-
-def finding_text(at: list[tuple[str, str]], checked: int) -> str:
+def finding_text(at: Texts, checked: int) -> str:
     """Text of a finding that has other numbers at other levels: the first one, and the levels at which it was found."""
     others = [levels for _, levels in at[1:]]
     (line, first) = at[0]
@@ -237,7 +225,7 @@ def options(factor: Factor) -> list[Option]:
 # The table.
 
 
-def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> list[tuple[str, str]]:
+def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> Texts:
     """Rows on the scene of a lab, its tracker by the facts of the checks, and how the study varies and repeats it."""
     study = plan.study
     scene = lab.scene
@@ -275,7 +263,7 @@ def light_text(scene: Scene, lab: Lab) -> str:
         layout = scene.dome.layout
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
-        cap = f" within {layout.cap_deg:g}°" if getattr(layout, "cap_deg", None) else ""
+        cap = f" within {scene.dome.points.cap_deg:g}°"
         return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({layout.kind}){cap}"
     if light := scene.stars:
         limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
@@ -285,13 +273,11 @@ def light_text(scene: Scene, lab: Lab) -> str:
 
 def camera_text(camera: CameraConfig) -> str:
     """The camera in words: pixels, field of view and scale."""
-    sides = (camera.width_px, camera.height_px)
-    field = " × ".join(
-        f"{2 * math.degrees(math.atan(side / 2 / camera.focal_px)):.3g}°" for side in sides
-    )
-    scale = 1 / camera.focal_px / ARCSEC_RAD
+    known = camera.calibration()
+    field = " × ".join(f"{side:.3g}°" for side in known.field_deg[:2])
     lens = f"{1e3 * camera.focal_length_m:.4g} mm f/{camera.f_number:.3g}"
-    return f"{sides[0]} × {sides[1]} px, {lens}, field {field}, {scale:.3g}″ a pixel"
+    size = f"{camera.width_px} × {camera.height_px} px"
+    return f"{size}, {lens}, field {field}, {known.arcsec_px:.3g}″ a pixel"
 
 
 def tracker_text(scene: Scene) -> str:

@@ -64,6 +64,8 @@ from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
 STUDY_FILE = "The study file"
+# Columns of the table of ranges: the least and the largest value of a response, with their points.
+RANGES = list(map(text_column, ("response", "least", "at", "largest", "at")))
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
 OPEN_ROWS = 20  # number of rows above which that table is folded
@@ -121,17 +123,15 @@ class Analysis(NamedTuple):
         return [*self.headline, *self.ranges]
 
 
-def study_report(
-    plan: Plan, store: Store, study: str = "", out: Path | None = None
-) -> Report:
-    """The report of a study; `study` and `out` are those of `commands`.
+def study_report(plan: Plan, store: Store) -> Report:
+    """The report of a study.
 
     Raises
     ------
     InputError
         If `where` of a figure names an unknown factor or level.
     """
-    command = commands(plan, store, study, out)
+    command = commands(plan, store)
     return compose(plan.study, store, analyze(plan, store, command), command)
 
 
@@ -222,7 +222,10 @@ def compose(
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
         *search_figures(lines, study, front, costs, also),
-        *index_figures(found.indices, shares),
+        *(
+            Figure(figures.indices_png(found.indices, one), shares.format(one), name=one)
+            for one in dict.fromkeys(index.response for index in found.indices)
+        ),
         *study_figures(lines, study, store.point_columns, command("replay")),
     ]
     shown = {one.response for one in layout.figures(study, lines)}
@@ -242,7 +245,9 @@ def compose(
         *drawn[:1],
         folded("All answers", [Items(found.headline)], on_terminal=True),
         folded("Further figures", further),
-        folded("Ranges of the responses", [range_table(study, found.lines)])
+        folded(
+            "Ranges of the responses", [Table(RANGES, answer.range_rows(study, found.lines))]
+        )
         if not found.pooled
         else Text(""),
         Section("Requirements", requirement_table(study, found)),
@@ -335,7 +340,7 @@ def points_section(
     for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
         keys = [
             line.point,
-            *(axes[name].coordinate(one) for name, one in line.levels.items()),
+            *(one.at(line) for one in axes.values()),
         ]
         keys += [one.value for one in line.responses.values()]
         tone: Tone = "marked" if line.point in front else ""
@@ -384,14 +389,6 @@ def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
         ),
         Table([Column(f"worst {ranked(response)}", format=".4g"), *heads], worst),
     ]
-
-
-def range_table(study: Study, lines: PointRows) -> Table:
-    """The least and the largest value of each response, with their points."""
-    heads = ("response", "least", "at", "largest", "at")
-    return Table(
-        [Column(head, kind="text") for head in heads], answer.range_rows(study, lines)
-    )
 
 
 def requirement_table(study: Study, found: Analysis) -> list[Block]:
@@ -534,15 +531,6 @@ def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
     ]
     heads = [Column(across.tick_label(x)) for x in across.levels]
     return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
-
-
-def index_figures(indices: Sequence[Index], caption: str) -> list[Figure]:
-    """Bar charts of indices, one per response."""
-    named = dict.fromkeys(one.response for one in indices)
-    return [
-        Figure(figures.indices_png(indices, name), caption.format(name), name=name)
-        for name in named
-    ]
 
 
 def search_figures(
