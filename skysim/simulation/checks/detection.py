@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -57,7 +57,8 @@ PHASES = 64  # number of phases of the pulses relative to the exposure
 MAX_PULSES = 500
 
 
-class Context(NamedTuple):
+@dataclass(frozen=True)
+class Context:
     """The data that all checks share.
 
     Attributes
