@@ -373,24 +373,17 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     shown = None
     if not isinstance(scene.light, DomeConfig):
         shown = catalog.read_for("light.catalog", scene.light.catalog)
-    main = build_camera(scene, vehicle, mount, shown)
+    band = Band.from_camera(scene.camera)
+    orbit = build_orbit(scene.orbit, scene.start_time)
+    viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
+    plan = LightPlan(scene, band, vehicle, viewpoint, shown)
+    main = camera_of(MAIN, plan, mount, orbit, scene.seed)
     heads = [
         build_head(scene, n, vehicle, main, shown, parts.programs)
         for n in range(len(scene.heads))
     ]
     start = lab_from_body_start(scene, mount, profiles)
     return Lab(scene, vehicle, (main, *heads), start, profiles)
-
-
-def build_camera(
-    scene: Scene, vehicle: multibody.VehicleModel, mount: Mount, shown: catalog.Catalog | None
-) -> StarCamera:
-    """The main camera of a scene, with its lights; `shown` is the catalog of the scene's light."""
-    band = Band.from_camera(scene.camera)
-    orbit = build_orbit(scene.orbit, scene.start_time)
-    viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
-    plan = LightPlan(scene, band, vehicle, viewpoint, shown)
-    return camera_of(MAIN, plan, mount, orbit, scene.seed)
 
 
 def camera_of(
@@ -402,15 +395,16 @@ def camera_of(
     mount_error: Rotation | None = None,
 ) -> StarCamera:
     """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
-    scene = plan.scene
+    camera = plan.scene.camera
+    dtype = np.float32 if camera.detector.noise else np.float64
     return StarCamera(
         name,
-        scene,
+        plan.scene,
         mount,
-        Optics.from_camera(scene.camera),
-        Detector.from_camera(scene.camera),
+        Optics.from_camera(camera),
+        Detector.from_camera(camera),
         plan.band,
-        build_canvas(scene),
+        np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
         color_channels(plan),
         orbit,
@@ -433,12 +427,6 @@ def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
         first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
         channels.append(ColorChannel(first_px, band, lights))
     return tuple(channels)
-
-
-def build_canvas(scene: Scene) -> NDArray:
-    """The (H, W) array in which a camera's frames are drawn, see `StarCamera`."""
-    dtype = np.float32 if scene.camera.detector.noise else np.float64
-    return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)
 
 
 def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:
