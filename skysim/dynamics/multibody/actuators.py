@@ -164,18 +164,11 @@ def check_names(spec: Any, path: Path) -> None:
 def check_bare(joint: Any, path: Path) -> None:
     """Raise InputError if the file gives an actuator's joint a limit, spring, damping or drive; the scene sets them."""
     # Each of these would act in addition to the scene's values.
-    attributes = {
-        "range": joint.range,
-        "stiffness": joint.stiffness,
-        "springref": joint.springref,
-        "damping": joint.damping,
-        "frictionloss": joint.frictionloss,
-        "armature": joint.armature,
-        "actuatorfrcrange": joint.actfrcrange,
-    }
-    for name, value in attributes.items():
-        if np.any(value):
+    names = "range stiffness springref damping frictionloss armature actfrcrange"
+    for name in names.split():
+        if np.any(getattr(joint, name)):
+            in_file = name.replace("actfrc", "actuatorfrc")
             raise InputError(
                 path,
-                f"joint {joint.name}: {name} is set by the scene; remove it from the file",
+                f"joint {joint.name}: {in_file} is set by the scene; remove it from the file",
             )

@@ -89,8 +89,8 @@ class FanSet:
 
     def __post_init__(self) -> None:
         self.torque_per_thrust_m = np.cross(self.positions_m, self.force_axes, axis=0)
-        self.thrust_from_torque = np.linalg.pinv(
-            self.torque_per_thrust_m, rcond=RANK_TOLERANCE
+        self.thrust_from_torque = np.asarray(
+            np.linalg.pinv(self.torque_per_thrust_m, rcond=RANK_TOLERANCE), np.float64
         )
 
     def torque(self, thrust_n: Floats) -> Floats:

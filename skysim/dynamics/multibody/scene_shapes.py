@@ -88,11 +88,9 @@ def laboratory(mjcf: str) -> Laboratory:
 
 def is_shown(model: mujoco.MjModel, n: int) -> bool:
     """Whether the geom with index n is visible and is no light."""
-    kind = mujoco.mjtGeom(model.geom_type[n])
-    name = model.geom(n).name
-    return (
-        kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
-    )
+    known = mujoco.mjtGeom(model.geom_type[n]) in KINDS
+    is_light = model.geom(n).name.startswith(LIGHTS)
+    return known and model.geom_group[n] != GROUP_HIDDEN and not is_light
 
 
 def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:

@@ -60,7 +60,9 @@ class WheelSet:
 
     def __post_init__(self) -> None:
         # T = -axes u, solved for u.
-        self.motor_from_torque = -np.linalg.pinv(self.axes, rcond=RANK_TOLERANCE)
+        self.motor_from_torque = np.asarray(
+            -np.linalg.pinv(self.axes, rcond=RANK_TOLERANCE), np.float64
+        )
 
     def momentum(self, speed_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of wheels at speeds (n,) relative to the body: h = sum axis inertia speed."""
