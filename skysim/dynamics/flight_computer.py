@@ -169,14 +169,6 @@ class FlightComputer:
             stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
         return stored
 
-    def relative_loads(self, control: Floats, inputs: ControlInput) -> Floats:
-        """(n,) commands of the motors over their limits; of wheels the speeds over theirs, if these are closer."""
-        loads = np.abs(control[self.motors]) / self.limit
-        if isinstance(self.actuator, WheelActuator):
-            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
-            loads = np.maximum(loads, np.abs(speeds) / self.actuator.model.speed_limit_rad_s)
-        return np.asarray(loads)
-
     def compute_controls(
         self,
         inputs: ControlInput,
@@ -216,7 +208,13 @@ class FlightComputer:
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         self.achieved_nm = achieved_nm + dump_nm
         if self.names:
-            self.loads = self.relative_loads(control, inputs)
+            self.loads = np.abs(control[self.motors]) / self.limit
+            if isinstance(self.actuator, WheelActuator):
+                # The speed of a wheel counts if it is closer to its limit.
+                speeds = np.abs(inputs.speeds_rad_s[self.actuator.joints.dof])
+                self.loads = np.maximum(
+                    self.loads, speeds / self.actuator.model.speed_limit_rad_s
+                )
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

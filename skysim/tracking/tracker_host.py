@@ -20,15 +20,13 @@ from skysim.tracking.tracker_interface import (
     Answer,
     Picture,
     Setup,
-    Tracker,
     check_answer,
 )
 
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     """The frame of a header, with its pixels read from the stream."""
-    count = header["bytes"]
-    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
+    image = np.frombuffer(frames.read(header["bytes"]), header["dtype"]).reshape(
         header["height_px"], header["width_px"]
     )
     streak = header["streak_px"]
@@ -36,34 +34,25 @@ def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     return Picture(image, *fields, None if streak is None else tuple(streak))
 
 
-def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
-    """The tracker's answer; an exception or an invalid answer becomes an answer with status "failed: ..."."""
-    begin_s = time.perf_counter()
-    try:
-        answer = tracker.solve(picture)
-        spent_s = time.perf_counter() - begin_s
-        return replace(check_answer(answer), seconds=spent_s)
-    except Exception as error:
-        return Answer(check_answer(Answer(FAILED + describe_error(error))).status)
+def create(name: str, setup: dict[str, Any]) -> Respond:
+    """The function with which `serve` answers frames. Raises TypeError for a tracker without a method `solve`.
 
-
-def create_tracker(name: str, setup: Setup) -> Tracker:
-    """The tracker of an entry point. Raises TypeError if it has no method `solve`."""
-    tracker = TRACKERS.entry_points()[name].load()(setup)
+    An exception or an invalid answer becomes an answer with status "failed: ...".
+    """
+    tracker = TRACKERS.entry_points()[name].load()(Setup.of_tree(setup))
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"{type(tracker).__name__} has no method solve")
-    return tracker
-
-
-def create(name: str, setup: dict[str, Any]) -> Respond:
-    """The function with which `serve` answers frames."""
-    tracker = create_tracker(name, Setup.of_tree(setup))
 
     def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
-        return {
-            "frame": header["frame"],
-            **solve_picture(tracker, receive_picture(header, frames)).as_tree(),
-        }
+        picture = receive_picture(header, frames)
+        begin_s = time.perf_counter()
+        try:
+            answer = tracker.solve(picture)
+            spent_s = time.perf_counter() - begin_s
+            answer = replace(check_answer(answer), seconds=spent_s)
+        except Exception as error:
+            answer = Answer(check_answer(Answer(FAILED + describe_error(error))).status)
+        return {"frame": header["frame"], **answer.as_tree()}
 
     return respond
 
