@@ -289,17 +289,15 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
         Column("t", "s", ".3f"),
         Column("exp", "ms", ".5g"),
         Column("rate", "°/s", ".2f"),
-    ]
-    columns += [
-        Column(name, "°", ".5f") for name in (*(f"true {name}" for name in angles), *angles)
-    ]
-    columns += [
+        *(Column(f"true {name}", "°", ".5f") for name in angles),
+        *(Column(name, "°", ".5f") for name in angles),
         Column("cross", "″", ".3f"),
         Column("roll", "″", "+.3f"),
         Column("detected"),
         Column("used"),
+        Column("time", "ms", ".1f"),
+        text_column("status"),
     ]
-    columns += [Column("time", "ms", ".1f"), text_column("status")]
     lines = []
     for row in rows:
         motion = [row.frame, row.t_s, 1e3 * row.exposure_s, row.rate_deg_s, *row.truth_deg]
