@@ -29,7 +29,7 @@ from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
-from skysim.dynamics.flight_computer import FlightComputer, controlling_actuator, usage
+from skysim.dynamics.flight_computer import FlightComputer, usage
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
@@ -37,7 +37,7 @@ from skysim.dynamics.multibody.actuator_kind import ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators
 from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
@@ -77,8 +77,16 @@ def check_reference(
         if not motion.is_prescribed:
             inertia = model.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
-            used = usage(controlling_actuator(motion.control, actuators, model), torque_nm)
-            check_torque(key, begin_s + t_s, used, torque_nm, motion.control)
+            used = usage(actuators[motion.control.actuators], torque_nm)
+            k = int(used.argmax())
+            if used[k] > 1 + ROUNDING:
+                torque = ", ".join(f"{one:.3g}" for one in significant(torque_nm[k], 3))
+                raise InputError(
+                    key,
+                    f"needs a torque of ({torque}) N m at {begin_s + t_s[k]:.6g} s, {used[k]:.3g} times what the"
+                    f" actuators {motion.control.actuators} can give",
+                    "slower or smaller, or motion.control: prescribed",
+                )
 
 
 def check_tilt(
@@ -130,21 +138,6 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
             key,
             f"{math.degrees(fastest[n]):.4g} deg/s about a body axis at {t_s[n]:.6g} s",
             f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
-        )
-
-
-def check_torque(
-    key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig
-) -> None:
-    """Raise InputError if the actuators cannot give a torque (K, 3); `used` (K,) is its ratio to their limit."""
-    n = int(used.argmax())
-    if used[n] > 1 + ROUNDING:
-        torque = ", ".join(f"{component:.3g}" for component in significant(torque_nm[n], 3))
-        raise InputError(
-            key,
-            f"needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
-            f" {control.actuators} can give",
-            "slower or smaller, or motion.control: prescribed",
         )
 
 
@@ -461,7 +454,17 @@ class Motion:
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
-        self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
+        self.navigation = None
+        if scene.vehicle.imu is not None:
+            self.navigation = Navigation(
+                scene,
+                tuple(camera.mount for camera in lab.cameras),
+                lab.start,
+                multibody.imu_position_m(vehicle),
+                vehicle.gravity_m_s2,
+                random_stream(scene.seed, IMU, 0),
+                math.inf if kept_s is None else kept_s,
+            )
         impulses = guidance.impulses(scene.motion, self.reference)
         self.disturbances = build_disturbances(lab, impulses, self.flight_computer.period_s)
         self.recorder = None
@@ -583,16 +586,4 @@ def build_disturbances(
         lab.vehicle.inertia_kg_m2,
         period_s,
         random_stream(scene.seed, AIR_CURRENT, 0),
-    )
-
-
-def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:
-    """The on-board navigation, which keeps IMU samples for kept_s; None without an IMU."""
-    if lab.scene.vehicle.imu is None:
-        return None
-    position_m = multibody.imu_position_m(lab.vehicle)
-    stream = random_stream(lab.scene.seed, IMU, 0)
-    mounts = tuple(camera.mount for camera in lab.cameras)
-    return Navigation(
-        lab.scene, mounts, lab.start, position_m, lab.vehicle.gravity_m_s2, stream, kept_s
     )

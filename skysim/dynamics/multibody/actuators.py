@@ -41,11 +41,12 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 
 
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
-    """All actuators that are switched on, by their key in `vehicle`."""
-    return {
-        kind.key: kind.control(model, getattr(vehicle, kind.key))
-        for kind in kinds_on(vehicle)
-    }
+    """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
+    motors = np.array([model.actuator(name).id for name in TORQUES])
+    found: dict[str, Actuators] = {"ideal": IdealTorque(motors, vehicle.torque_limit_nm)}
+    for kind in kinds_on(vehicle):
+        found[kind.key] = kind.control(model, getattr(vehicle, kind.key))
+    return found
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:

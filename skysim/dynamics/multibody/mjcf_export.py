@@ -17,6 +17,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
@@ -138,10 +139,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
         if not mesh.file:
             continue
         compiled_mesh = model.mesh(mesh.name or Path(mesh.file).stem)
-        first = int(compiled_mesh.vertadr[0])
-        count = int(compiled_mesh.vertnum[0])
-        begin = int(compiled_mesh.faceadr[0])
-        faces = int(compiled_mesh.facenum[0])
+        vertices_m, faces = mesh_arrays(model, compiled_mesh.id)
         file_from_compiled = Rotation.from_quat(
             model.mesh_quat[compiled_mesh.id], scalar_first=True
         )
@@ -150,11 +148,16 @@ def inline_meshes(spec: Any, model: Any) -> None:
         mesh.scale = [1.0, 1.0, 1.0]
         mesh.refpos = [0.0, 0.0, 0.0]
         mesh.refquat = [1.0, 0.0, 0.0, 0.0]
-        mesh.uservert = (
-            file_from_compiled.apply(model.mesh_vert[first : first + count])
-            + model.mesh_pos[compiled_mesh.id]
-        ).ravel()
-        mesh.userface = model.mesh_face[begin : begin + faces].ravel()
+        placed_m = file_from_compiled.apply(vertices_m) + model.mesh_pos[compiled_mesh.id]
+        mesh.uservert = placed_m.ravel()
+        mesh.userface = faces.ravel()
+
+
+def mesh_arrays(model: Any, k: int) -> tuple[Floats, NDArray[np.int32]]:
+    """(N, 3) vertices and (M, 3) faces of mesh k of a compiled model."""
+    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
+    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
+    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()
 
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN
+from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN, mesh_arrays
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 
 KINDS = {
@@ -125,7 +125,4 @@ def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
     """Vertices (N, 3) and faces (M, 3) of the mesh of a geom; empty for other kinds."""
     if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    k = model.geom_dataid[n]
-    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
-    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
-    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()
+    return mesh_arrays(model, model.geom_dataid[n])
