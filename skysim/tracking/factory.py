@@ -8,6 +8,7 @@ the settings (`assumed_settings`) that the tracker assumes, which may differ fro
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,9 +37,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import OWN
-from skysim.tracking import external_tracker
 from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
 from skysim.tracking.onboard_model import (
     OrbitStarTracker,
@@ -51,6 +50,7 @@ from skysim.tracking.onboard_model import (
     with_brightness,
     zero_point_mag,
 )
+from skysim.tracking.tracker_interface import Leds, Stars
 
 # Settings of the tracker from a scene.
 
@@ -76,17 +76,19 @@ def assumed_settings(scene: Scene) -> Settings:
     """
     config = scene.tracker
     default = Settings()
-    usual = DOME_ALGORITHMS if isinstance(scene.light, DomeConfig) else {}
+    usual = DOME_ALGORITHMS if scene.dome else {}
     chosen: dict[str, Any] = {}
     for stage, table in algorithm_tables(scene).items():
         name = getattr(config, stage) or usual.get(stage, "default")
-        chosen[stage] = require_algorithm(stage, name, table)
+        # Only the estimator has the list, and the scene package may not import it, so the name is checked here.
+        if name not in table:
+            raise InputError(f"tracker.{stage}", *unknown_name(stage, name, table))
+        chosen[stage] = name
+    most = config.brightest or default.max_blobs
     return Settings(
-        max_blobs=config.brightest or default.max_blobs,
-        base_stars=min(config.brightest or default.base_stars, default.base_stars),
-        searched_stars=min(
-            config.brightest or default.searched_stars, default.searched_stars
-        ),
+        max_blobs=most,
+        base_stars=min(most, default.base_stars),
+        searched_stars=min(most, default.searched_stars),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
         intensity_threshold=config.intensity_threshold,
@@ -105,25 +107,13 @@ def assumed_settings(scene: Scene) -> Settings:
 
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
     """The algorithms that a scene's tracker may use: by stage, then by name."""
-    near: dict[str, Mapping[str, object]] = {}
-    if isinstance(scene.light, DomeConfig):
-        near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
-    return STAR_ALGORITHMS | near
+    near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
+    return {**STAR_ALGORITHMS, **near} if scene.dome else STAR_ALGORITHMS
 
 
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:
     """The names of the algorithms that a scene's tracker may use, by stage."""
     return {stage: tuple(table) for stage, table in algorithm_tables(scene).items()}
-
-
-def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -> str:
-    """The name, if it is one of the algorithms; else raise InputError.
-
-    Only the estimator has the list, and the scene package may not import it, so the name is checked here.
-    """
-    if name not in algorithms:
-        raise InputError(f"tracker.{stage}", *unknown_name(stage, name, algorithms))
-    return name
 
 
 # Trackers.
@@ -169,26 +159,26 @@ def build_tracker(
     name = scene.tracker.name
     if not isinstance(programs.get(name, ""), str):
         return tracker_of(name, programs[name])
-    if isinstance(scene.light, DomeConfig):
-        return build_dome_tracker(scene, scene.light, mount, sources, programs)
-    return build_sky_tracker(scene, programs)
-
-
-def build_dome_tracker(
-    scene: Scene,
-    dome: DomeConfig,
-    mount: Mount,
-    sources: Sources,
-    programs: Programs,
-) -> DomeTracker | CodedTracker | ExternalTracker:
-    """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
     settings = assumed_settings(scene)
+    dome = scene.dome
+    if dome is None:
+        # Stars, with their apparent directions from the tracker's catalog.
+        camera = assumed_camera(scene)
+        orbit = assumed_orbit(scene)
+        stars, directions = assumed_stars(scene, orbit)
+        if name != OWN:
+            lights = Stars(stars.id, directions, stars.v_mag)
+            return ExternalTracker.start(scene, camera, settings, lights, programs)
+        if orbit:
+            return OrbitStarTracker(camera, stars, directions, settings, orbit)
+        return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
+    # LEDs, with map and lever from the survey or from a map's file.
     camera, leds, lever = onboard_dome(scene, dome, mount, sources)
     leds = with_brightness(scene, dome, leds, lever)
-    if scene.tracker.name != OWN:
-        return ExternalTracker.start(
-            scene, camera, settings, external_tracker.led_map(leds, lever), programs
-        )
+    if name != OWN:
+        axes_xyzw = lever.cam_from_body.as_quat()
+        dome_map = Leds(leds.id, leds.position_m, lever.camera_body_m, axes_xyzw)
+        return ExternalTracker.start(scene, camera, settings, dome_map, programs)
     try:
         if scene.tracker.decoder is None:
             return DomeTracker(camera, leds, lever, settings)
@@ -197,21 +187,6 @@ def build_dome_tracker(
         return CodedTracker(camera, leds, lever, settings, code, decoder)
     except ImageError as error:
         raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
-
-
-def build_sky_tracker(scene: Scene, programs: Programs) -> StarTracker | ExternalTracker:
-    """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
-    camera = assumed_camera(scene)
-    settings = assumed_settings(scene)
-    orbit = assumed_orbit(scene)
-    stars, directions = assumed_stars(scene, orbit)
-    if scene.tracker.name != OWN:
-        return ExternalTracker.start(
-            scene, camera, settings, external_tracker.star_map(stars, directions), programs
-        )
-    if orbit:
-        return OrbitStarTracker(camera, stars, directions, settings, orbit)
-    return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 
 
 def solve_frame(
@@ -235,16 +210,13 @@ def solve_frame(
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
+    seen: list[Any] = [frame.image_dn, streak_px, rate, frame.exposure_s]
+    if isinstance(estimator, StarTracker | CodedTracker):
+        seen.append(frame.t_mid_s)
+    if isinstance(estimator, CodedTracker):
+        seen.append(frame.index)
     try:
-        if isinstance(estimator, StarTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s
-            )
-        if isinstance(estimator, CodedTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index
-            )
-        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
+        return estimator.solve(*seen)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())
 
@@ -283,9 +255,8 @@ class ExposureController:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             observed = observe_frame(self.settings, self.control, frame)
-            self.exposure_s = step(
-                NextExposure(frame.exposure_s), observed, self.control
-            ).time_s
+            last = NextExposure(frame.exposure_s)
+            self.exposure_s = step(last, observed, self.control).time_s
 
 
 def control_settings(scene: Scene) -> Control | None:
@@ -301,7 +272,9 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
     as saturated.
     """
     image_dn = monochrome(frame.image_dn, settings)
-    try:
+    box_px = np.empty((0, 4), np.int64)
+    # A coarse converter may give a frame of one value: no blobs.
+    with suppress(ImageError):
         blobs = DETECTORS[settings.detector](
             image_dn,
             settings.threshold_sigma,
@@ -309,7 +282,5 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
             settings.max_blobs,
             FramePriors(None, settings.saturation, 0.0, settings.intensity_threshold),
         )
-    except ImageError:  # a coarse converter may give a frame of one value: no blobs
-        return observe(image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
-    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+        box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(image_dn, box_px, settings.saturation, control)
