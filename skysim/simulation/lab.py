@@ -100,12 +100,19 @@ def with_parts(
     motion = scene.motion
     estimator = None
     if controller is not None:
-        motion, programs = with_controller(motion, controller, programs)
+        check_controller(controller)
+        law = controller if isinstance(controller, str) else name_of(controller)
+        config = (motion.control or ControlConfig()).model_copy(update={"law": law})
+        motion = motion.model_copy(update={"control": config})
+        programs = programs if law is controller else {**programs, law: controller}
     if profile is not None:
         motion = with_profile(motion, profile)
     scene = scene.model_copy(update={"motion": motion})
     if tracker is not None:
-        scene, estimator = with_tracker(scene, tracker)
+        name = tracker if isinstance(tracker, str) else name_of(tracker)
+        estimator = None if name is tracker else factory.tracker_of(name, tracker)
+        named = scene.tracker.model_copy(update={"name": name})
+        scene = scene.model_copy(update={"tracker": named})
     table = None if isinstance(profile, str | Path) else profile
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {
@@ -116,17 +123,6 @@ def with_parts(
     commands = {name: one for name, one in programs.items() if isinstance(one, str)}
     given |= {"programs": repr(commands)} if commands else {}
     return scene, UserParts(programs, estimator, table, given)
-
-
-def with_controller(
-    motion: MotionConfig, controller: Any, programs: Programs
-) -> tuple[MotionConfig, Programs]:
-    """The motion with a controller, and the programs with that of Python."""
-    config = motion.control or ControlConfig()
-    check_controller(controller)
-    law = controller if isinstance(controller, str) else name_of(controller)
-    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
-    return changed, programs if law is controller else {**programs, law: controller}
 
 
 def check_controller(controller: Any) -> None:
@@ -159,14 +155,6 @@ def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
             "control": motion.control or ControlConfig(law=PRESCRIBED),
         }
     )
-
-
-def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
-    """The scene with the name of a tracker, and the tracker; None if it is given by name."""
-    name = tracker if isinstance(tracker, str) else name_of(tracker)
-    estimator = None if name is tracker else factory.tracker_of(name, tracker)
-    config = scene.tracker.model_copy(update={"name": name})
-    return scene.model_copy(update={"tracker": config}), estimator
 
 
 def name_of(part: Any) -> str:
@@ -338,9 +326,9 @@ class Lab:
     def export_leds(self) -> tuple[str, int]:
         """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
         scene = self.scene
-        if not isinstance(scene.light, DomeConfig):
+        if not scene.dome:
             raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
-        return led_list(scene.light, self.camera.band, scene.name)
+        return led_list(scene.dome, self.camera.band, scene.name)
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:

@@ -202,7 +202,7 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
         samples = sampling.sampled(attitudes.of_frames(lab), context)
         error = samples.error.total("cross")
         found[identifier, focal_length] = (
-            samples.error.cross_rad2["focal length"].max(),
+            samples.error.rad2["cross"]["focal length"].max(),
             error.mean(),
         )
         cam_from_body = lab.camera.mount.cam_from_body
@@ -252,7 +252,10 @@ def test_a_fit_reaches_the_bound_of_mortensen() -> None:
         integral = scipy.integrate.quad(lambda t, tau=tau: np.log(t) / (1 + t / tau), 0, 1)[0]
         noise_e2 = tau * electrons / (2 * np.pi * sigma_px**2)
         found = detection.weighted_variance(
-            images(electrons, sigma_px), np.array([electrons]), noise_e2, detection.fit
+            images(electrons, sigma_px),
+            np.array([electrons]),
+            noise_e2,
+            detection.WEIGHTS["fit"],
         )
         expected_px2 = sigma_px**2 / electrons / (1 + integral)
         assert np.ravel(found) == pytest.approx(np.full(2, expected_px2), rel=2e-3)
@@ -470,8 +473,8 @@ def variances_of(survey: dict[str, str]) -> dict[str, Floats]:
     context = detection.context_of(lab)
     found = sampling.sampled(attitudes.of_frames(lab), context).error
     return {
-        name: np.array([found.cross_rad2[name].mean(), found.roll_rad2[name].mean()])
-        for name in found.cross_rad2
+        name: np.array([found.rad2["cross"][name].mean(), found.rad2["roll"][name].mean()])
+        for name in found.rad2["cross"]
     }
 
 
@@ -588,8 +591,10 @@ def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
     none = dict.fromkeys(facts.DRAWN_ONCE, np.zeros(2))
     noise = np.array([ARCSEC_RAD**2 * 15, np.nan])
     error = Expected(
-        none | {"centroid noise": noise, "LED survey": noise / 15},
-        none | {"centroid noise": 2 * noise},
+        {
+            "cross": none | {"centroid noise": noise, "LED survey": noise / 15},
+            "roll": none | {"centroid noise": 2 * noise},
+        }
     )
     require = {
         "cross_arcsec_p95": 6.93,
@@ -599,9 +604,7 @@ def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
         "wrong": 0.001,
     }
     scene = SimpleNamespace(require=require)
-    plan = SimpleNamespace(
-        lab=SimpleNamespace(scene=scene), frames=SimpleNamespace(error=error)
-    )
+    plan = SimpleNamespace(scene=scene, frames=SimpleNamespace(error=error))
     fact = facts.requirements(plan)
     found = {name: fact.values[name]["expected"] for name in require}
     rng = np.random.default_rng(1)

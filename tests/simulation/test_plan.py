@@ -812,7 +812,7 @@ def test_a_body_s_expected_pixel_value_matches_its_frame(
     row = list(truth.sources.id).index(
         next(body.id for body in truth.bodies if body.name == name.lower())
     )
-    full_e = detection.full_scale_e(lab.scene.camera.detector)
+    full_e = detection.context_of(lab).full_e
     assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
 
 

@@ -139,7 +139,7 @@ PROBE_BYTES = 1 << 20
 # Progress bar over items: items, count, label.
 Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]
 
-# Unit by the ending of a column's name; the longest matching ending applies.
+# Unit by the ending of a column's name; the first ending that matches applies.
 UNITS = {
     "_deg_s": "deg/s",
     "_deg_h": "deg/h",
@@ -318,8 +318,7 @@ def to_arrow(table: Any, run: Recording) -> Any:
 
 def unit_of(name: str) -> str:
     """Unit of a column from the ending of its name; empty if it has none."""
-    ending = max((suffix for suffix in UNITS if name.endswith(suffix)), key=len, default="")
-    return UNITS.get(ending, "")
+    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
 def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:

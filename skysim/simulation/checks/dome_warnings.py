@@ -41,10 +41,11 @@ MAX_IMAGE_PX = 32.0
 
 def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     """The warnings about assumptions of the tracker, one line each, for a camera inside the dome."""
-    assert isinstance(scene.light, DomeConfig)
-    inside = surface.build_surface(scene.light.surface)
+    light = scene.dome
+    assert light is not None
+    inside = surface.build_surface(light.surface)
     lines = [
-        surface_fit_warning(scene.light, inside),
+        surface_fit_warning(light, inside),
         ellipsoid_warning(inside),
         image_width_warning(scene, sources, mount),
         exposure_warning(scene, sources),
@@ -55,9 +56,8 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
     """Warn if the camera is outside of the dome at the start (lab_from_body), where its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
-    if not isinstance(scene.light, DomeConfig) or surface.build_surface(
-        scene.light.surface
-    ).inside(camera_m):
+    light = scene.dome
+    if light is None or surface.build_surface(light.surface).inside(camera_m):
         return ""
     return (
         f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
@@ -165,9 +165,9 @@ def of(plan: Plan) -> Lookalike | None:
 
 def why_not_compared(plan: Plan) -> str:
     """The reason why fields cannot be compared; empty if they can."""
-    if not isinstance(plan.lab.scene.light, DomeConfig):
+    if not plan.scene.dome:
         return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
-    if plan.lab.scene.tracker.decoder is not None:
+    if plan.scene.tracker.decoder is not None:
         return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
     mean = float(plan.reach.counts().mean())
     if mean < MIN_LEDS:

@@ -58,7 +58,6 @@ from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
@@ -66,21 +65,16 @@ from skysim.sources.dome import survey_errors
 
 
 class Expected(NamedTuple):
-    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights.
+    """Variances (A,) of the angles `cross` and `roll` at A attitudes in rad^2, by cause; NaN with too few lights.
 
     They are NaN also where most streaks break: those that are left are not fitted as well as expected.
     """
 
-    cross_rad2: dict[str, Floats]
-    roll_rad2: dict[str, Floats]
-
-    def by_cause(self, angle: str) -> dict[str, Floats]:
-        """The variances of the angle `cross` or `roll`, by cause."""
-        return self.cross_rad2 if angle == "cross" else self.roll_rad2
+    rad2: dict[str, dict[str, Floats]]
 
     def total(self, angle: str) -> Floats:
         """(A,) variance of the angle `cross` or `roll` by all causes together; NaN with too few lights."""
-        return np.asarray(sum(self.by_cause(angle).values()))
+        return np.asarray(sum(self.rad2[angle].values()))
 
     def rms_arcsec(self) -> tuple[float, float]:
         """Root mean square of cross and roll over the attitudes in arcsec; NaN without any solution."""
@@ -114,7 +108,7 @@ def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats |
 
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors of the set-up of the survey's instrument, common to all LEDs."""
-    instrument = context.lab.scene.tracker.survey.instrument
+    instrument = context.scene.tracker.survey.instrument
     if instrument is None:
         return None
     shifts_m = survey_errors.station_displacements_m(
@@ -216,12 +210,12 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Flo
     camera = context.camera.optics.camera
     if not isinstance(camera.shutter, RollingShutterConfig):
         return None
-    assumed_s = context.lab.scene.tracker.assumed_row_time_s
+    assumed_s = context.scene.tracker.assumed_row_time_s
     error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
     if not error_s:
         return None
     delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
-    velocity_px_s = view.streak_px / context.lab.scene.exposure.time_s
+    velocity_px_s = view.streak_px / context.scene.exposure.time_s
     return (velocity_px_s * delay_s[:, None])[:, :, None]
 
 
@@ -365,10 +359,10 @@ def fits_focal_length(context: Context) -> bool:
 
 def finds_focal_length(context: Context) -> bool:
     """Whether the tracker finds the right focal length: by a fit, or by the default identifier under the stars."""
-    scene = context.lab.scene
+    scene = context.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
-    if not isinstance(scene.light, StarsConfig):
+    if not scene.stars:
         return False
     by_default = scene.tracker.identifier in (None, "default")
     return by_default and abs(context.beliefs.focal_error) < WRONG_FOCAL
@@ -442,15 +436,14 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
     names = (CENTROIDS, LED_SURVEY, *CAUSES, SOLVER)
-    cross = {name: np.zeros(len(views)) for name in names}
-    roll = {name: np.zeros(len(views)) for name in names}
+    cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
     cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
         variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
         for name, variance in variances.items():
             cross[name][a] = variance[:2].sum()
             roll[name][a] = variance[2]
-    return Expected(cross, roll)
+    return Expected({"cross": cross, "roll": roll})
 
 
 def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
-from skysim.simulation.checks.detection import Context, centroid_variance, full_scale_e
+from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.vehicle_facts import Fact, short
@@ -57,7 +56,7 @@ def lights_in_field(plan: Plan) -> Fact:
     values = {}
     tilt_deg = math.degrees(attitudes.tilts_rad(plan.reach.attitudes).max())
     reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
-    if isinstance(lab.scene.light, StarsConfig):
+    if lab.scene.stars:
         reach = "in the whole sky"
     for key, what, sampled in (
         ("frames", "at the frames", plan.frames),
@@ -132,7 +131,7 @@ def spot(plan: Plan) -> Fact:
     width, disk_px, defocus_px = (
         float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
     )
-    led = f", LED {disk_px:.1f}" if isinstance(plan.lab.scene.light, DomeConfig) else ""
+    led = f", LED {disk_px:.1f}" if plan.scene.dome else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {
         "width_px": width,
@@ -145,13 +144,13 @@ def spot(plan: Plan) -> Fact:
 
 def fill(plan: Plan) -> Floats:
     """(n,) peaks of all lights at the frames over the full well, or over the range of the converter if that is less."""
-    return plan.frames.joined("peak_e") / full_scale_e(plan.lab.scene.camera.detector)
+    return plan.frames.joined("peak_e") / plan.full_e
 
 
 def peak(plan: Plan) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
     ratio = fill(plan)
-    full_e = full_scale_e(plan.lab.scene.camera.detector)
+    full_e = plan.full_e
     if not len(ratio):
         return Fact("peak", ["no light in the field"], {"full_e": full_e})
     full = float((ratio >= 1).mean())
@@ -256,9 +255,9 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     tilt_deg
         The tilt; None for the greatest of the attitudes in reach
     """
-    light = plan.lab.scene.light
+    light = plan.scene.dome
     camera = plan.camera.optics.camera
-    if not isinstance(light, DomeConfig) or plan.surface is None:
+    if light is None or plan.surface is None:
         return None
     points = getattr(light.layout, "points", light.layout)
     if getattr(points, "boards", ()):
@@ -305,7 +304,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
 def cap(plan: Plan) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
     found = cap_margin(plan)
-    vehicle = plan.lab.scene.vehicle
+    vehicle = plan.scene.vehicle
     if found is None:
         return None
     wider = (
@@ -330,9 +329,9 @@ def cap(plan: Plan) -> Fact | None:
 
 def room(plan: Plan) -> Fact | None:
     """The size of the dome and its parts in the room and its door; a scene that does not fit was refused before."""
-    light = plan.lab.scene.light
+    light = plan.scene.dome
     surface = plan.surface
-    if not isinstance(light, DomeConfig) or light.room is None or surface is None:
+    if light is None or light.room is None or surface is None:
         return None
     limits = light.room
     values = fit(light.room, surface, light.layout.cap_deg)
@@ -359,9 +358,9 @@ def room(plan: Plan) -> Fact | None:
 
 def wall(plan: Plan) -> Fact | None:
     """Area, volume and mass of a formed wall without its flange; None without `surface.wall`."""
-    light = plan.lab.scene.light
-    config = getattr(getattr(light, "surface", None), "wall", None)
-    if config is None or not isinstance(light, DomeConfig):
+    light = plan.scene.dome
+    config = getattr(light.surface, "wall", None) if light else None
+    if light is None or config is None:
         return None
     assert isinstance(plan.surface, Radial)
     size = wall_size(plan.surface, light.layout.cap_deg)
@@ -413,7 +412,7 @@ def tracker_beliefs(plan: Plan) -> Fact:
         "catalog_epoch_jyear": believed.epoch_jyear,
         "map_faults": list(believed.faults),
     }
-    lines = beliefs.describe(believed, plan.lab.scene)
+    lines = beliefs.describe(believed, plan.scene)
     if plan.settings.acceptance == "thesis":
         lines = [*lines, UNTESTED]
     return Fact(TRACKER_KNOWS, lines, values)
@@ -513,7 +512,7 @@ def requirements(plan: Plan) -> Fact | None:
     sizes = {"cross": cross, "roll": roll, "angle": np.hypot(cross, roll)}
     lines = []
     values: dict[str, Any] = {}
-    for name, limit in plan.lab.scene.require.items():
+    for name, limit in plan.scene.require.items():
         limits = re.findall(r"([a-z]+)_arcsec_([\d.]+)", name)
         quantile = re.fullmatch(r"([a-z]+)_arcsec_(?:median|[a-z]+(\d+))", name)
         expected = math.nan
@@ -532,7 +531,7 @@ def requirements(plan: Plan) -> Fact | None:
         lines.append(f"{name}: {text}")
         values[name] = {"limit": limit, "expected": expected}
     shares = [
-        sum(error.by_cause(angle)[name] for name in DRAWN_ONCE) / error.total(angle)
+        sum(error.rad2[angle][name] for name in DRAWN_ONCE) / error.total(angle)
         for angle in UNIT_ERRORS
     ]
     values["drawn_once"] = (
@@ -548,7 +547,7 @@ DRAWN_ONCE = (*SURVEYED, "focal length")
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
     """The rms over the attitudes of the error by each cause in arcsec, the largest first."""
-    by_cause = sampled.error.by_cause(angle)
+    by_cause = sampled.error.rad2[angle]
     known = np.isfinite(sampled.error.total(angle))
     size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
     return {

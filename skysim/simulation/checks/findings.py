@@ -21,12 +21,10 @@ from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes, vehicle_facts
 from skysim.simulation.checks.detection import (
     Context,
     detected_area_px,
-    full_scale_e,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
@@ -70,14 +68,14 @@ MAX_TAG_ARCSEC = 1.0
 def saturation(plan: Plan) -> str:
     """Warn if many lights are saturated."""
     ratio = fill(plan)
-    scene = plan.lab.scene
+    scene = plan.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
     if full <= MAX_SATURATED or bright_background(plan):
         return ""
     factor = TARGET_FILL / float(np.quantile(ratio, 1 - MAX_SATURATED))
     text = (
         f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
-        f" {full_scale_e(scene.camera.detector):.0f} electrons; change it to"
+        f" {plan.full_e:.0f} electrons; change it to"
     )
     (first, value), *more = dimmer(plan, factor).items()
     others = "".join(f", or {key} to {other}" for key, other in more)
@@ -94,7 +92,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     An exposure is recommended only if it is not shorter than SHORTEST_S and the LED drive's cycle, in which each LED is
     lit once, and an f-number only up to LARGEST_F_NUMBER. Stars always get an exposure.
     """
-    scene = context.lab.scene
+    scene = context.scene
     sources = context.lab.camera.sources
     cures = led_strength(scene, factor)
     cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
@@ -118,9 +116,9 @@ def led_strength(scene: Scene, factor: float) -> dict[str, str]:
 
 def bright_background(plan: Plan) -> str:
     """Warn if extended light alone fills the pixels."""
-    scene = plan.lab.scene
+    scene = plan.scene
     camera = plan.camera
-    full_e = full_scale_e(scene.camera.detector)
+    full_e = plan.full_e
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
     shorter_ms = (
@@ -136,7 +134,7 @@ def bright_background(plan: Plan) -> str:
 
 def black_level(plan: Plan) -> str:
     """Warn if a pixel without light is above the fixed threshold of the detector `thesis`."""
-    detector = plan.lab.scene.camera.detector
+    detector = plan.scene.camera.detector
     level_dn = detector.offset_dn + plan.camera.background_e / detector.gain_e_dn
     share = plan.settings.intensity_threshold
     threshold_dn = share * saturation_dn(detector)
@@ -171,7 +169,7 @@ def few_lights(plan: Plan) -> str:
     3. Return no warning if enough lights are on the detector (`undetected` warns of those).
     4. Recommend more LEDs, or fainter stars.
     """
-    scene = plan.lab.scene
+    scene = plan.scene
     needed = least_lights(scene)
     # 1. More lights where there are some would not help.
     explained = (cap_too_small, dark_corners, bright_background, black_level)
@@ -199,8 +197,8 @@ def few_lights(plan: Plan) -> str:
     if (on_chip[counts < needed] >= needed).mean() > MIN_DETECTED:
         return ""
     # 4. Recommendation.
-    if isinstance(scene.light, DomeConfig):
-        key, change = denser(scene.light.layout, float(on_chip.mean()))
+    if scene.dome:
+        key, change = denser(scene.dome.layout, float(on_chip.mean()))
         return f"{key}: {text}; {change}"
     fainter = scene.tracker.limit_mag + 1
     sky_mag = getattr(scene.light, "limit_mag", None)
@@ -212,7 +210,7 @@ def few_lights(plan: Plan) -> str:
 def hidden_lights(plan: Plan) -> str:
     """Warn if something hides so many lights at a frame that the tracker has too few."""
     frames = plan.frames
-    scene = plan.lab.scene
+    scene = plan.scene
     counts = frames.counts()
     hidden = frames.hidden_counts()
     few = (counts < least_lights(scene)) & (counts + hidden >= least_lights(scene))
@@ -253,7 +251,7 @@ def denser(layout: Layout, mean: float) -> tuple[str, str]:
 
 def undetected(plan: Plan) -> str:
     """Warn if most lights on the detector are too faint or too small to be detected."""
-    scene = plan.lab.scene
+    scene = plan.scene
     settings = plan.settings
     # The tracker takes at most max_blobs of a frame.
     seen = sum(min(len(view), settings.max_blobs) for view in plan.frames.seen)
@@ -296,7 +294,7 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
 def not_where_expected(plan: Plan) -> str:
     """Warn if errors that are unknown to the tracker displace images beyond its matching radius."""
     frames = plan.frames
-    scene = plan.lab.scene
+    scene = plan.scene
     cam_from_body = plan.lab.camera.mount.cam_from_body
     found = [
         one
@@ -320,7 +318,8 @@ def not_where_expected(plan: Plan) -> str:
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
     text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
-    return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
+    key, change = ADVICE[cause]
+    return f"{key}: {text}; {change(scene, excess)}"
 
 
 def map_of_other_hardware(plan: Plan) -> str:
@@ -331,51 +330,55 @@ def map_of_other_hardware(plan: Plan) -> str:
     )
 
 
-MISMATCH_KEYS = {
-    "focal length": "tracker.assumed_focal_length",
-    "distortion": "tracker.assumed_distortion",
-    "assumed lever": "tracker.assumed_camera_body",
-    "rolling shutter": "tracker.assumed_row_time",
-    "survey set-up": "tracker.survey.instrument",
-    "surface survey": "light.surface.error",
-    "common survey": "tracker.map",
-    "other map": "tracker.map",
-}
-# The recommended change, as a function of the scene and of the ratio of the displacement to the allowed one.
-CHANGES: dict[str, Callable[[Any, float], str]] = {
-    "focal length": lambda scene, excess: (
-        f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
+# By cause: the key, and the change as a function of the scene and of the ratio of the displacement to the
+# allowed one.
+ADVICE: dict[str, tuple[str, Callable[[Any, float], str]]] = {
+    "focal length": (
+        "tracker.assumed_focal_length",
+        lambda scene, excess: (
+            f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
+        ),
     ),
-    "distortion": lambda scene, excess: (
-        f"change it to {list(scene.camera.distortion)}, the lens's"
+    "distortion": (
+        "tracker.assumed_distortion",
+        lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
     ),
-    "assumed lever": lambda scene, excess: (
-        "leave it out, or fit the place with tracker.solver: pnp"
+    "assumed lever": (
+        "tracker.assumed_camera_body",
+        lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
     ),
-    "rolling shutter": lambda scene, excess: (
-        "leave it out, so that the tracker corrects the rows for"
-        f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
+    "rolling shutter": (
+        "tracker.assumed_row_time",
+        lambda scene, excess: (
+            "leave it out, so that the tracker corrects the rows for"
+            f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
+        ),
     ),
-    "survey set-up": lambda scene, excess: (
-        f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+    "survey set-up": (
+        "tracker.survey.instrument",
+        lambda scene, excess: (
+            f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+        ),
     ),
-    "surface survey": lambda scene, excess: (
-        f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
+    "surface survey": (
+        "light.surface.error",
+        lambda scene, excess: (
+            f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
+        ),
     ),
-    "common survey": lambda scene, excess: "survey the dome with more frames",
-    "other map": lambda scene, excess: "survey the dome again",
+    "common survey": (
+        "tracker.map",
+        lambda scene, excess: "survey the dome with more frames",
+    ),
+    "other map": ("tracker.map", lambda scene, excess: "survey the dome again"),
 }
 
 
 def cap_too_small(plan: Plan) -> str:
     """Warn if the field reaches beyond the LEDs at the greatest tilt."""
     found = cap_margin(plan)
-    light = plan.lab.scene.light
-    if (
-        found is None
-        or not isinstance(light, DomeConfig)
-        or found.needed_deg <= found.cap_deg
-    ):
+    light = plan.scene.dome
+    if found is None or light is None or found.needed_deg <= found.cap_deg:
         return ""
     # No key changes the positions of listed LEDs.
     if getattr(light.layout, "points", light.layout).kind == "listed":
@@ -425,7 +428,7 @@ def out_of_focus(plan: Plan) -> str:
 def long_smear(plan: Plan) -> str:
     """Warn if images move by more than MAX_SMEAR_PX and MAX_SMEAR_WIDTHS of their own width."""
     frames = plan.frames
-    scene = plan.lab.scene
+    scene = plan.scene
     length_px = frames.joined("streak_length_px")
     sigma = frames.joined("sigma_px")
     if not len(length_px):
@@ -449,7 +452,7 @@ def long_smear(plan: Plan) -> str:
 
 def uneven_motion(plan: Plan) -> str:
     """Warn if jitter moves the images unevenly within an exposure, which the expected errors leave out."""
-    scene = plan.lab.scene
+    scene = plan.scene
     t_s = plan.frames.attitudes.t_s
     moved_px = uneven_px(plan, t_s, scene.exposure.time_s)
     if moved_px <= MAX_UNEVEN_PX:
@@ -466,7 +469,7 @@ def uneven_motion(plan: Plan) -> str:
 
 def unknown_tag_error(plan: Plan) -> str:
     """Warn if time tags have larger errors than the filter assumes, and the vehicle rotates in that time."""
-    scene = plan.lab.scene
+    scene = plan.scene
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
         return ""
@@ -483,7 +486,7 @@ def unknown_tag_error(plan: Plan) -> str:
 
 def thermal_drift(plan: Plan) -> str:
     """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
-    thermal_config = plan.lab.scene.thermal
+    thermal_config = plan.scene.thermal
     frames = plan.frames
     if thermal_config is None:
         return ""
@@ -509,7 +512,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
 
     It is sum K_i (drifted - surveyed image position); NaN with too few lights.
     """
-    config = context.lab.scene.thermal
+    config = context.scene.thermal
     assert config is not None
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)

@@ -20,7 +20,6 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import context_of
@@ -110,9 +109,9 @@ def check(
     facts = [fact for fact in built if fact is not None]
     findings = warnings_of(plan, drawn)
     alike = dome_warnings.of(plan)
-    if alike is not None and isinstance(scene.light, DomeConfig):
+    if alike is not None and scene.dome:
         facts.insert(2, dome_warnings.fact(alike))
-        warning = dome_warnings.finding(alike, scene.light)
+        warning = dome_warnings.finding(alike, scene.dome)
         findings += [warning] if warning else []
     findings += [*broken_assumptions(lab), *filter(None, [shortfall(lab)])]
     # 4. Heads.
@@ -162,10 +161,10 @@ def plan_of(lab: Lab, frames: CheckedAttitudes, tilt_deg: float | None = None) -
 def broken_assumptions(lab: Lab) -> list[str]:
     """Warnings that the scene breaks an assumption of its tracker, or of the WCS of its frames."""
     scene = lab.scene
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         warning = wcs.accuracy_warning(scene.camera.calibration())
         return [warning] if warning else []
-    if not isinstance(scene.light, DomeConfig):
+    if not scene.dome:
         return []
     return dome_warnings.warnings(scene, lab.camera.sources, lab.camera.mount)
 
@@ -231,11 +230,7 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
     # The mount of a head points it elsewhere, not the start of the motion.
-    lines = [
+    lines = (
         line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main
-    ]
-    return [
-        f"heads.{n}.{line}"
-        for line in lines
-        if line.startswith(OWN_KEYS) and line not in main
-    ]
+    )
+    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS)]

@@ -12,14 +12,12 @@ from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
     STILL_PX,
     Context,
     centroid_variance,
-    full_scale_e,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
@@ -140,7 +138,7 @@ def peak_fill(context: Context, body: BodyLight) -> float:
     A partly lit body counts as a full disk of the lit area.
     """
     camera = context.camera
-    scene = context.lab.scene
+    scene = context.scene
     lit = (1 + math.cos(body.place.phase_rad)) / 2
     radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
     lens2_px2 = np.array([camera.lens_px**2])
@@ -148,7 +146,7 @@ def peak_fill(context: Context, body: BodyLight) -> float:
     none = np.zeros(1)
     electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
     share = float(peak_share(lens2_px2, radius, none, none)[0])
-    return electrons * share / full_scale_e(scene.camera.detector)
+    return electrons * share / context.full_e
 
 
 # Claimed errors: the expected normalized estimation error squared (NEES) under the stars.
@@ -194,7 +192,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
 
 def claimed(plan: Plan) -> float:
     """The expected NEES over the whole sky with the tracker's least centroid error; NaN under other lights."""
-    if not isinstance(plan.lab.scene.light, StarsConfig):
+    if not plan.scene.stars:
         return math.nan
     return expected_nees(plan.reach, plan, plan.settings.centroid_sigma_px)
 
@@ -256,10 +254,9 @@ def stray_light(plan: Plan) -> Iterator[str]:
         return
     allowed_e = own_e2 * (10 ** (MAX_LOSS_MAG / 1.25) - 1)
     source = max(by_frame[n], key=lambda name: by_frame[n][name])
-    full_e = full_scale_e(lab.scene.camera.detector)
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
-        f" {source}, of {full_e:.0f} at saturation,"
+        f" {source}, of {plan.full_e:.0f} at saturation,"
         f" at {attitudes.describe(at, n, lab)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
@@ -313,9 +310,9 @@ SNR = 5.0
 
 def faintest_star(plan: Plan) -> Fact | None:
     """V of the faintest star that the tracker detects, and of a star with the signal-to-noise ratio SNR."""
-    scene = plan.lab.scene
+    scene = plan.scene
     believed = plan.beliefs
-    if not isinstance(scene.light, StarsConfig):
+    if not scene.stars:
         return None
     rate_deg_s = float(np.degrees(plan.frames.attitudes.speed_rad_s).min())
     limit_mag = detection_limit_mag(plan)
@@ -346,17 +343,17 @@ def known_share(context: Context, limit_mag: float) -> float:
 
 def sky_too_shallow(plan: Plan) -> str:
     """Warn if the camera detects fainter stars than the simulated sky has."""
-    light = plan.lab.scene.light
+    stars = plan.scene.stars
     sky = plan.lab.camera.sources.magnitude
-    if not isinstance(light, StarsConfig) or not len(sky):
+    if not stars or not len(sky):
         return ""
     limit_mag = detection_limit_mag(plan)
     faintest_mag = float(np.nanmax(sky))
     text = f"the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f}; change it to"
-    if light.limit_mag is not None:
+    if stars.limit_mag is not None:
         # `few_lights` may recommend a fainter limit already.
         said = few_lights(plan).startswith("light.limit_mag")
-        if said or limit_mag <= light.limit_mag + LIMIT_MARGIN_MAG:
+        if said or limit_mag <= stars.limit_mag + LIMIT_MARGIN_MAG:
             return ""
         return f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
     if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
@@ -367,7 +364,7 @@ def sky_too_shallow(plan: Plan) -> str:
 
 def tracker_too_shallow(plan: Plan) -> str:
     """Warn if most stars that the tracker detects are fainter than those that it knows."""
-    if not isinstance(plan.lab.scene.light, StarsConfig):
+    if not plan.scene.stars:
         return ""
     limit_mag = detection_limit_mag(plan)
     faintest_mag = plan.beliefs.faintest_mag
@@ -383,13 +380,10 @@ def tracker_too_shallow(plan: Plan) -> str:
 
 def beyond_catalog(plan: Plan) -> str:
     """Warn if the tracker's limit is beyond its catalog, which has no stars to add."""
-    scene = plan.lab.scene
+    scene = plan.scene
     faintest_mag = plan.beliefs.faintest_mag
     limit_mag = scene.tracker.limit_mag
-    if (
-        not isinstance(scene.light, StarsConfig)
-        or limit_mag <= faintest_mag + CATALOG_MARGIN_MAG
-    ):
+    if not scene.stars or limit_mag <= faintest_mag + CATALOG_MARGIN_MAG:
         return ""
     return (
         f"tracker.limit_mag: V {limit_mag:g}, but tracker.catalog ends at V {faintest_mag:.1f}; change it to"

@@ -62,34 +62,33 @@ def actuators(plan: Plan) -> Fact | None:
     """The actuators that are switched on: names, axes in body axes, limits, and greatest momentum."""
     vehicle = plan.lab.vehicle
     config = vehicle.config
-    momentum: Floats | None
     rows: list[tuple[str, str, Any, Floats | None]] = []
-    if config.wheels is not None:
-        momentum = vehicle.wheels.inertia_kg_m2 * config.wheels.speed_limit_rpm * RPM_RAD_S
-        limit = f"{short(config.wheels.torque_limit_nm)} N m"
-        rows.append(("wheels", limit, vehicle.wheels, momentum))
-    if config.cmgs is not None:
-        momentum = vehicle.rotors.inertia_kg_m2 * config.cmgs.rotor_rpm * RPM_RAD_S
-        limit = f"{short(config.cmgs.gimbal_rate_limit_deg_s)} deg/s"
-        rows.append(("cmgs", limit, vehicle.gimbals, momentum))
-    if config.fans is not None:
-        rows.append(("fans", f"{short(config.fans.thrust_limit_n)} N", vehicle.fans, None))
-    if config.trim is not None:
-        rows.append(("trim", f"{short(1e3 * config.trim.travel_m)} mm", vehicle.trims, None))
+    if wheels := config.wheels:
+        spun = vehicle.wheels.inertia_kg_m2 * wheels.speed_limit_rpm
+        rows.append(("wheels", f"{short(wheels.torque_limit_nm)} N m", vehicle.wheels, spun))
+    if cmgs := config.cmgs:
+        spun = vehicle.rotors.inertia_kg_m2 * cmgs.rotor_rpm
+        limit = f"{short(cmgs.gimbal_rate_limit_deg_s)} deg/s"
+        rows.append(("cmgs", limit, vehicle.gimbals, spun))
+    if fans := config.fans:
+        rows.append(("fans", f"{short(fans.thrust_limit_n)} N", vehicle.fans, None))
+    if trim := config.trim:
+        rows.append(("trim", f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
     lines = []
     values: dict[str, Any] = {}
-    for key, limit, members, momentum in rows:
-        parts = []
-        for n, name in enumerate(members.names):
-            axis = f"({numbers(members.axes[:, n], 3)})"
-            stored = (
-                f"about {axis}, {short(momentum[n])} N m s" if momentum is not None else ""
-            )
-            parts.append(f"{name} {stored or f'along {axis}'}")
-        lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
+    for key, limit, members, spun_rpm in rows:
         values[key] = {"names": list(members.names), "axes": members.axes.T.tolist()}
-        values[key] |= {} if momentum is None else {"momentum_nms": momentum.tolist()}
-    control = plan.lab.scene.motion.control
+        texts = [f"along ({numbers(axis, 3)})" for axis in members.axes.T]
+        if spun_rpm is not None:
+            momentum_nms = (spun_rpm * RPM_RAD_S).tolist()
+            values[key]["momentum_nms"] = momentum_nms
+            texts = [
+                f"about ({numbers(axis, 3)}), {short(one)} N m s"
+                for axis, one in zip(members.axes.T, momentum_nms, strict=True)
+            ]
+        parts = map(" ".join, zip(members.names, texts, strict=True))
+        lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
+    control = plan.scene.motion.control
     if control is not None and control.actuators == "ideal":
         lines.append(f"ideal torques to {short(config.torque_limit_nm)} N m about each axis")
         values["ideal"] = {"torque_limit_nm": config.torque_limit_nm}
@@ -125,7 +124,7 @@ def maneuver(plan: Plan) -> Fact | None:
 
 def inherited_vehicle(plan: Plan) -> str:
     """Warn if keys about the vehicle's body are those of a base scene with another vehicle."""
-    inherited = ", ".join(plan.lab.scene.inherited)
+    inherited = ", ".join(plan.scene.inherited)
     if not inherited:
         return ""
     return f"vehicle.model: not that of the base, whose {inherited} the vehicle keeps; give its own"
