@@ -92,12 +92,9 @@ class Recorder:
         plan: Check,
         pictures: Sequence[Path] = (),
     ) -> tuple[dict[str, Any], Report]:
-        """Write tables, annotated image and report. Returns the report, and before it what `skysim run --json` prints.
+        """Write tables, annotated image and report, with pictures of the laboratory.
 
-        Parameters
-        ----------
-        pictures
-            Image files of the laboratory
+        Returns the report, and before it what `skysim run --json` prints.
         """
         scene = self.camera.scene
         names = scoring.angle_names(scene)
@@ -107,7 +104,6 @@ class Recorder:
             write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(imu_samples))
         assert self.shown is not None
         annotated = self.shown.annotated()
-        page = self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
         stages_ms = {
             stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
@@ -135,7 +131,7 @@ class Recorder:
             findings=plan.findings,
             judged=judged,
         )
-        report.save(page)
+        page = report.save(self.folder / "report.html")
         statistics = run_report.summary(self.rows) | {
             "stages_ms": stages_ms,
             **({"computer_ms": on_computer(computer, stages_ms)} if computer else {}),

@@ -61,8 +61,6 @@ def render_frame(
 
     Parameters
     ----------
-    camera
-        Star camera
     trajectory
         Motion of the vehicle during the exposure
     index

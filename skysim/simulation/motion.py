@@ -80,11 +80,10 @@ def check_reference(
             used = usage(actuators[motion.control.actuators], torque_nm)
             k = int(used.argmax())
             if used[k] > 1 + ROUNDING:
-                torque = ", ".join(f"{one:.3g}" for one in significant(torque_nm[k], 3))
                 raise InputError(
                     key,
-                    f"needs a torque of ({torque}) N m at {begin_s + t_s[k]:.6g} s, {used[k]:.3g} times what the"
-                    f" actuators {motion.control.actuators} can give",
+                    f"needs a torque of ({components(torque_nm[k], 3)}) N m at {begin_s + t_s[k]:.6g} s,"
+                    f" {used[k]:.3g} times what the actuators {motion.control.actuators} can give",
                     "slower or smaller, or motion.control: prescribed",
                 )
 
@@ -124,6 +123,11 @@ def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]
     t_s = np.arange(0.0, leg.duration_s, period_s)
     _, rates, accelerations = zip(*(leg.state_at(float(t)) for t in t_s), strict=True)
     return t_s, np.array(rates), np.array(accelerations)
+
+
+def components(vector: Floats, digits: int) -> str:
+    """A vector with commas; 0 for components below the last digit of the largest one."""
+    return ", ".join(f"{one:.{digits}g}" for one in significant(vector, digits))
 
 
 def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig) -> None:
@@ -206,14 +210,11 @@ def shortfall(lab: Lab) -> str:
         return ""
     # Later the actuators give more than is needed: what they owe.
     n = int(((needed - given) * needed).sum(axis=1).argmax())
-    wanted, possible = (
-        ", ".join(f"{component:.2g}" for component in significant(torque[n], 2))
-        for torque in (needed, given)
-    )
     text = flown_saturation(lab)
     return (
-        f"motion.maneuver: needs a torque of ({wanted}) N m at {t_s[n]:.1f} s, of which the actuators"
-        f" {control.actuators} give ({possible}){text and ': '}{text}; change it to a slower or smaller one, balance"
+        f"motion.maneuver: needs a torque of ({components(needed[n], 2)}) N m at {t_s[n]:.1f} s, of which the"
+        f" actuators {control.actuators} give ({components(given[n], 2)})"
+        f"{text and ': '}{text}; change it to a slower or smaller one, balance"
         " the vehicle, or take stronger actuators"
     )
 

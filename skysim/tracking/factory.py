@@ -107,8 +107,10 @@ def assumed_settings(scene: Scene) -> Settings:
 
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
     """The algorithms that a scene's tracker may use: by stage, then by name."""
-    near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
-    return {**STAR_ALGORITHMS, **near} if scene.dome else STAR_ALGORITHMS
+    near: dict[str, Mapping[str, object]] = {}
+    if scene.dome:
+        near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
+    return STAR_ALGORITHMS | near
 
 
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:

@@ -71,10 +71,6 @@ def mjcf(
 
     Parameters
     ----------
-    vehicle
-        Vehicle of the scene
-    scene
-        The scene
     sources
         LEDs in lab coordinates (m), or stars; the brightest stars are put on a sphere
     lab_from_body
