@@ -14,10 +14,11 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import asdict, dataclass, field
+from typing import Any, Self
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, printable
 from skysim.core.plugins import (
@@ -34,10 +35,6 @@ from skysim.core.plugins import (
 from skysim.core.types import Floats
 from skysim.dynamics.guidance import Reference
 from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED, ControlConfig
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
-
 
 # The interface.
 
@@ -132,16 +129,17 @@ class ControllerInput:
     @property
     def lab_from_body(self) -> Rotation:
         """The measured attitude."""
-        return _rotation(self.lab_from_body_xyzw)
+        return Rotation.from_quat(self.lab_from_body_xyzw)
 
     @property
     def lab_from_ref(self) -> Rotation:
         """The commanded attitude."""
-        return _rotation(self.lab_from_ref_xyzw)
+        return Rotation.from_quat(self.lab_from_ref_xyzw)
 
     def as_tree(self) -> dict[str, Any]:
         """The input as a JSON object; arrays become lists."""
-        return {item.name: to_lists(getattr(self, item.name)) for item in fields(self)}
+        tree: dict[str, Any] = to_lists(asdict(self))
+        return tree
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
@@ -190,12 +188,6 @@ def torque_of_reply(reply: Any, tick: int, authority_nm: float) -> Floats:
     if unknown:
         raise ValueError(f"unknown key {unknown[0][:80]!r}; allowed: tick, torque_nm, status")
     return check_torque(reply.get("torque_nm"), authority_nm)
-
-
-def _rotation(a_from_b_xyzw: Floats) -> Rotation:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(a_from_b_xyzw)
 
 
 # The control law that calls an external controller.

@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -26,11 +25,11 @@ from skysim.dynamics.controllers import (
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
-from skysim.dynamics.multibody.actuators import IdealTorque, build_actuators
+from skysim.dynamics.multibody.actuators import build_actuators
 from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS
 
 # Return rate of the controller over the gyros' rate limit (`assumed`)
 GYRO_RATE_FRACTION = 0.7
@@ -51,20 +50,6 @@ def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
     return np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit
 
 
-def ideal_torque(vehicle: VehicleModel) -> IdealTorque:
-    """The ideal actuator of a vehicle, which applies torques about the body's axes."""
-    return IdealTorque(vehicle.torques, vehicle.config.torque_limit_nm)
-
-
-def controlling_actuator(
-    config: ControlConfig, actuator_sets: Mapping[str, Actuators], vehicle: VehicleModel
-) -> Actuators:
-    """The actuators that receive the controller's torque."""
-    if config.actuators == "ideal":
-        return ideal_torque(vehicle)
-    return actuator_sets[config.actuators]
-
-
 class FlightComputer:
     """Attitude control with one set of actuators, and momentum dumping with the fans. Stateful: one object per motion.
 
@@ -75,7 +60,7 @@ class FlightComputer:
     period_s
         Control period
     actuator_sets
-        All actuators that are switched on, by their key in `vehicle`
+        All actuators that are switched on, by their key in `vehicle`, and `ideal`
     actuator
         Actuators that receive the control torque
     nu
@@ -106,11 +91,11 @@ class FlightComputer:
         self.names: list[str] = []
         self.loads = np.empty(0)
         self.momentum_dump: MomentumDump | None = None
-        self.actuator: Actuators = ideal_torque(vehicle)
+        self.actuator = self.actuator_sets["ideal"]
         if self.config is None:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
-        self.actuator = controlling_actuator(self.config, self.actuator_sets, vehicle)
+        self.actuator = self.actuator_sets[self.config.actuators]
         motors = {
             "wheels": vehicle.wheels.motor,
             "cmgs": vehicle.gimbals.motor,
@@ -169,14 +154,6 @@ class FlightComputer:
             stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
         return stored
 
-    def relative_loads(self, control: Floats, inputs: ControlInput) -> Floats:
-        """(n,) commands of the motors over their limits; of wheels the speeds over theirs, if these are closer."""
-        loads = np.abs(control[self.motors]) / self.limit
-        if isinstance(self.actuator, WheelActuator):
-            speeds = inputs.speeds_rad_s[self.actuator.joints.dof]
-            loads = np.maximum(loads, np.abs(speeds) / self.actuator.model.speed_limit_rad_s)
-        return np.asarray(loads)
-
     def compute_controls(
         self,
         inputs: ControlInput,
@@ -216,7 +193,13 @@ class FlightComputer:
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         self.achieved_nm = achieved_nm + dump_nm
         if self.names:
-            self.loads = self.relative_loads(control, inputs)
+            self.loads = np.abs(control[self.motors]) / self.limit
+            if isinstance(self.actuator, WheelActuator):
+                # The speed of a wheel counts if it is closer to its limit.
+                speeds = np.abs(inputs.speeds_rad_s[self.actuator.joints.dof])
+                self.loads = np.maximum(
+                    self.loads, speeds / self.actuator.model.speed_limit_rad_s
+                )
         # 4. Anti-windup.
         if torque_nm is None:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

@@ -1,4 +1,4 @@
-"""Guidance: the reference attitude over time from a scene's list of maneuvers, and its impulses and vibration.
+"""Guidance: the reference attitude over time from a scene's list of maneuvers, and its impulses.
 
 `plan` makes the reference in three steps:
 
@@ -44,7 +44,6 @@ from skysim.scene.sections.motion import (
     AttitudeConfig,
     BumpConfig,
     ChirpConfig,
-    JitterPart,
     MotionConfig,
     PointingConfig,
     ProfileConfig,
@@ -509,7 +508,7 @@ def plan(
     return Reference((*legs, final_leg), tuple(start_times_s))
 
 
-# Impulses and vibration of the list.
+# Impulses of the list.
 
 
 @dataclass(frozen=True, slots=True)
@@ -546,15 +545,3 @@ def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
                     Impulse(begin_s + bump.caught_after_s, bump.duration_s, -rate_rad_s)
                 )
     return tuple(result)
-
-
-def vibration_intervals(
-    motion: MotionConfig, reference: Reference
-) -> tuple[tuple[float, float, tuple[JitterPart, ...]], ...]:
-    """(begin_s, end_s, parts of the spectrum) of each vibration in order of time."""
-    start_times = zip(reference.start_s, motion.maneuver, strict=False)
-    return tuple(
-        (begin_s, begin_s + element.duration_s, element.components)
-        for begin_s, element in start_times
-        if element.kind == "jitter"
-    )

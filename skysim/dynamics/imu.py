@@ -307,7 +307,7 @@ class Triad:
         # A step of the Gauss-Markov process: decay exp(-h / tau), innovation sd sqrt(1 - exp(-2 h / tau)).
         decay = math.exp(-step_s / self.markov_time_s)
         innovation = self.markov_sd * math.sqrt(-math.expm1(-2 * step_s / self.markov_time_s))
-        counted, limited = corrupt(
+        return corrupt(
             ideal,
             self.matrix,
             self.turn_on_bias,
@@ -323,7 +323,6 @@ class Triad:
                 self.quantum,
             ),
         )
-        return counted, limited
 
 
 @jit
@@ -381,8 +380,12 @@ def corrupt(
     return counted, limited
 
 
-def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
-    """The gyro triad from standard normal draws.
+def build_triad(
+    config: GyroConfig | AccelerometerConfig, hardware: Floats, start: Floats
+) -> Triad:
+    """The gyros or the accelerometers from standard normal draws.
+
+    The square of an accelerometer's noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.
 
     Parameters
     ----------
@@ -391,37 +394,22 @@ def gyro_triad(config: GyroConfig, hardware: Floats, start: Floats) -> Triad:
     start
         (3,) draws of the initial Gauss-Markov bias
     """
-    return Triad(
-        matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
-        turn_on_bias=DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0]),
-        markov_bias=config.bias_deg_h * DEG_H_RAD_S * start,
-        markov_sd=config.bias_deg_h * DEG_H_RAD_S,
-        markov_time_s=config.bias_time_s,
-        white=math.radians(config.arw_deg_sqrt_h) / 60,
-        limit=math.radians(config.rate_limit_deg_s),
-        quantum=math.radians(config.quantum_arcsec / 3600),
-    )
-
-
-def accelerometer_triad(
-    config: AccelerometerConfig, hardware: Floats, start: Floats
-) -> Triad:
-    """The accelerometer triad, as `gyro_triad`.
-
-    The square of the noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.
-    """
-    # One micro-g in m/s2.
-    ug = PPM * STANDARD_GRAVITY_M_S2
-    return Triad(
-        matrix=response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:]),
-        turn_on_bias=ug * scaled_errors(config.turn_on_bias_ug, hardware[0]),
-        markov_bias=config.bias_ug * ug * start,
-        markov_sd=config.bias_ug * ug,
-        markov_time_s=config.bias_time_s,
-        white=config.vrw_ug_sqrt_hz * ug,
-        limit=config.limit_g * STANDARD_GRAVITY_M_S2,
-        quantum=1e-6 * config.quantum_um_s,
-    )
+    if isinstance(config, GyroConfig):
+        turn_on = DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0])
+        bias = config.bias_deg_h * DEG_H_RAD_S
+        white = math.radians(config.arw_deg_sqrt_h) / 60
+        limit = math.radians(config.rate_limit_deg_s)
+        quantum = math.radians(config.quantum_arcsec / 3600)
+    else:
+        ug = PPM * STANDARD_GRAVITY_M_S2  # a micro-g in m/s2
+        turn_on = ug * scaled_errors(config.turn_on_bias_ug, hardware[0])
+        bias = config.bias_ug * ug
+        white = config.vrw_ug_sqrt_hz * ug
+        limit = config.limit_g * STANDARD_GRAVITY_M_S2
+        quantum = 1e-6 * config.quantum_um_s
+    matrix = response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:])
+    time_s = config.bias_time_s
+    return Triad(matrix, turn_on, bias * start, bias, time_s, white, limit, quantum)
 
 
 def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
@@ -458,8 +446,8 @@ class Imu:
         hardware = random_stream(config.hardware_seed).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
         return cls(
-            gyro_triad(config.gyro, hardware[0], start[0]),
-            accelerometer_triad(config.accelerometer, hardware[1], start[1]),
+            build_triad(config.gyro, hardware[0], start[0]),
+            build_triad(config.accelerometer, hardware[1], start[1]),
             rng,
         )
 

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Bools, Floats, Ints, Trajectory
-from skysim.dynamics.guidance import Reference, plan, vibration_intervals
+from skysim.dynamics.guidance import Reference, plan
 from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
     JitterBandConfig,
@@ -192,12 +192,14 @@ class Vibration:
             Reference of the maneuvers; by default it is planned here, which is not possible with a profile
         """
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
-        for begin_s, end_s, configs in vibration_intervals(motion, reference or plan(motion)):
-            components.append(
-                draw_component(
-                    configs, rng, f"motion.maneuver jitter at {begin_s:g} s", begin_s, end_s
+        starts_s = (reference or plan(motion)).start_s
+        for begin_s, element in zip(starts_s, motion.maneuver, strict=False):
+            if element.kind == "jitter":
+                name = f"motion.maneuver jitter at {begin_s:g} s"
+                end_s = begin_s + element.duration_s
+                components.append(
+                    draw_component(element.components, rng, name, begin_s, end_s)
                 )
-            )
         return cls(tuple(component for component in components if component))
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:

@@ -24,7 +24,6 @@ from skysim.dynamics.profile_samples import Samples, check_samples
 from skysim.dynamics.reference_curves import AttitudeSpline, fit_spline
 from skysim.dynamics.two_axis import on_gimbals
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import ProfileConfig
 
 TABLE = "profile"  # source of a table given in Python
@@ -111,7 +110,7 @@ def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
     """
     if samples.a in ("body", "cam"):
         samples = samples.inverted()
-    sky = isinstance(scene.light, StarsConfig)
+    sky = scene.stars
     allowed = ("icrs_from_body", "icrs_from_cam") if sky else ("lab_from_body",)
     if samples.direction not in allowed:
         raise InputError(

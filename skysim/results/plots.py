@@ -207,21 +207,10 @@ DETECTED_BGR = (80, 80, 235)
 MATCHED_BGR = (110, 220, 90)
 
 
-def frame_levels(image: NDArray) -> tuple[float, float]:
-    """Black and white levels in DN: the 30th percentile (the sky), and the 99.95th percentile or a quarter of the peak.
-
-    The higher of the two, so that a few bright sources do not leave a large part of the image white.
-    """
-    low, high = np.percentile(image, (30, 99.95)).tolist()
-    return low, max(high, low + 1.0, float(image.max()) * 0.25)
-
-
 def enlarged(image: NDArray) -> tuple[Picture, int, int]:
     """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
     scale = 2 if max(image.shape) < 1000 else 1
-    picture = cv2.cvtColor(
-        to_8bit(image, "square root", levels_dn=frame_levels(image)), cv2.COLOR_GRAY2BGR
-    )
+    picture = cv2.cvtColor(to_8bit(image, "square root"), cv2.COLOR_GRAY2BGR)
     picture = np.asarray(
         cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST),
         np.uint8,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -92,12 +92,9 @@ class Recorder:
         plan: Check,
         pictures: Sequence[Path] = (),
     ) -> tuple[dict[str, Any], Report]:
-        """Write tables, annotated image and report. Returns the report, and before it what `skysim run --json` prints.
+        """Write tables, annotated image and report, with pictures of the laboratory.
 
-        Parameters
-        ----------
-        pictures
-            Image files of the laboratory
+        Returns the report, and before it what `skysim run --json` prints.
         """
         scene = self.camera.scene
         names = scoring.angle_names(scene)
@@ -107,17 +104,13 @@ class Recorder:
             write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(imu_samples))
         assert self.shown is not None
         annotated = self.shown.annotated()
-        page = self.folder / "report.html"
         write_image(self.folder / "annotated.png", annotated)
         stages_ms = {
             stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
         }
         computer = scene.tracker.computer
-        flight = (
-            telemetry_report.figure(log)
-            if len(self.rows) > 1 or log.t_s[-1] > SHORT_S
-            else b""
-        )
+        has_plot = len(self.rows) > 1 or log.t_s[-1] > SHORT_S
+        flight = telemetry_report.figure(log) if has_plot else b""
         facts = [(name, [text]) for name, text in scene.summary] + [
             (fact.name, fact.lines) for fact in plan.facts
         ]
@@ -132,15 +125,13 @@ class Recorder:
             stages_ms=stages_ms,
             computer=computer_text(computer, stages_ms) if computer else "",
             annotated=annotated,
-            motion=motion,
-            motion_figure=flight,
-            motion_findings=flown,
+            motion=run_report.motion_section(motion, flown, flight),
             views=pictures,
             facts=facts,
             findings=plan.findings,
             judged=judged,
         )
-        report.save(page)
+        page = report.save(self.folder / "report.html")
         statistics = run_report.summary(self.rows) | {
             "stages_ms": stages_ms,
             **({"computer_ms": on_computer(computer, stages_ms)} if computer else {}),
@@ -242,12 +233,11 @@ def run_of(flight: Flight, scores: Sequence[Sequence[Score]]) -> Run:
     telemetry = flight.telemetry()
     imu_samples = flight.imu_samples()
     given = flight.parts.given
-    heads = {
-        camera.name: Run(flight.lab, camera, tuple(own), telemetry, imu_samples, {}, given)
-        for camera, own in zip(flight.lab.cameras[1:], scores[1:], strict=True)
-    }
-    own = tuple(scores[0])
-    return Run(flight.lab, flight.lab.camera, own, telemetry, imu_samples, heads, given)
+    main, *heads = (
+        Run(flight.lab, camera, tuple(own), telemetry, imu_samples, given=given)
+        for camera, own in zip(flight.lab.cameras, scores, strict=True)
+    )
+    return replace(main, heads={head.camera.name: head for head in heads})
 
 
 class FlightRecorder:
@@ -292,14 +282,9 @@ class FlightRecorder:
         """
         main = run_of(self.flight, [() for _ in self.recorders])
         pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
-        finished = []
-        for run, recorder in zip(
-            (main, *main.heads.values()), self.recorders.values(), strict=True
-        ):
-            is_main = run is main
-            own_plan = plan if is_main else run.check()
-            shown = pictures if is_main else ()
-            finished.append(
-                recorder.finish(command, run.telemetry, run.imu_samples, own_plan, shown)
-            )
+        motion = main.telemetry, main.imu_samples
+        first, *others = self.recorders.values()
+        finished = [first.finish(command, *motion, plan, pictures)]
+        for run, recorder in zip(main.heads.values(), others, strict=True):
+            finished.append(recorder.finish(command, *motion, run.check()))
         return finished

@@ -61,17 +61,13 @@ def run_report(
     stages_ms: Mapping[str, float],
     computer: str = "",
     annotated: Picture,
-    motion: Mapping[str, float],
-    motion_figure: bytes,
-    motion_findings: Sequence[str] = (),
+    motion: Section,
     views: Sequence[Path],
     facts: Sequence[tuple[str, Sequence[str]]],
     findings: Sequence[str],
     judged: Sequence[Judgment] = (),
 ) -> Report:
-    """The report of a run.
-
-    A single frame has no plot against time.
+    """The report of a run. A single frame has no plot against time.
 
     Parameters
     ----------
@@ -84,11 +80,7 @@ def run_report(
     annotated
         The last solved frame with its markers, BGR
     motion
-        Statistics of the telemetry
-    motion_figure
-        Its plot, PNG, or empty
-    motion_findings
-        Warnings after the flight
+        Section of `motion_section`
     views
         Image files of the laboratory in 3-D
     facts, findings
@@ -101,7 +93,6 @@ def run_report(
         Figure(path.read_bytes(), "the laboratory in 3-D", path.suffix[1:]) for path in views
     ]
     errors = [Figure(error_figure(rows), ERROR_CAPTION)] if len(rows) > 1 else []
-    moved = [Figure(motion_figure, MOTION_CAPTION)] if motion_figure else []
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
     last = [Text(f"Median ms a frame: {stages}"), Text(computer), Text(magnitude_text(rows))]
@@ -113,10 +104,7 @@ def run_report(
         Section("The last solved frame", [frame]),
         Section("The laboratory", laboratory),
         Section("Errors", errors),
-        Section(
-            "Motion",
-            [*moved, Items(motion_lines(motion)), Items(motion_findings, tone="warning")],
-        ),
+        motion,
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
         Section(
@@ -276,14 +264,22 @@ def refusals(rows: Sequence[FrameRow], findings: Sequence[str]) -> list[str]:
     return [f"{count} frames: {status}; {advice[status]}" for status, count in counts.items()]
 
 
-def motion_lines(motion: Mapping[str, float]) -> list[str]:
-    """The statistics of a motion in words; those that a scene does not have are skipped."""
+def motion_section(
+    motion: Mapping[str, float], findings: Sequence[str], figure: bytes
+) -> Section:
+    """The statistics of a motion in words, the warnings after the flight, and the plot as PNG, which may be empty.
+
+    Statistics that a scene does not have are skipped.
+    """
     lines = [text.format(**motion) for key, text in MOTION.items() if key in motion]
     mounts = re.findall(r"mounting_(\w+)_arcsec_end", " ".join(motion))
     errors = ", ".join(
         f"{name} {motion[f'mounting_{name}_arcsec_end']:.3g}″" for name in mounts
     )
-    return [*lines, *([f"mounting error at the end: {errors}"] if mounts else [])]
+    if mounts:
+        lines.append(f"mounting error at the end: {errors}")
+    plot = [Figure(figure, MOTION_CAPTION)] if figure else []
+    return Section("Motion", [*plot, Items(lines), Items(findings, tone="warning")])
 
 
 def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
@@ -293,17 +289,15 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
         Column("t", "s", ".3f"),
         Column("exp", "ms", ".5g"),
         Column("rate", "°/s", ".2f"),
-    ]
-    columns += [
-        Column(name, "°", ".5f") for name in (*(f"true {name}" for name in angles), *angles)
-    ]
-    columns += [
+        *(Column(f"true {name}", "°", ".5f") for name in angles),
+        *(Column(name, "°", ".5f") for name in angles),
         Column("cross", "″", ".3f"),
         Column("roll", "″", "+.3f"),
         Column("detected"),
         Column("used"),
+        Column("time", "ms", ".1f"),
+        text_column("status"),
     ]
-    columns += [Column("time", "ms", ".1f"), text_column("status")]
     lines = []
     for row in rows:
         motion = [row.frame, row.t_s, 1e3 * row.exposure_s, row.rate_deg_s, *row.truth_deg]

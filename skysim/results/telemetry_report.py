@@ -42,9 +42,10 @@ def summary(log: Telemetry) -> dict[str, float]:
     Only the entries that the telemetry supports are present: pointing error with a reference attitude, wheel speed
     with wheels, and so on.
     """
-    pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
-    imu = attitude_error_deg(log.lab_from_imu, log.lab_from_body)
-    by_filter = attitude_error_deg(log.lab_from_filter, log.lab_from_body)
+    pointing, imu, by_filter = (
+        attitude_error_deg(one, log.lab_from_body)
+        for one in (log.lab_from_ref, log.lab_from_imu, log.lab_from_filter)
+    )
     statistics: dict[str, Any] = {}
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
@@ -157,16 +158,14 @@ def imu_table(record: Increments) -> Any:
     from astropy.table import Table
 
     columns: dict[str, Any] = {"t_s": record.t_s}
-    columns |= {f"angle_{end}_rad": record.angle_rad[:, n] for n, end in enumerate(AXES)}
-    columns |= {
-        f"velocity_{end}_m_s": record.velocity_m_s[:, n] for n, end in enumerate(AXES)
-    }
+    for n, end in enumerate(AXES):
+        columns[f"angle_{end}_rad"] = record.angle_rad[:, n]
+    for n, end in enumerate(AXES):
+        columns[f"velocity_{end}_m_s"] = record.velocity_m_s[:, n]
     level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
     columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
-    columns |= {
-        "gyro_saturated": record.saturated,
-        "accelerometer_overloaded": record.overloaded,
-    }
+    columns["gyro_saturated"] = record.saturated
+    columns["accelerometer_overloaded"] = record.overloaded
     return Table(columns)
 
 
@@ -230,12 +229,8 @@ def draw_estimate(
 
 
 def bias_panel(log: Telemetry, axes: Any) -> None:
-    assert log.bias_rad_s is not None
-    assert log.assumed_bias_rad_s is not None
-    assert log.sigma_bias_rad_s is not None
-    true = per_hour(log.bias_rad_s)
-    estimate = per_hour(log.assumed_bias_rad_s)
-    sigma = per_hour(log.sigma_bias_rad_s)
+    rates: Any = (log.bias_rad_s, log.assumed_bias_rad_s, log.sigma_bias_rad_s)
+    true, estimate, sigma = map(per_hour, rates)
     draw_estimate(axes, log.t_s, true, estimate, sigma)
     settled = sigma[len(sigma) // 4 :]
     limit = max(np.abs(true).max(), np.abs(estimate).max()) + 3 * settled.max()
@@ -278,9 +273,8 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 
 def momentum_panel(log: Telemetry, axes: Any) -> None:
     axes.plot(log.t_s, log.momentum_nms, label=AXES)
-    axes.plot(
-        log.t_s, np.linalg.norm(log.momentum_nms, axis=1), color="k", lw=1, label="norm"
-    )
+    norm_nms = np.linalg.norm(log.momentum_nms, axis=1)
+    axes.plot(log.t_s, norm_nms, color="k", lw=1, label="norm")
     axes.set_ylabel("stored momentum\n[N m s]")
 
 

@@ -114,12 +114,11 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
     image_dn = random_stream(0).normal(
         0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px)
     )
-    x = np.arange(assumed.width_px)
-    y = np.arange(assumed.height_px)
-    for x_px, y_px in xy_px:
-        along = np.exp(-(((x - x_px) / SPOT_SIGMA_PX) ** 2) / 2)
-        down = np.exp(-(((y - y_px) / SPOT_SIGMA_PX) ** 2) / 2)
-        image_dn += 0.5 * full_dn * np.outer(down, along)
+    down, along = (
+        np.exp(-(((at_px[:, None] - np.arange(size)) / SPOT_SIGMA_PX) ** 2) / 2)
+        for at_px, size in zip(xy_px.T[::-1], image_dn.shape, strict=True)
+    )
+    image_dn += 0.5 * full_dn * down.T @ along
     image = np.clip(image_dn, 0, full_dn).astype(np.uint16)
     return Frame(0, image, when.open_s, when.exposure_s, full_dn)
 

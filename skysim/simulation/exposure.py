@@ -33,9 +33,9 @@ from skysim.camera.glow import background, stray
 from skysim.camera.projection import in_view, project, sample_times
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Floats, Frame, Ints, SourceTruth, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Ints, Sources, SourceTruth, Trajectory, Truth
 from skysim.simulation.lab import ColorChannel, StarCamera
-from skysim.simulation.lights.light import Beam, Exposure, Lit, Seeds, any_of, beam_of
+from skysim.simulation.lights.light import Beam, Exposure, Seeds, any_of, beam_of
 from skysim.simulation.timing import (
     MARGIN_S,
     exposure_window,
@@ -61,8 +61,6 @@ def render_frame(
 
     Parameters
     ----------
-    camera
-        Star camera
     trajectory
         Motion of the vehicle during the exposure
     index
@@ -280,19 +278,21 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
 
 def hidden_ids(beam: Beam, exposure: Exposure) -> Ints:
     """(M,) ids of the points that something hides and that would otherwise be on the detector at mid-exposure."""
-    return np.concatenate(
-        [np.zeros(0, np.int64), *(hidden_of(lit, exposure) for lit in beam.lits)]
-    )
+    found = [np.zeros(0, np.int64)]
+    for lit in beam.lits:
+        if lit.points is not None and lit.occlusion is not None:
+            seen = lit.points.take(on_detector(lit.points, exposure)[0])
+            found.append(seen.id[lit.occlusion(seen.place)])
+    return np.concatenate(found)
 
 
-def hidden_of(lit: Lit, exposure: Exposure) -> Ints:
-    """(M,) ids of `hidden_ids` among the points of one light."""
-    occludes = lit.occlusion
-    if lit.points is None or occludes is None:
-        return np.zeros(0, np.int64)
+def on_detector(points: Sources, exposure: Exposure) -> tuple[Ints, list[Floats]]:
+    """Rows of the points whose images are on the detector, and what `project` returns for these at the one pose."""
+    optics = exposure.optics
+    near = in_view(points, optics, exposure.pose, reach=0.0)
+    projected = [one[0] for one in project(points.take(near), optics, exposure.pose)]
+    xy_px = projected[0]
     # The detector ends half a pixel outside of the centers of its outer pixels.
-    near = lit.points.take(in_view(lit.points, exposure.optics, exposure.pose, reach=0.0))
-    xy_px = project(near, exposure.optics, exposure.pose)[0][0]
-    size_px = np.array([exposure.optics.camera.width_px, exposure.optics.camera.height_px])
-    on_chip = ((xy_px > -0.5) & (xy_px < size_px - 0.5)).all(axis=1)
-    return near.id[on_chip & occludes(near.place)]
+    size = np.array([optics.camera.width_px, optics.camera.height_px])
+    on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
+    return near[on_chip], [one[on_chip] for one in projected]

@@ -398,7 +398,7 @@ class Flight:
                 if progress:
                     progress(self.now_s, self.duration_s)
             if captures_late:
-                yield from self.capture_late(schedules, solves, selects)
+                yield from self.capture_due(schedules, solves, selects, late=True)
         finally:
             self.is_in_shots = False
 
@@ -407,45 +407,30 @@ class Flight:
         schedules: Sequence[Schedule],
         solves: bool = False,
         selects: FrameSelector | None = None,
+        late: bool = False,
     ) -> Iterator[Shot]:
-        """Yield the exposures that are due and not yet rendered, in order; a filter is updated with each."""
-        has_filter = bool(self.filter_schedules)
+        """Yield the exposures that are due and not yet rendered, in order; a filter is updated with each.
+
+        Late ones ended within the motion but are due after its end; the filter is not updated.
+        """
+        has_filter = bool(self.filter_schedules) and not late
         while due := [
-            one for one in schedules if not one.is_over and one.due_s <= self.now_s
+            one
+            for one in schedules
+            if not one.is_over and (one.close_s if late else one.due_s) <= self.now_s
         ]:
-            yield from self.capture_next(
-                earliest(due), solves or has_filter, selects, updates_filter=has_filter
-            )
-
-    def capture_late(
-        self, schedules: Sequence[Schedule], solves: bool, selects: FrameSelector | None
-    ) -> Iterator[Shot]:
-        """Yield the exposures that ended within the motion but are due after its end; the filter is not updated."""
-        while late := [
-            one for one in schedules if not one.is_over and one.close_s <= self.now_s
-        ]:
-            yield from self.capture_next(
-                earliest(late), solves, selects, updates_filter=False
-            )
-
-    def capture_next(
-        self,
-        schedule: Schedule,
-        solves: bool,
-        selects: FrameSelector | None,
-        updates_filter: bool,
-    ) -> Iterator[Shot]:
-        """Yield the next exposure of a camera if it is selected."""
-        index = schedule.index
-        window = schedule.window
-        close_s = schedule.close_s
-        schedule.index += 1
-        if selects and schedule.number == 0 and not selects(index, close_s):
-            return
-        schedule.exposures_s[index] = window.exposure_s
-        shot = self.capture(schedule, index, window, solves, updates_filter)
-        schedule.exposure_control.update(shot.frame)
-        yield shot
+            # Of several that are due at once, the first camera's.
+            schedule = min(due, key=lambda one: one.due_s)
+            index = schedule.index
+            window = schedule.window
+            close_s = schedule.close_s
+            schedule.index += 1
+            if selects and schedule.number == 0 and not selects(index, close_s):
+                continue
+            schedule.exposures_s[index] = window.exposure_s
+            shot = self.capture(schedule, index, window, solves or has_filter, has_filter)
+            schedule.exposure_control.update(shot.frame)
+            yield shot
 
     def capture(
         self,
@@ -581,11 +566,6 @@ class Flight:
         index = FIRST_OBSERVATION + self.observations
         self.observations += 1
         return self.capture(schedule, index, window, solves, updates_filter=False)
-
-
-def earliest(schedules: Sequence[Schedule]) -> Schedule:
-    """The schedule whose next exposure is due first; the first one of several that are due at once."""
-    return min(schedules, key=lambda schedule: schedule.due_s)
 
 
 def open_flight(

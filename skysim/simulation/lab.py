@@ -100,12 +100,19 @@ def with_parts(
     motion = scene.motion
     estimator = None
     if controller is not None:
-        motion, programs = with_controller(motion, controller, programs)
+        check_controller(controller)
+        law = controller if isinstance(controller, str) else name_of(controller)
+        config = (motion.control or ControlConfig()).model_copy(update={"law": law})
+        motion = motion.model_copy(update={"control": config})
+        programs = programs if law is controller else {**programs, law: controller}
     if profile is not None:
         motion = with_profile(motion, profile)
     scene = scene.model_copy(update={"motion": motion})
     if tracker is not None:
-        scene, estimator = with_tracker(scene, tracker)
+        name = tracker if isinstance(tracker, str) else name_of(tracker)
+        estimator = None if name is tracker else factory.tracker_of(name, tracker)
+        named = scene.tracker.model_copy(update={"name": name})
+        scene = scene.model_copy(update={"tracker": named})
     table = None if isinstance(profile, str | Path) else profile
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {
@@ -116,17 +123,6 @@ def with_parts(
     commands = {name: one for name, one in programs.items() if isinstance(one, str)}
     given |= {"programs": repr(commands)} if commands else {}
     return scene, UserParts(programs, estimator, table, given)
-
-
-def with_controller(
-    motion: MotionConfig, controller: Any, programs: Programs
-) -> tuple[MotionConfig, Programs]:
-    """The motion with a controller, and the programs with that of Python."""
-    config = motion.control or ControlConfig()
-    check_controller(controller)
-    law = controller if isinstance(controller, str) else name_of(controller)
-    changed = motion.model_copy(update={"control": config.model_copy(update={"law": law})})
-    return changed, programs if law is controller else {**programs, law: controller}
 
 
 def check_controller(controller: Any) -> None:
@@ -159,14 +155,6 @@ def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
             "control": motion.control or ControlConfig(law=PRESCRIBED),
         }
     )
-
-
-def with_tracker(scene: Scene, tracker: Any) -> tuple[Scene, factory.Estimator | None]:
-    """The scene with the name of a tracker, and the tracker; None if it is given by name."""
-    name = tracker if isinstance(tracker, str) else name_of(tracker)
-    estimator = None if name is tracker else factory.tracker_of(name, tracker)
-    config = scene.tracker.model_copy(update={"name": name})
-    return scene.model_copy(update={"tracker": config}), estimator
 
 
 def name_of(part: Any) -> str:
@@ -338,9 +326,9 @@ class Lab:
     def export_leds(self) -> tuple[str, int]:
         """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
         scene = self.scene
-        if not isinstance(scene.light, DomeConfig):
+        if not scene.dome:
             raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
-        return led_list(scene.light, self.camera.band, scene.name)
+        return led_list(scene.dome, self.camera.band, scene.name)
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
@@ -373,24 +361,17 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     shown = None
     if not isinstance(scene.light, DomeConfig):
         shown = catalog.read_for("light.catalog", scene.light.catalog)
-    main = build_camera(scene, vehicle, mount, shown)
+    band = Band.from_camera(scene.camera)
+    orbit = build_orbit(scene.orbit, scene.start_time)
+    viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
+    plan = LightPlan(scene, band, vehicle, viewpoint, shown)
+    main = camera_of(MAIN, plan, mount, orbit, scene.seed)
     heads = [
         build_head(scene, n, vehicle, main, shown, parts.programs)
         for n in range(len(scene.heads))
     ]
     start = lab_from_body_start(scene, mount, profiles)
     return Lab(scene, vehicle, (main, *heads), start, profiles)
-
-
-def build_camera(
-    scene: Scene, vehicle: multibody.VehicleModel, mount: Mount, shown: catalog.Catalog | None
-) -> StarCamera:
-    """The main camera of a scene, with its lights; `shown` is the catalog of the scene's light."""
-    band = Band.from_camera(scene.camera)
-    orbit = build_orbit(scene.orbit, scene.start_time)
-    viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
-    plan = LightPlan(scene, band, vehicle, viewpoint, shown)
-    return camera_of(MAIN, plan, mount, orbit, scene.seed)
 
 
 def camera_of(
@@ -402,15 +383,16 @@ def camera_of(
     mount_error: Rotation | None = None,
 ) -> StarCamera:
     """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
-    scene = plan.scene
+    camera = plan.scene.camera
+    dtype = np.float32 if camera.detector.noise else np.float64
     return StarCamera(
         name,
-        scene,
+        plan.scene,
         mount,
-        Optics.from_camera(scene.camera),
-        Detector.from_camera(scene.camera),
+        Optics.from_camera(camera),
+        Detector.from_camera(camera),
         plan.band,
-        build_canvas(scene),
+        np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
         color_channels(plan),
         orbit,
@@ -433,12 +415,6 @@ def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
         first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
         channels.append(ColorChannel(first_px, band, lights))
     return tuple(channels)
-
-
-def build_canvas(scene: Scene) -> NDArray:
-    """The (H, W) array in which a camera's frames are drawn, see `StarCamera`."""
-    dtype = np.float32 if scene.camera.detector.noise else np.float64
-    return np.empty((scene.camera.height_px, scene.camera.width_px), dtype)
 
 
 def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:

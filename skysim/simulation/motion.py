@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,7 +29,7 @@ from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
-from skysim.dynamics.flight_computer import FlightComputer, controlling_actuator, usage
+from skysim.dynamics.flight_computer import FlightComputer, usage
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
@@ -36,7 +37,7 @@ from skysim.dynamics.multibody.actuator_kind import ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators
 from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import BUILT_IN_LAWS, ControlConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
@@ -76,8 +77,15 @@ def check_reference(
         if not motion.is_prescribed:
             inertia = model.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
-            used = usage(controlling_actuator(motion.control, actuators, model), torque_nm)
-            check_torque(key, begin_s + t_s, used, torque_nm, motion.control)
+            used = usage(actuators[motion.control.actuators], torque_nm)
+            k = int(used.argmax())
+            if used[k] > 1 + ROUNDING:
+                raise InputError(
+                    key,
+                    f"needs a torque of ({components(torque_nm[k], 3)}) N m at {begin_s + t_s[k]:.6g} s,"
+                    f" {used[k]:.3g} times what the actuators {motion.control.actuators} can give",
+                    "slower or smaller, or motion.control: prescribed",
+                )
 
 
 def check_tilt(
@@ -117,6 +125,11 @@ def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]
     return t_s, np.array(rates), np.array(accelerations)
 
 
+def components(vector: Floats, digits: int) -> str:
+    """A vector with commas; 0 for components below the last digit of the largest one."""
+    return ", ".join(f"{one:.{digits}g}" for one in significant(vector, digits))
+
+
 def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig) -> None:
     """Raise InputError if a rate (K, 3) about a body axis saturates the gyros."""
     if vehicle.imu is None:
@@ -129,21 +142,6 @@ def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig
             key,
             f"{math.degrees(fastest[n]):.4g} deg/s about a body axis at {t_s[n]:.6g} s",
             f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
-        )
-
-
-def check_torque(
-    key: str, t_s: Floats, used: Floats, torque_nm: Floats, control: ControlConfig
-) -> None:
-    """Raise InputError if the actuators cannot give a torque (K, 3); `used` (K,) is its ratio to their limit."""
-    n = int(used.argmax())
-    if used[n] > 1 + ROUNDING:
-        torque = ", ".join(f"{component:.3g}" for component in significant(torque_nm[n], 3))
-        raise InputError(
-            key,
-            f"needs a torque of ({torque}) N m at {t_s[n]:.6g} s, {used[n]:.3g} times what the actuators"
-            f" {control.actuators} can give",
-            "slower or smaller, or motion.control: prescribed",
         )
 
 
@@ -212,14 +210,11 @@ def shortfall(lab: Lab) -> str:
         return ""
     # Later the actuators give more than is needed: what they owe.
     n = int(((needed - given) * needed).sum(axis=1).argmax())
-    wanted, possible = (
-        ", ".join(f"{component:.2g}" for component in significant(torque[n], 2))
-        for torque in (needed, given)
-    )
     text = flown_saturation(lab)
     return (
-        f"motion.maneuver: needs a torque of ({wanted}) N m at {t_s[n]:.1f} s, of which the actuators"
-        f" {control.actuators} give ({possible}){text and ': '}{text}; change it to a slower or smaller one, balance"
+        f"motion.maneuver: needs a torque of ({components(needed[n], 2)}) N m at {t_s[n]:.1f} s, of which the"
+        f" actuators {control.actuators} give ({components(given[n], 2)})"
+        f"{text and ': '}{text}; change it to a slower or smaller one, balance"
         " the vehicle, or take stronger actuators"
     )
 
@@ -269,10 +264,7 @@ def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
 
 
 class TelemetryRecorder:
-    """Records of a simulated motion, one row per control period; `telemetry` returns them as a table.
-
-    The simulation keeps its states, so only the other quantities are recorded during the motion.
-    """
+    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry."""
 
     def __init__(
         self,
@@ -286,84 +278,85 @@ class TelemetryRecorder:
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
         self.steps_per_tick = steps
-        rows = len(self.at_step)
-        self.recorded = np.zeros(rows, dtype=bool)
-        self.torque_nm = np.zeros((rows, 3))
-        self.disturbance_nm = np.zeros((rows, 3))
-        self.momentum_nms = np.zeros((rows, 3))
-        self.imu_wxyz = np.zeros((rows, 4))
-        self.filter_wxyz = np.zeros((rows, 4))
-        self.saturated = np.zeros(rows, dtype=bool)
-        self.loads = np.zeros((rows, len(flight_computer.names)))
-        self.bias_rad_s = np.zeros((rows, 3))
-        # Of the filter: sigma of the attitude, bias, and sigma of the bias.
-        self.filter_estimates = np.zeros((rows, 3, 3))
-        # Of the filter: estimate and sigma of each mounting.
-        self.mountings = np.zeros((len(mounting_states(navigation)), 2, rows, 3))
+        self.mounted = mounting_states(navigation)
+        # Of the filter: sigma of the attitude, bias and its sigma, and estimate and sigma of each mounting.
+        columns = [
+            ("recorded", bool),
+            ("torque_nm", float, 3),
+            ("disturbance_nm", float, 3),
+            ("momentum_nms", float, 3),
+            ("loads", float, (len(flight_computer.names),)),
+            ("imu_wxyz", float, 4),
+            ("saturated", bool),
+            ("bias_rad_s", float, 3),
+            ("filter_wxyz", float, 4),
+            ("filter", float, (3, 3)),
+            ("mountings", float, (len(self.mounted), 2, 3)),
+        ]
+        self.rows = np.zeros(len(self.at_step), columns)
 
-    @property
-    def row(self) -> int:
-        """Row of the control period that begins now."""
-        return self.simulation.step // self.steps_per_tick
-
-    def record(self, momentum_nms: Floats) -> None:
-        """Record the rest of this control period, after the controls are set and before the vehicle moves."""
-        k = self.row
-        self.recorded[k] = True
-        self.torque_nm[k] = self.flight_computer.control_torque_nm
-        self.momentum_nms[k] = momentum_nms
-        self.loads[k] = self.flight_computer.loads
-        if self.navigation:
-            self.record_estimates(k, self.navigation)
-
-    def record_estimates(self, k: int, navigation: Navigation) -> None:
-        """Record the present estimates of the inertial navigator and of the filter in row k."""
-        self.imu_wxyz[k] = navigation.attitude_wxyz("imu")
-        self.saturated[k] = navigation.saturated
-        self.bias_rad_s[k] = navigation.apparent_bias_rad_s(
+    def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
+        """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
+        row = self.rows[self.simulation.step // self.steps_per_tick]
+        row["recorded"] = True
+        row["torque_nm"] = self.flight_computer.control_torque_nm
+        row["disturbance_nm"] = disturbance_nm
+        row["momentum_nms"] = momentum_nms
+        row["loads"] = self.flight_computer.loads
+        navigation = self.navigation
+        if navigation is None:
+            return
+        row["imu_wxyz"] = navigation.attitude_wxyz("imu")
+        row["saturated"] = navigation.saturated
+        row["bias_rad_s"] = navigation.apparent_bias_rad_s(
             self.simulation.lab_from_body_wxyz, self.simulation.rate_body_rad_s
         )
         if navigation.filter:
             state = navigation.filter.state
-            self.filter_wxyz[k] = navigation.attitude_wxyz("filter")
-            self.filter_estimates[k] = (
-                state.sigma_attitude_rad,
-                state.bias_rad_s,
-                state.sigma_bias_rad_s,
-            )
-            for n, name in enumerate(mounting_states(navigation)):
-                self.mountings[n, :, k] = state.others[name], state.sigma(name)
+            row["filter_wxyz"] = navigation.attitude_wxyz("filter")
+            row["filter"] = state.sigma_attitude_rad, state.bias_rad_s, state.sigma_bias_rad_s
+            for n, name in enumerate(self.mounted):
+                row["mountings"][n] = state.others[name], state.sigma(name)
 
     def telemetry(
         self, reference: Reference | None, cameras: Sequence[StarCamera]
     ) -> Telemetry:
         """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
         simulation = self.simulation
-        vehicle = self.simulation.vehicle
+        vehicle = simulation.vehicle
         steps = self.at_step[self.at_step < simulation.step]
         states = simulation.states[steps]
+        rows = self.rows[: len(steps)]
         nq = simulation.model.nq
         # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
-        for k in np.flatnonzero(~self.recorded[: len(steps)]):
-            self.momentum_nms[k] = self.flight_computer.momentum_nms(
+        for k in np.flatnonzero(~rows["recorded"]):
+            rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
                 states[k, 1 : 1 + nq], states[k, 1 + nq :]
             )
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
         t_s = steps * np.float64(simulation.step_s)
-        navigation = self.navigation
-        rows = slice(len(steps))
-        has_imu = navigation is not None
-        has_filter = navigation is not None and navigation.filter is not None
+        estimates: dict[str, Any] = {}
+        if self.navigation:
+            estimates["lab_from_imu"] = Rotation.from_quat(
+                rows["imu_wxyz"], scalar_first=True
+            )
+            estimates |= {name: rows[name] for name in ("saturated", "bias_rad_s")}
+            if self.navigation.filter:
+                estimates["lab_from_filter"] = Rotation.from_quat(
+                    rows["filter_wxyz"], scalar_first=True
+                )
+                names = ("sigma_attitude_rad", "assumed_bias_rad_s", "sigma_bias_rad_s")
+                estimates |= zip(names, rows["filter"].swapaxes(0, 1), strict=True)
         return Telemetry(
             t_s,
             self.flight_computer.period_s,
             Rotation.from_quat(states[:, 1:5], scalar_first=True),
             states[:, 1 + nq : 4 + nq].copy(),
-            self.torque_nm[rows],
-            self.disturbance_nm[rows],
-            self.momentum_nms[rows],
+            rows["torque_nm"],
+            rows["disturbance_nm"],
+            rows["momentum_nms"],
             states[:, 1 + nq + vehicle.wheels.dof],
             gimbals,
             states[:, 1 : 1 + nq].copy(),
@@ -371,36 +364,27 @@ class TelemetryRecorder:
             if isinstance(cmgs, CmgActuator)
             else None,
             reference.attitudes(t_s) if reference else None,
-            rotation(self.imu_wxyz[rows]) if has_imu else None,
-            self.saturated[rows] if has_imu else None,
-            self.bias_rad_s[rows] if has_imu else None,
-            rotation(self.filter_wxyz[rows]) if has_filter else None,
-            self.filter_estimates[rows, 0] if has_filter else None,
-            self.filter_estimates[rows, 1] if has_filter else None,
-            self.filter_estimates[rows, 2] if has_filter else None,
-            self.mountings_by_camera(t_s, cameras),
-            dict(zip(self.flight_computer.names, self.loads[rows].T, strict=True)),
-            vehicle.wheels.names,
-            vehicle.gimbals.names,
+            mountings=self.mountings_by_camera(rows["mountings"], t_s, cameras),
+            loads=dict(zip(self.flight_computer.names, rows["loads"].T, strict=True)),
+            wheel_names=vehicle.wheels.names,
+            gimbal_names=vehicle.gimbals.names,
+            **estimates,
         )
 
     def mountings_by_camera(
-        self, t_s: Floats, cameras: Sequence[StarCamera]
+        self, mountings: Floats, t_s: Floats, cameras: Sequence[StarCamera]
     ) -> dict[str, Mounting]:
-        """Estimates, sigmas and truth of the filter's mounting states, by name of the camera.
+        """Estimates, sigmas and truth of the filter's mounting states (K, n, 2, 3), by name of the camera.
 
         The state of a head is relative to that of the main camera.
         """
-        if not len(self.mountings):
+        if not self.mounted:
             return {}
-        names = [camera.name for camera in cameras]
         true_rad = [mounting_rad(camera, t_s) for camera in cameras]
         relative_rad = [true_rad[0], *(head - true_rad[0] for head in true_rad[1:])]
         return {
-            name: Mounting(estimate[: len(t_s)], sigma[: len(t_s)], true)
-            for name, (estimate, sigma), true in zip(
-                names, self.mountings, relative_rad, strict=True
-            )
+            camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], relative_rad[n])
+            for n, camera in enumerate(cameras)
         }
 
 
@@ -424,11 +408,6 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
         for t in t_s
     ]
     return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
-
-
-def rotation(wxyz: Floats) -> Rotation:
-    """Rotations of quaternions (N, 4), scalar first."""
-    return Rotation.from_quat(wxyz, scalar_first=True)
 
 
 # The motion.
@@ -476,7 +455,17 @@ class Motion:
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
-        self.navigation = build_navigation(lab, math.inf if kept_s is None else kept_s)
+        self.navigation = None
+        if scene.vehicle.imu is not None:
+            self.navigation = Navigation(
+                scene,
+                tuple(camera.mount for camera in lab.cameras),
+                lab.start,
+                multibody.imu_position_m(vehicle),
+                vehicle.gravity_m_s2,
+                random_stream(scene.seed, IMU, 0),
+                math.inf if kept_s is None else kept_s,
+            )
         impulses = guidance.impulses(scene.motion, self.reference)
         self.disturbances = build_disturbances(lab, impulses, self.flight_computer.period_s)
         self.recorder = None
@@ -534,16 +523,15 @@ class Motion:
             inputs, measured_attitude, momentum, torque_nm
         )
         # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
+        mean_nm = np.zeros(3)
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):
             times_s = simulation.times_s(simulation.step, simulation.step + len(control) + 1)
             disturbance = self.disturbances.torque_nm(times_s, attitude, rate, momentum)
             control[:, simulation.vehicle.torques] += disturbance
-            if self.recorder:
-                mean_nm = disturbance.sum(axis=0) / len(control)
-                self.recorder.disturbance_nm[self.recorder.row] = mean_nm
+            mean_nm = disturbance.sum(axis=0) / len(control)
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.recorder:
-            self.recorder.record(momentum)
+            self.recorder.record(momentum, mean_nm)
         # 5. Integration.
         simulation.advance(control)
         # 6. IMU.
@@ -599,16 +587,4 @@ def build_disturbances(
         lab.vehicle.inertia_kg_m2,
         period_s,
         random_stream(scene.seed, AIR_CURRENT, 0),
-    )
-
-
-def build_navigation(lab: Lab, kept_s: float) -> Navigation | None:
-    """The on-board navigation, which keeps IMU samples for kept_s; None without an IMU."""
-    if lab.scene.vehicle.imu is None:
-        return None
-    position_m = multibody.imu_position_m(lab.vehicle)
-    stream = random_stream(lab.scene.seed, IMU, 0)
-    mounts = tuple(camera.mount for camera in lab.cameras)
-    return Navigation(
-        lab.scene, mounts, lab.start, position_m, lab.vehicle.gravity_m_s2, stream, kept_s
     )

@@ -15,17 +15,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
-from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.core.plugins import ProgramError, describe_error, host_command
-from skysim.core.types import Floats, Frame
+from skysim.core.types import Frame
 from skysim.scene import scene as scenes
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.tracker import OWN
 from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (
@@ -103,7 +100,7 @@ def build_setup(
 ) -> Setup:
     """The set-up that is sent to the tracker: the hardware that skysim's own tracker would assume."""
     return Setup(
-        "icrs" if isinstance(scene.light, StarsConfig) else "lab",
+        "icrs" if scene.stars else "lab",
         scene.start_time.isoformat(),
         camera.width_px,
         camera.height_px,
@@ -117,16 +114,6 @@ def build_setup(
         lights if isinstance(lights, Leds) else None,
         dict(scene.tracker.options),
     )
-
-
-def star_map(catalog: StarCatalog, direction: Floats) -> Stars:
-    """The on-board catalog with the apparent directions (N, 3) of its stars."""
-    return Stars(catalog.id, direction, catalog.v_mag)
-
-
-def led_map(leds: LedMap, lever: Lever) -> Leds:
-    """The dome map and the camera's mounting."""
-    return Leds(leds.id, leds.position_m, lever.camera_body_m, lever.cam_from_body.as_quat())
 
 
 def to_report(answer: Answer) -> Report:

@@ -8,6 +8,7 @@ the settings (`assumed_settings`) that the tracker assumes, which may differ fro
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -36,10 +37,13 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Frame, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import OWN
-from skysim.tracking import external_tracker
-from skysim.tracking.external_tracker import ExternalTracker, FunctionTracker
+from skysim.tracking.external_tracker import (
+    ExternalTracker,
+    FunctionTracker,
+    build_setup,
+    takes_setup,
+)
 from skysim.tracking.onboard_model import (
     OrbitStarTracker,
     assumed_air,
@@ -77,17 +81,19 @@ def assumed_settings(scene: Scene) -> Settings:
     """
     config = scene.tracker
     default = Settings()
-    usual = DOME_ALGORITHMS if isinstance(scene.light, DomeConfig) else {}
+    usual = DOME_ALGORITHMS if scene.dome else {}
     chosen: dict[str, Any] = {}
     for stage, table in algorithm_tables(scene).items():
         name = getattr(config, stage) or usual.get(stage, "default")
-        chosen[stage] = require_algorithm(stage, name, table)
+        # Only the estimator has the list, and the scene package may not import it, so the name is checked here.
+        if name not in table:
+            raise InputError(f"tracker.{stage}", *unknown_name(stage, name, table))
+        chosen[stage] = name
+    most = config.brightest or default.max_blobs
     return Settings(
-        max_blobs=config.brightest or default.max_blobs,
-        base_stars=min(config.brightest or default.base_stars, default.base_stars),
-        searched_stars=min(
-            config.brightest or default.searched_stars, default.searched_stars
-        ),
+        max_blobs=most,
+        base_stars=min(most, default.base_stars),
+        searched_stars=min(most, default.searched_stars),
         threshold_sigma=config.threshold_sigma,
         min_area_px=config.min_area_px,
         intensity_threshold=config.intensity_threshold,
@@ -107,7 +113,7 @@ def assumed_settings(scene: Scene) -> Settings:
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
     """The algorithms that a scene's tracker may use: by stage, then by name."""
     near: dict[str, Mapping[str, object]] = {}
-    if isinstance(scene.light, DomeConfig):
+    if scene.dome:
         near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
     return STAR_ALGORITHMS | near
 
@@ -115,16 +121,6 @@ def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:
     """The names of the algorithms that a scene's tracker may use, by stage."""
     return {stage: tuple(table) for stage, table in algorithm_tables(scene).items()}
-
-
-def require_algorithm(stage: str, name: str, algorithms: Mapping[str, object]) -> str:
-    """The name, if it is one of the algorithms; else raise InputError.
-
-    Only the estimator has the list, and the scene package may not import it, so the name is checked here.
-    """
-    if name not in algorithms:
-        raise InputError(f"tracker.{stage}", *unknown_name(stage, name, algorithms))
-    return name
 
 
 # Trackers.
@@ -137,9 +133,7 @@ def tracker_of(name: str, given: Any) -> Estimator:
     """A star tracker given in Python, as `FunctionTracker` if it is a function or a class. Raises InputError."""
     if isinstance(given, StarTracker | DomeTracker | FunctionTracker):
         return given
-    if callable(given) and (
-        not isinstance(given, type) or external_tracker.takes_setup(given)
-    ):
+    if callable(given) and (not isinstance(given, type) or takes_setup(given)):
         return FunctionTracker(name, given)
     what = f"the class {given.__name__}" if isinstance(given, type) else type(given).__name__
     raise InputError(
@@ -152,15 +146,16 @@ def tracker_of(name: str, given: Any) -> Estimator:
 
 def setup_of(scene: Scene, mount: Mount, sources: Sources) -> Setup:
     """The set-up that a tracker of one's own gets: camera, catalog or map, and settings that skysim's would assume."""
-    settings = assumed_settings(scene)
-    if isinstance(scene.light, DomeConfig):
-        camera, leds, lever = onboard_dome(scene, scene.light, mount, sources)
-        leds = with_brightness(scene, scene.light, leds, lever)
-        lights: Stars | Leds = external_tracker.led_map(leds, lever)
+    lights: Stars | Leds
+    if dome := scene.dome:
+        camera, leds, lever = onboard_dome(scene, dome, mount, sources)
+        axes_xyzw = lever.cam_from_body.as_quat()
+        lights = Leds(leds.id, leds.position_m, lever.camera_body_m, axes_xyzw)
     else:
         camera = assumed_camera(scene)
-        lights = external_tracker.star_map(*assumed_stars(scene, assumed_orbit(scene)))
-    return external_tracker.build_setup(scene, camera, settings, lights)
+        stars, directions = assumed_stars(scene, assumed_orbit(scene))
+        lights = Stars(stars.id, directions, stars.v_mag)
+    return build_setup(scene, camera, assumed_settings(scene), lights)
 
 
 def build_tracker(
@@ -194,19 +189,17 @@ def build_tracker(
         return tracker
     if name != OWN:
         return ExternalTracker.start(scene, setup_of(scene, mount, sources), programs)
-    if isinstance(scene.light, DomeConfig):
-        return build_dome_tracker(scene, scene.light, mount, sources)
-    return build_sky_tracker(scene)
-
-
-def build_dome_tracker(
-    scene: Scene,
-    dome: DomeConfig,
-    mount: Mount,
-    sources: Sources,
-) -> DomeTracker | CodedTracker:
-    """The tracker of LEDs, with LED map and lever from the survey or from a map's file. Raises InputError."""
     settings = assumed_settings(scene)
+    dome = scene.dome
+    if dome is None:
+        # Stars, with their apparent directions from the tracker's catalog.
+        camera = assumed_camera(scene)
+        orbit = assumed_orbit(scene)
+        stars, directions = assumed_stars(scene, orbit)
+        if orbit:
+            return OrbitStarTracker(camera, stars, directions, settings, orbit)
+        return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
+    # LEDs, with map and lever from the survey or from a map's file.
     camera, leds, lever = onboard_dome(scene, dome, mount, sources)
     leds = with_brightness(scene, dome, leds, lever)
     try:
@@ -217,17 +210,6 @@ def build_dome_tracker(
         return CodedTracker(camera, leds, lever, settings, code, decoder)
     except ImageError as error:
         raise InputError("light", f"the star tracker cannot use this dome: {error}") from None
-
-
-def build_sky_tracker(scene: Scene) -> StarTracker:
-    """The tracker of stars, with their apparent directions from its catalog. Raises InputError."""
-    camera = assumed_camera(scene)
-    settings = assumed_settings(scene)
-    orbit = assumed_orbit(scene)
-    stars, directions = assumed_stars(scene, orbit)
-    if orbit:
-        return OrbitStarTracker(camera, stars, directions, settings, orbit)
-    return StarTracker(camera, stars, directions, settings, air=assumed_air(scene))
 
 
 def solve_frame(
@@ -251,16 +233,13 @@ def solve_frame(
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
+    seen: list[Any] = [frame.image_dn, streak_px, rate, frame.exposure_s]
+    if isinstance(estimator, StarTracker | CodedTracker):
+        seen.append(frame.t_mid_s)
+    if isinstance(estimator, CodedTracker):
+        seen.append(frame.index)
     try:
-        if isinstance(estimator, StarTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s
-            )
-        if isinstance(estimator, CodedTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index
-            )
-        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
+        return estimator.solve(*seen)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())
 
@@ -299,9 +278,8 @@ class ExposureController:
         """Update the exposure time from a frame, which was exposed for `frame.exposure_s`."""
         if self.control:
             observed = observe_frame(self.settings, self.control, frame)
-            self.exposure_s = step(
-                NextExposure(frame.exposure_s), observed, self.control
-            ).time_s
+            last = NextExposure(frame.exposure_s)
+            self.exposure_s = step(last, observed, self.control).time_s
 
 
 def control_settings(scene: Scene) -> Control | None:
@@ -317,7 +295,9 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
     as saturated.
     """
     image_dn = monochrome(frame.image_dn, settings)
-    try:
+    box_px = np.empty((0, 4), np.int64)
+    # A coarse converter may give a frame of one value: no blobs.
+    with suppress(ImageError):
         blobs = DETECTORS[settings.detector](
             image_dn,
             settings.threshold_sigma,
@@ -325,7 +305,5 @@ def observe_frame(settings: Settings, control: Control, frame: Frame) -> Observa
             settings.max_blobs,
             FramePriors(None, settings.saturation, 0.0, settings.intensity_threshold),
         )
-    except ImageError:  # a coarse converter may give a frame of one value: no blobs
-        return observe(image_dn, np.empty((0, 4), np.int64), settings.saturation, control)
-    box_px = blobs.box_px[blobs.flag & settings.reject == 0]
+        box_px = blobs.box_px[blobs.flag & settings.reject == 0]
     return observe(image_dn, box_px, settings.saturation, control)

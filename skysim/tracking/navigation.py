@@ -130,7 +130,9 @@ class Navigation:
         earth = imu.earth_rate_lab_rad_s(scene.site)
         self.earth_sensed_rad_s = earth * (config.earth_rate != "none")
         self.earth_compensated_rad_s = earth * (config.earth_rate == "compensated")
-        assumed = zeroed_attitude(lab_from_body, config.home_error_deg)
+        # The navigator is zeroed to the true attitude minus an error.
+        angles_deg = lab_from_body.as_euler("ZYX", degrees=True) - config.home_error_deg[::-1]
+        assumed = Rotation.from_euler("ZYX", angles_deg, degrees=True)
         self.navigator = imu.Navigator(
             assumed.as_quat(scalar_first=True), self.earth_compensated_rad_s
         )
@@ -190,21 +192,14 @@ class Navigation:
         """The kept IMU samples of whole control periods from about since_s on."""
         if not self.measured:
             none = np.zeros((0, 3))
-            return imu.Increments(
-                np.zeros(0), self.step_s, none, none, np.zeros(0, bool), np.zeros(0, bool)
-            )
+            never = np.zeros(0, bool)
+            return imu.Increments(np.zeros(0), self.step_s, none, none, never, never)
         first = len(self.measured) - 1
         while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
             first -= 1
-        columns = zip(
-            *(
-                (m.t_s, m.angle_rad, m.velocity_m_s, m.saturated, m.overloaded)
-                for m in self.measured[first:]
-            ),
-            strict=True,
-        )
         t_s, angle, velocity, saturated, overloaded = (
-            np.concatenate(column) for column in columns
+            np.concatenate([getattr(one, name) for one in self.measured[first:]])
+            for name in ("t_s", "angle_rad", "velocity_m_s", "saturated", "overloaded")
         )
         return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
 
@@ -270,15 +265,6 @@ class Navigation:
         if feedback == "imu" or self.filter is None:
             return self.rate_rad_s
         return self.filter.rate_rad_s
-
-
-def zeroed_attitude(
-    lab_from_body: Rotation, error_deg: tuple[float, float, float]
-) -> Rotation:
-    """The attitude to which the navigator is zeroed: the true one minus the error in roll, pitch, yaw."""
-    yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
-    angles_deg = [yaw - error_deg[2], pitch - error_deg[1], roll - error_deg[0]]
-    return Rotation.from_euler("ZYX", angles_deg, degrees=True)
 
 
 def build_filter(

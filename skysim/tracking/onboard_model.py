@@ -24,10 +24,10 @@ from estimator.trackers.pipeline import Report, Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.air import weather_of
 from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.catalog import require_catalog
@@ -69,9 +69,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     nominal = led_list.design_leds(
         light, surface.build_surface(light.surface), Band.from_camera(scene.camera)
     )
-    # The design's LEDs in the order of the map.
-    order = np.argsort(nominal.id)
-    nominal = nominal.take(order[np.searchsorted(nominal.id, leds.id, sorter=order)])
+    nominal = nominal.take(rows_of(leds.id, nominal.id))
     distance_m = leds.radius_m - np.linalg.norm(lever.camera_body_m)
     strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
     light_e_s_m2 = irradiance_e_s_m2(
@@ -80,6 +78,12 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     collecting_m2 = Optics.from_camera(scene.camera).collecting_m2
     flux_s = light_e_s_m2 * collecting_m2 / scene.camera.detector.gain_e_dn
     return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
+
+
+def rows_of(wanted: Ints, ids: Ints) -> Ints:
+    """Row of each wanted number among the numbers ids; any row for one that is not among them."""
+    order = np.argsort(ids)
+    return order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(order) - 1)]
 
 
 def zero_point_mag(scene: Scene) -> float | None:
@@ -99,8 +103,8 @@ def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
     """The code words of the LEDs in the tracker's map, which are those of the dome."""
     assert light.led.code is not None
     code = light.led.code
-    row = np.searchsorted(sources.id, leds.id, sorter=np.argsort(sources.id))
-    levels = light_levels(code, codebook(code, len(sources))[np.argsort(sources.id)[row]])
+    words = codebook(code, len(sources))[rows_of(leds.id, sources.id)]
+    levels = light_levels(code, words)
     return LedCode(levels, None if code.bit_time_s == "frame" else code.bit_time_s)
 
 
@@ -109,13 +113,11 @@ def assumed_air(scene: Scene) -> SiteAir | None:
 
     None without `tracker.refraction`.
     """
-    light = scene.light
+    stars = scene.stars
     site = scene.site
-    if not isinstance(light, StarsConfig) or light.air is None or site.longitude_deg is None:
+    if not (scene.tracker.refraction and stars and stars.air) or site.longitude_deg is None:
         return None
-    if not scene.tracker.refraction:
-        return None
-    weather = weather_of(light.air, site, Band.from_camera(scene.camera))
+    weather = weather_of(stars.air, site, Band.from_camera(scene.camera))
     return SiteAir(
         site.latitude_deg,
         site.longitude_deg,
@@ -166,16 +168,13 @@ def surveyed_dome(
             f"{path}: surveyed with a camera of {dome_map.size_px} px",
             f"{size_px} px",
         )
-    order = np.argsort(leds.id)
-    row = order[
-        np.minimum(np.searchsorted(leds.id, dome_map.id, sorter=order), len(order) - 1)
-    ]
+    row = rows_of(dome_map.id, leds.id)
     unknown = dome_map.id[leds.id[row] != dome_map.id]
     if len(unknown):
         raise InputError(
             "tracker.map",
             f"{path}: unknown LED {unknown[0]}",
-            f"the {len(order)} LEDs of this dome",
+            f"the {len(leds.id)} LEDs of this dome",
         )
     nearest = cKDTree(leds.position_m).query(dome_map.position_m)[1]
     others = int(np.sum(nearest != row))
@@ -323,18 +322,13 @@ def assumed_stars(
     stars = catalog.brighter_than(
         onboard_catalog("tracker.catalog", scene.tracker.catalog), scene.tracker.limit_mag
     )
-    directions = catalog.apparent(stars, assumed_observer(scene, orbit))
+    # The observer is at the Earth's center, with the orbit's velocity.
+    observer = catalog.on_earth(scene.start_time)
+    if orbit:
+        velocity_m_s = observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s
+        observer = replace(observer, velocity_m_s=velocity_m_s)
+    directions = catalog.apparent(stars, observer)
     if isinstance(scene.light, CollimatedDisplayConfig):
         # The mounting of the display defines the stars' directions in the lab frame.
         directions = display.lab_from_icrs(scene.light).apply(directions)
     return stars, directions
-
-
-def assumed_observer(scene: Scene, orbit: CameraOrbit | None) -> catalog.Observer:
-    """The observer of the tracker's catalog at the scene's start: at the Earth's center, with the orbit's velocity."""
-    observer = catalog.on_earth(scene.start_time)
-    if orbit is None:
-        return observer
-    return replace(
-        observer, velocity_m_s=observer.velocity_m_s + state_at(orbit, 0.0).velocity_m_s
-    )

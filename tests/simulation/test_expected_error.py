@@ -29,11 +29,10 @@ from skysim.simulation.checks import (
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, timing_sigma_s
 from skysim.simulation.checks.expected_error import (
-    Common,
     Expected,
-    Independent,
-    covariance,
     gains,
+    of_common,
+    of_independent,
 )
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure
@@ -106,9 +105,7 @@ def test_expected_errors_of_stars_on_a_ring_match_the_textbook(stars: Lab) -> No
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     circle = ring(places, places, stars)
     gain = gains(circle, px2(np.full(LEDS, 0.3)))  # equal weights: their size does not matter
-    variance = np.diag(
-        covariance(gain, Independent(np.tile(sigma_px**2 * np.eye(2), (LEDS, 1, 1))))
-    )
+    variance = np.diag(of_independent(gain, np.tile(sigma_px**2 * np.eye(2), (LEDS, 1, 1))))
     focal_px = stars.scene.camera.focal_px
     assert np.sqrt(variance[2]) == pytest.approx(
         sigma_px / (tangent * focal_px * np.sqrt(LEDS)), rel=1e-6
@@ -124,9 +121,7 @@ def test_weights_favor_the_accurate_lights(stars: Lab) -> None:
     places = np.array([[tangent, 0, 1], [-tangent, 0, 1], [0, tangent, 1], [0, -tangent, 1]])
     sigma_px = np.array([0.1, 0.1, 0.4, 0.4])
     gain = gains(ring(places, places, stars), px2(sigma_px))
-    variance = np.diag(
-        covariance(gain, Independent(sigma_px[:, None, None] ** 2 * np.eye(2)))
-    )
+    variance = np.diag(of_independent(gain, sigma_px[:, None, None] ** 2 * np.eye(2)))
     assert np.sqrt(variance[:2]) == pytest.approx(
         np.full(2, 1 / focal_px / np.sqrt(np.sum(1 / sigma_px**2))), rel=1e-3
     )
@@ -143,16 +138,15 @@ def test_a_survey_s_errors_are_angles_at_the_bearing(leds: Lab) -> None:
     sigma_m = 1e-4
     gain = gains(circle, px2(np.ones(LEDS)))
     places = np.diag(
-        covariance(
-            gain,
-            Independent(sigma_m**2 * circle.gradient @ np.swapaxes(circle.gradient, 1, 2)),
+        of_independent(
+            gain, sigma_m**2 * circle.gradient @ np.swapaxes(circle.gradient, 1, 2)
         )
     )
     assert np.sqrt(places[:2]) == pytest.approx(
         np.full(2, sigma_m / HEIGHT_M / np.sqrt(LEDS)), rel=0.02
     )
     assert np.sqrt(places[2]) == pytest.approx(sigma_m / RING_M / np.sqrt(LEDS), rel=1e-3)
-    lever = np.diag(covariance(gain, Common(-sigma_m * circle.gradient)))
+    lever = np.diag(of_common(gain, -sigma_m * circle.gradient))
     assert np.sqrt(lever[:2]) == pytest.approx(np.full(2, sigma_m / HEIGHT_M), rel=0.02)
     assert lever[2] < 1e-6 * lever[0]
 
@@ -162,7 +156,7 @@ def test_a_rotated_survey_rotates_the_solution_equally(leds: Lab) -> None:
     circle = under_ring(leds)
     turn_rad = np.array([2e-4, -1e-4, 3e-4])
     shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, circle.arm_m))
-    matrix = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))
+    matrix = of_common(gains(circle, px2(np.ones(LEDS))), shift_px[:, :, None])
     np.testing.assert_allclose(matrix, np.outer(turn_rad, turn_rad), rtol=1e-6, atol=1e-16)
 
 
@@ -172,7 +166,7 @@ def test_a_wrong_focal_length_moves_the_solution_by_the_mean_of_the_field(stars:
         places = around(0.02, 1.0) + np.array([aside, 0, 0])
         circle = ring(places, places, stars)
         shift_px = 1e-3 * (circle.xy_px - np.array(stars.scene.camera.center_px))
-        cross = covariance(gains(circle, px2(np.ones(LEDS))), Common(shift_px[:, :, None]))[
+        cross = of_common(gains(circle, px2(np.ones(LEDS))), shift_px[:, :, None])[
             :2, :2
         ].trace()
         assert np.sqrt(cross) == pytest.approx(1e-3 * aside, rel=0.02, abs=1e-9)
@@ -183,10 +177,10 @@ def test_a_fitted_place_absorbs_the_lever(leds: Lab) -> None:
     circle = under_ring(leds)
     exact = gains(circle, px2(np.ones(LEDS)))
     free = gains(circle, px2(np.ones(LEDS)), circle.gradient)
-    lever = Common(circle.gradient)
-    noise = Independent(np.tile(np.eye(2), (LEDS, 1, 1)))
-    assert covariance(free, lever).trace() < 1e-6 * covariance(exact, lever).trace()
-    assert covariance(free, noise)[0, 0] > 100 * covariance(exact, noise)[0, 0]
+    lever = circle.gradient
+    noise = np.tile(np.eye(2), (LEDS, 1, 1))
+    assert of_common(free, lever).trace() < 1e-6 * of_common(exact, lever).trace()
+    assert of_independent(free, noise)[0, 0] > 100 * of_independent(exact, noise)[0, 0]
 
 
 @pytest.mark.slow
@@ -208,7 +202,7 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
         samples = sampling.sampled(attitudes.of_frames(lab), context)
         error = samples.error.total("cross")
         found[identifier, focal_length] = (
-            samples.error.cross_rad2["focal length"].max(),
+            samples.error.rad2["cross"]["focal length"].max(),
             error.mean(),
         )
         cam_from_body = lab.camera.mount.cam_from_body
@@ -258,7 +252,10 @@ def test_a_fit_reaches_the_bound_of_mortensen() -> None:
         integral = scipy.integrate.quad(lambda t, tau=tau: np.log(t) / (1 + t / tau), 0, 1)[0]
         noise_e2 = tau * electrons / (2 * np.pi * sigma_px**2)
         found = detection.weighted_variance(
-            images(electrons, sigma_px), np.array([electrons]), noise_e2, detection.fit
+            images(electrons, sigma_px),
+            np.array([electrons]),
+            noise_e2,
+            detection.WEIGHTS["fit"],
         )
         expected_px2 = sigma_px**2 / electrons / (1 + integral)
         assert np.ravel(found) == pytest.approx(np.full(2, expected_px2), rel=2e-3)
@@ -318,7 +315,8 @@ def test_every_centroider_scatters_as_forecast(
     context = detection.context_of(stars)
     background_e = 60.0
     settings = replace(context.settings, centroider=centroider, detector=detector)
-    context = context._replace(
+    context = replace(
+        context,
         settings=settings,
         camera=context.camera._replace(noise_e=np.sqrt(background_e)),
         timing_s=np.zeros(1),
@@ -475,8 +473,8 @@ def variances_of(survey: dict[str, str]) -> dict[str, Floats]:
     context = detection.context_of(lab)
     found = sampling.sampled(attitudes.of_frames(lab), context).error
     return {
-        name: np.array([found.cross_rad2[name].mean(), found.roll_rad2[name].mean()])
-        for name in found.cross_rad2
+        name: np.array([found.rad2["cross"][name].mean(), found.rad2["roll"][name].mean()])
+        for name in found.rad2["cross"]
     }
 
 
@@ -593,8 +591,10 @@ def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
     none = dict.fromkeys(facts.DRAWN_ONCE, np.zeros(2))
     noise = np.array([ARCSEC_RAD**2 * 15, np.nan])
     error = Expected(
-        none | {"centroid noise": noise, "LED survey": noise / 15},
-        none | {"centroid noise": 2 * noise},
+        {
+            "cross": none | {"centroid noise": noise, "LED survey": noise / 15},
+            "roll": none | {"centroid noise": 2 * noise},
+        }
     )
     require = {
         "cross_arcsec_p95": 6.93,
@@ -603,9 +603,9 @@ def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:
         "right_within_cross_arcsec_4": 0.3,
         "wrong": 0.001,
     }
-    context = SimpleNamespace(lab=SimpleNamespace(scene=SimpleNamespace(require=require)))
-    samples = SimpleNamespace(frames=SimpleNamespace(error=error))
-    fact = facts.requirements(context, samples)
+    scene = SimpleNamespace(require=require)
+    plan = SimpleNamespace(scene=scene, frames=SimpleNamespace(error=error))
+    fact = facts.requirements(plan)
     found = {name: fact.values[name]["expected"] for name in require}
     rng = np.random.default_rng(1)
     drawn = rng.normal(size=(3, 400_000)) * np.sqrt([[8.0], [8.0], [30.0]])

@@ -23,11 +23,12 @@ from skysim.simulation.checks import (
     check,
     detection,
     facts,
+    plan_check,
     sampling,
     sky_warnings,
 )
 from skysim.simulation.checks.facts import Fact
-from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -62,13 +63,8 @@ def afit() -> Check:
     return check(lab_of("afit_simsat"))
 
 
-def samples_of(lab: Lab) -> tuple[detection.Context, CheckedSamples]:
-    context = detection.context_of(lab)
-    frames = attitudes.of_frames(lab)
-    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames)
-    return context, CheckedSamples(
-        sampling.sampled(frames, context), sampling.sampled(reach, context)
-    )
+def plan_of(lab: Lab) -> Plan:
+    return plan_check.plan_of(lab, attitudes.of_frames(lab))
 
 
 # Attitudes
@@ -163,8 +159,8 @@ def test_the_check_counts_the_lights_that_the_tracker_uses(name: str) -> None:
 
 def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
     lab = lab_of("afit_simsat")
-    context, samples = samples_of(lab)
-    text = facts.lights_in_field(context, samples).values["reach"]["least_at"]
+    plan = plan_of(lab)
+    text = facts.lights_in_field(plan).values["reach"]["least_at"]
     roll, pitch, yaw = (
         float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw")
     )  # type: ignore[index]
@@ -173,8 +169,8 @@ def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
         np.zeros((1, 3)),
         np.full(1, np.nan),
     )
-    assert len(sampling.sampled(there, context).used[0]) == pytest.approx(
-        samples.reach.counts().min(), abs=1
+    assert len(sampling.sampled(there, plan).used[0]) == pytest.approx(
+        plan.reach.counts().min(), abs=1
     )
 
 
@@ -215,7 +211,7 @@ def test_the_cap_s_margin_is_the_angle_beyond_the_field() -> None:
         vehicle__camera="[0 in, 0 in, 15 in]",
         motion__maneuver=TILTED,
     )
-    found = facts.cap_margin(*samples_of(lab))
+    found = facts.cap_margin(plan_of(lab))
     assert found is not None
     half = math.atan(lab.scene.camera.width_px / 2 / lab.scene.camera.focal_px)
     at_bearing = half - math.asin(15 / 48 * math.sin(half))
@@ -706,7 +702,7 @@ def test_fields_of_coded_leds_are_not_called_similar() -> None:
 def test_half_of_the_stars_at_the_limit_are_detected() -> None:
     """The limit that `light.catalog` is compared with, on rendered frames: most brighter by half a magnitude are."""
     lab = lab_of("shefex2", exposure__frames="1", motion__rate_deg_s="[0, 0, 0]")
-    limit = sky_warnings.detection_limit_mag(*samples_of(lab))
+    limit = sky_warnings.detection_limit_mag(plan_of(lab))
     tracker = build_tracker(lab.camera)
     rng = np.random.default_rng(3)
     found = []
@@ -753,7 +749,7 @@ def test_the_centroid_floor_proposed_by_the_check_makes_claims_correct() -> None
     floor_px = 0.02
     nees = [
         sky_warnings.claimed(
-            *samples_of(
+            plan_of(
                 lab_of(
                     "shefex2",
                     camera__detector__prnu="0.1",
@@ -816,7 +812,7 @@ def test_a_body_s_expected_pixel_value_matches_its_frame(
     row = list(truth.sources.id).index(
         next(body.id for body in truth.bodies if body.name == name.lower())
     )
-    full_e = detection.full_scale_e(lab.scene.camera.detector)
+    full_e = detection.context_of(lab).full_e
     assert fill == pytest.approx(truth.sources.peak_e[row] / full_e, rel=0.5)
 
 

@@ -11,9 +11,9 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
-from skysim.simulation.checks.detection import Context, context_of
+from skysim.simulation.checks.detection import context_of
 from skysim.simulation.checks.plan_check import check
-from skysim.simulation.checks.sampling import CheckedSamples, sampled
+from skysim.simulation.checks.sampling import Plan, sampled
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.sources.satellites import MIRRORED
@@ -40,12 +40,12 @@ SHINY = {
 DOES_NOT_KNOW = {"tracker__orbit_velocity": "false"}
 
 
-def plan_of(scene: str, **keys: str) -> tuple[Context, CheckedSamples]:
+def plan_of(scene: str, **keys: str) -> Plan:
     overrides = {key.replace("__", "."): value for key, value in keys.items()}
     lab = build_lab(loader.load(scene, (SPACE if scene == "shefex2" else {}) | overrides))
     context = context_of(lab)
     frames = sampled(attitudes.of_frames(lab), context)
-    return context, CheckedSamples(frames, frames)
+    return Plan(**vars(context), frames=frames, reach=frames)
 
 
 def pointing(ra_deg: float, dec_deg: float) -> str:
@@ -56,28 +56,28 @@ def pointing(ra_deg: float, dec_deg: float) -> str:
 def test_stray_light_that_costs_stars_is_warned_of() -> None:
     """The loss is that of the limit with and without the baffle; the cure leaves half a magnitude."""
     keys = {"motion__start": pointing(90.0, -18.0), "light__bodies": "{}"}
-    plain = sky_warnings.snr_limit_mag(*plan_of("shefex2", **keys))
+    plain = sky_warnings.snr_limit_mag(plan_of("shefex2", **keys))
     lit = plan_of("shefex2", **keys, camera__baffle=BAFFLE)
-    (line,) = sky_warnings.stray_light(*lit)
+    (line,) = sky_warnings.stray_light(lit)
     lost = re.match(
         r"camera.baffle.pst: stray light of ([\d.]+) electrons in a pixel, most of it of the Sun, .* the faintest"
         r" star is ([\d.]+) mag brighter; change it to ([\d.]+) times as much",
         line,
     )
     assert lost
-    assert float(lost[1]) == pytest.approx(lit[0].camera.stray_e, rel=1e-2)
-    assert float(lost[2]) == pytest.approx(plain - sky_warnings.snr_limit_mag(*lit), abs=0.15)
+    assert float(lost[1]) == pytest.approx(lit.camera.stray_e, rel=1e-2)
+    assert float(lost[2]) == pytest.approx(plain - sky_warnings.snr_limit_mag(lit), abs=0.15)
     better = f"{{angle_deg: [20, 50, 90, 120], pst: {[float(lost[3]) * one for one in (1e-3, 1e-7, 1e-9, 1e-12)]}}}"
     cured = plan_of("shefex2", **keys, camera__baffle=better)
-    assert 0.4 < plain - sky_warnings.snr_limit_mag(*cured) < 0.55
-    assert len(list(sky_warnings.stray_light(*plan_of("shefex2", **keys)))) == 0
+    assert 0.4 < plain - sky_warnings.snr_limit_mag(cured) < 0.55
+    assert len(list(sky_warnings.stray_light(plan_of("shefex2", **keys)))) == 0
 
 
 @pytest.mark.slow
 def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
     """23 degrees south of the summer's Sun; the camera is over the equator at RA 0, so RA 180 is nadir."""
     sun, *others = sky_warnings.exclusion(
-        *plan_of("shefex2", motion__start=pointing(93.9, 0.0), orbit=ORBIT)
+        plan_of("shefex2", motion__start=pointing(93.9, 0.0), orbit=ORBIT)
     )
     assert re.match(
         r"orbit.exclusion.sun_deg: the Sun is 23.4° from the boresight at RA 93.9° .*, within 40°",
@@ -85,7 +85,7 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
     )
     assert others == [line for line in others if "earth_deg" in line]
     (limb,) = sky_warnings.exclusion(
-        *plan_of("shefex2", motion__start=pointing(180.0, -60.0), orbit=ORBIT)
+        plan_of("shefex2", motion__start=pointing(180.0, -60.0), orbit=ORBIT)
     )
     dip_deg = np.degrees(np.arccos(6378.137 / 6878.137))
     angle = re.match(
@@ -97,7 +97,7 @@ def test_bodies_within_the_exclusion_angles_are_warned_of() -> None:
     assert (
         list(
             sky_warnings.exclusion(
-                *plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)
+                plan_of("shefex2", motion__start=pointing(0.0, -60.0), orbit=ORBIT)
             )
         )
         == []
@@ -120,7 +120,7 @@ def test_a_baffle_replaces_the_advice_to_add_one() -> None:
 def test_the_tracker_of_a_plan_has_the_orbit_s_velocity() -> None:
     """Else its stars are off by the orbit's aberration, up to 5.2"."""
     errors = [
-        plan_of("shefex2", orbit=ORBIT, **keys)[0].beliefs.direction_error
+        plan_of("shefex2", orbit=ORBIT, **keys).beliefs.direction_error
         for keys in ({}, DOES_NOT_KNOW)
     ]
     off_arcsec = [
@@ -134,23 +134,23 @@ def test_the_tracker_of_a_plan_has_the_orbit_s_velocity() -> None:
 def test_refraction_that_the_tracker_does_not_know_is_warned_of() -> None:
     """A tan h + B tan^3 h with the textbooks' 58.3" less 2 % for red light, some 25 degrees high; none if it knows."""
     low_in_the_south = {"motion__start": pointing(222.0, -10.0)}
-    context, samples = plan_of("shefex2", **low_in_the_south, **NIGHT)
+    plan = plan_of("shefex2", **low_in_the_south, **NIGHT)
     found = re.match(
         r"tracker.refraction: the air raises stars by ([\d.]+)″ at RA 222.0° .*, ([\d.]+)° above the horizon, and"
         r" shortens the field by ([\d.]+)″, .*; change it to true",
-        sky_warnings.refraction(context, samples),
+        sky_warnings.refraction(plan),
     )
     assert found
     raised, altitude_deg, shortened = map(float, found.groups())
     assert 15 < altitude_deg < 30
-    half_deg = np.degrees(context.camera.optics.field_rad)
+    half_deg = np.degrees(plan.camera.optics.field_rad)
     middle, low, high = bent_arcsec(np.array([0.0, -half_deg, half_deg]) + altitude_deg)
     assert raised == pytest.approx(middle, rel=0.02)
     assert shortened == pytest.approx(low - high, rel=0.05)
     assert not sky_warnings.refraction(
-        *plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true")
+        plan_of("shefex2", **low_in_the_south, **NIGHT, tracker__refraction="true")
     )
-    assert not sky_warnings.refraction(*plan_of("shefex2", **low_in_the_south))
+    assert not sky_warnings.refraction(plan_of("shefex2", **low_in_the_south))
 
 
 def bent_arcsec(altitude_deg: Floats) -> Floats:
@@ -161,21 +161,21 @@ def bent_arcsec(altitude_deg: Floats) -> Floats:
 @pytest.mark.slow
 def test_detectable_reflections_in_the_wall_are_warned_of() -> None:
     """As many as the tracker detects in a frame near a mirrored LED of its truth; none in a wall as dull as advised."""
-    context, samples = plan_of("apl_dome", **SHINY)
-    line = dome_warnings.mirror_images(context, samples)
+    plan = plan_of("apl_dome", **SHINY)
+    line = dome_warnings.mirror_images(plan)
     found = re.match(
         r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$",
         line,
     )
     assert found
-    frame, truth = Flight(context.lab).simulate_motion().render(0)
-    seen = solve_frame(build_tracker(context.lab.camera), frame).centroids.xy_px
+    frame, truth = Flight(plan.lab).simulate_motion().render(0)
+    seen = solve_frame(build_tracker(plan.lab.camera), frame).centroids.xy_px
     mirrored = truth.sources.xy_px[truth.sources.id >= MIRRORED]
     near = (np.linalg.norm(mirrored[:, None] - seen, axis=2).min(axis=1) < 2).sum()
     assert near > 0
     assert abs(int(found[1]) - near) <= max(1, 0.2 * near)
     dull = SHINY | {"light__reflection": f"{{specular: {found[2]}}}"}
-    assert not dome_warnings.mirror_images(*plan_of("apl_dome", **dull))
+    assert not dome_warnings.mirror_images(plan_of("apl_dome", **dull))
 
 
 @pytest.mark.slow
@@ -198,21 +198,21 @@ def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(
         "mount_arcsec_k": str(list(mount)),
         "creep": f"[{0 if any(mount) else 1} mm, 0 mm, 0 mm]",
     }
-    context, samples = plan_of(
+    plan = plan_of(
         "thermal_drift", **{f"thermal__{key}": value for key, value in keys.items()}
     )
-    view = samples.frames.used[0]
-    at = samples.frames.attitudes
+    view = plan.frames.used[0]
+    at = plan.frames.attitudes
     distance_m, arm_m = (
         np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m)
     )
-    turn = findings.drift_rad(view, at.lab_from_body[0], 0.0, context) / ARCSEC_RAD
+    turn = findings.drift_rad(view, at.lab_from_body[0], 0.0, plan) / ARCSEC_RAD
     if any(mount):
         np.testing.assert_allclose(
             turn[:2], 25 * np.array(mount[:2]) * distance_m / arm_m, rtol=0.01
         )
         assert turn[2] == pytest.approx(25 * mount[2], rel=0.01)
-        line = findings.thermal_drift(context, samples)
+        line = findings.thermal_drift(plan)
         assert re.match(
             rf"thermal.reference_c: .* by {np.hypot(*turn[:2]):.0f}″ \(cross\) at 45.0 °C, t = ",
             line,
@@ -223,4 +223,4 @@ def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(
 
 @pytest.mark.slow
 def test_the_scene_that_drifts_stays_within_its_survey() -> None:
-    assert findings.thermal_drift(*plan_of("thermal_drift")) == ""
+    assert findings.thermal_drift(plan_of("thermal_drift")) == ""

@@ -39,11 +39,11 @@ def model(folder: Path, right: str, wrong: str) -> str:
 def warned(lab: Lab) -> list[str]:
     """The warnings of vehicle_facts alone."""
     context = plan_check.context_of(lab)
-    return [line for find in vehicle_facts.FINDINGS if (line := find(context, None))]  # type: ignore[arg-type]
+    return [line for find in vehicle_facts.FINDINGS if (line := find(context))]  # type: ignore[arg-type]
 
 
 def maneuver_of(lab: Lab) -> list[str]:
-    found = vehicle_facts.maneuver(plan_check.context_of(lab), None)  # type: ignore[arg-type]
+    found = vehicle_facts.maneuver(plan_check.context_of(lab))  # type: ignore[arg-type]
     assert found is not None
     return found.lines
 
@@ -156,15 +156,12 @@ def test_a_field_that_passes_the_rim_is_covered_by_no_cap() -> None:
         motion__maneuver="[]",
         vehicle__camera_rotation_deg="[15, 0, 0]",
     )
-    context = plan_check.context_of(lab)
-    samples = plan_check.samples_of(context, plan_check.attitudes.of_frames(lab), None)
-    margin = facts.cap_margin(context, samples)
+    plan = plan_check.plan_of(lab, plan_check.attitudes.of_frames(lab))
+    margin = facts.cap_margin(plan)
     assert margin is not None
     assert math.isinf(margin.needed_deg)
     assert "no cap covers it" in margin.text
-    assert "no cap covers it (40.2 at most); tilt less" in findings.cap_too_small(
-        context, samples
-    )
+    assert "no cap covers it (40.2 at most); tilt less" in findings.cap_too_small(plan)
 
 
 def test_the_forecast_of_saturation_is_that_of_the_flight() -> None:

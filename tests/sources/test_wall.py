@@ -14,7 +14,7 @@ from skysim.scene import loader
 from skysim.scene.sections.light import SphereSurfaceConfig
 from skysim.simulation.checks import facts
 from skysim.simulation.checks.detection import context_of
-from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.lab import build_lab
 from skysim.sources.dome.surface import Radial, build_surface
 from skysim.sources.dome.wall import WallSize, wall_size
@@ -104,7 +104,7 @@ def test_a_check_states_the_size_of_a_formed_wall(density: float | None) -> None
     surface = {"kind": "sphere", "radius": "1.2 m", "apex": "1.194 m", "rim_deg": 40}
     wall = UNIFORM | ({"density_kg_m3": density} if density else {})
     scene = loader.load("afit_test3", {"light.surface": json.dumps(surface | {"wall": wall})})
-    fact = facts.wall(context_of(build_lab(scene)), cast(CheckedSamples, None))
+    fact = facts.wall(cast(Plan, context_of(build_lab(scene))))
     assert fact is not None
     assert facts.wall in facts.FACTS
     area_m2, volume_m3 = spherical_shell(1.194, 1.2, 40)

@@ -95,26 +95,6 @@ def scale_to_limit(command: Floats, limit: float) -> Floats:
     return command * (limit / peak if peak > limit else 1.0)
 
 
-def unit_columns(axes: Floats, name: str) -> Floats:
-    """(3, n) axes as floats. Raises InputError unless they are unit vectors."""
-    # One memory layout, since numba compiles for each.
-    columns = np.ascontiguousarray(axes, dtype=float)
-    if columns.ndim != 2 or len(columns) != 3 or not columns.size:
-        raise InputError(name, f"shape {columns.shape}", "(3, n), one column each")
-    norm = np.linalg.norm(columns, axis=0)
-    if not np.all(np.abs(norm - 1) < 1e-6):
-        raise InputError(name, f"lengths {np.round(norm, 6).tolist()}", "unit vectors")
-    return columns
-
-
-def positive_values(value: Floats, n: int, name: str) -> Floats:
-    """(n,) values as floats. Raises InputError unless they are n positive numbers."""
-    values = np.asarray(value, dtype=float)
-    if values.shape != (n,) or not np.all(values > 0):
-        raise InputError(name, values.tolist(), f"{n} positive numbers")
-    return values
-
-
 # Joints, sites and motors of actuators in the MuJoCo model.
 
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)

@@ -41,11 +41,12 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 
 
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
-    """All actuators that are switched on, by their key in `vehicle`."""
-    return {
-        kind.key: kind.control(model, getattr(vehicle, kind.key))
-        for kind in kinds_on(vehicle)
-    }
+    """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
+    motors = np.array([model.actuator(name).id for name in TORQUES])
+    found: dict[str, Actuators] = {"ideal": IdealTorque(motors, vehicle.torque_limit_nm)}
+    for kind in kinds_on(vehicle):
+        found[kind.key] = kind.control(model, getattr(vehicle, kind.key))
+    return found
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
@@ -164,18 +165,11 @@ def check_names(spec: Any, path: Path) -> None:
 def check_bare(joint: Any, path: Path) -> None:
     """Raise InputError if the file gives an actuator's joint a limit, spring, damping or drive; the scene sets them."""
     # Each of these would act in addition to the scene's values.
-    attributes = {
-        "range": joint.range,
-        "stiffness": joint.stiffness,
-        "springref": joint.springref,
-        "damping": joint.damping,
-        "frictionloss": joint.frictionloss,
-        "armature": joint.armature,
-        "actuatorfrcrange": joint.actfrcrange,
-    }
-    for name, value in attributes.items():
-        if np.any(value):
+    names = "range stiffness springref damping frictionloss armature actfrcrange"
+    for name in names.split():
+        if np.any(getattr(joint, name)):
+            in_file = name.replace("actfrc", "actuatorfrc")
             raise InputError(
                 path,
-                f"joint {joint.name}: {name} is set by the scene; remove it from the file",
+                f"joint {joint.name}: {in_file} is set by the scene; remove it from the file",
             )

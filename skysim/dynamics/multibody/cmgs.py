@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
@@ -34,9 +34,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     add_motor,
     joints,
     member_values,
-    positive_values,
     scale_to_limit,
-    unit_columns,
 )
 from skysim.scene.sections.vehicle import CmgsConfig
 
@@ -166,7 +164,7 @@ def vscmg_commands(
     return rate * scale, torque * scale
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CmgSet:
     """A set of n control moment gyroscopes: rotating the axle of a spinning rotor gives a torque.
 
@@ -193,7 +191,7 @@ class CmgSet:
     Raises
     ------
     InputError
-        If axes are not unit vectors or not at right angles, or for an unknown steering law.
+        If axes are not at right angles.
     """
 
     gimbal_axes: Floats
@@ -205,25 +203,13 @@ class CmgSet:
     cross_axes: Floats = field(init=False, repr=False)  # (3, n) g x s
 
     def __post_init__(self) -> None:
-        gimbal = unit_columns(self.gimbal_axes, "gimbal axes")
-        spin = unit_columns(self.spin_axes, "rotor axes")
-        inertia = positive_values(
-            self.rotor_inertia_kg_m2, gimbal.shape[1], "rotor_inertia_kg_m2"
-        )
-        if spin.shape != gimbal.shape or np.abs((gimbal * spin).sum(axis=0)).max() > 1e-6:
+        if np.abs((self.gimbal_axes * self.spin_axes).sum(axis=0)).max() > 1e-6:
             raise InputError(
                 "rotor axes", "", "one for each gimbal, at right angles to its axis"
             )
-        if self.steering not in STEERING:
-            raise InputError(
-                "cmgs.steering", *unknown_name("steering law", self.steering, STEERING)
-            )
-        # A frozen dataclass is completed by object.__setattr__.
-        arrays = {"gimbal_axes": gimbal, "spin_axes": spin, "rotor_inertia_kg_m2": inertia}
-        for name, value in arrays.items():
-            object.__setattr__(self, name, value)
-        object.__setattr__(
-            self, "cross_axes", np.ascontiguousarray(np.cross(gimbal, spin, axis=0))
+        # One memory layout, since numba compiles for each.
+        self.cross_axes = np.ascontiguousarray(
+            np.cross(self.gimbal_axes, self.spin_axes, axis=0)
         )
 
     def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:

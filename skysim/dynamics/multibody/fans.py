@@ -9,7 +9,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from skysim.core.errors import InputError
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
@@ -20,7 +19,6 @@ from skysim.dynamics.multibody.actuator_kind import (
     all_names,
     scale_to_limit,
     sites,
-    unit_columns,
 )
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
@@ -67,7 +65,7 @@ class Fans:
         return len(self.names)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FanSet:
     """A set of n fans, whose thrust has a lever arm about the bearing's center: T = sum position x axis thrust.
 
@@ -79,33 +77,20 @@ class FanSet:
         (3, n) positions from the center of rotation, in body axes
     thrust_limit_n
         Greatest thrust of each fan
-
-    Raises
-    ------
-    InputError
-        If axes are not unit vectors, or positions have another shape.
+    torque_per_thrust_m, thrust_from_torque
+        (3, n) lever arms in N m per N, and their pseudo-inverse (n, 3)
     """
 
     force_axes: Floats
     positions_m: Floats
     thrust_limit_n: float
-    torque_per_thrust_m: Floats = field(
-        init=False, repr=False
-    )  # (3, n) lever arms, N m per N
-    thrust_from_torque: Floats = field(init=False, repr=False)  # (n, 3)
+    torque_per_thrust_m: Floats = field(init=False, repr=False)
+    thrust_from_torque: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        axes = unit_columns(self.force_axes, "fan axes")
-        positions = np.asarray(self.positions_m, dtype=float)
-        if positions.shape != axes.shape:
-            raise InputError(
-                "fan positions_m", f"shape {positions.shape}", f"{axes.shape}, as the axes"
-            )
-        # Lever arms, and their pseudo-inverse.
-        arms = np.cross(positions, axes, axis=0)
-        object.__setattr__(self, "torque_per_thrust_m", arms)
-        object.__setattr__(
-            self, "thrust_from_torque", np.linalg.pinv(arms, rcond=RANK_TOLERANCE)
+        self.torque_per_thrust_m = np.cross(self.positions_m, self.force_axes, axis=0)
+        self.thrust_from_torque = np.asarray(
+            np.linalg.pinv(self.torque_per_thrust_m, rcond=RANK_TOLERANCE), np.float64
         )
 
     def torque(self, thrust_n: Floats) -> Floats:

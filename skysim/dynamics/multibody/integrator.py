@@ -79,11 +79,7 @@ class Simulation:
         self.step = self.first_step = 0
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
-        self.set_initial_state(lab_from_body, rate_body_rad_s)
-
-    def set_initial_state(self, lab_from_body: Rotation, rate_body_rad_s: Floats) -> None:
-        """Set the initial state; wheel speeds, rotor speeds and gimbal angles are those of the scene."""
-        vehicle = self.vehicle
+        # The initial state; wheel speeds, rotor speeds and gimbal angles are those of the scene.
         data = self.data
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
         data.qvel[:3] = rate_body_rad_s
@@ -181,18 +177,13 @@ class Simulation:
     def check_warnings(self) -> None:
         """Raise InputError if the last call made MuJoCo warn."""
         if self.data.warning.number.any():
+            kinds = np.flatnonzero(self.data.warning.number).tolist()
+            names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
             raise InputError(
                 "motion",
                 f"not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
-                f" ({self.warning_names()}); check vehicle and motion.control for stiff, fast or NaN values",
+                f" ({names}); check vehicle and motion.control for stiff, fast or NaN values",
             )
-
-    def warning_names(self) -> str:
-        """Names of the kinds of warnings that MuJoCo counted."""
-        counts = [warning.number for warning in self.data.warning]
-        # The last member of MuJoCo's enumeration is its length, which has no count.
-        warnings = list(mujoco.mjtWarning.__members__.values())[: len(counts)]
-        return ", ".join(str(warning.name) for warning in warnings if counts[int(warning)])
 
     def times_s(self, begin: int, end: int) -> Floats:
         """(end - begin,) times of the steps begin, ..., end - 1."""

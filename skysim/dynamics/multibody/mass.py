@@ -23,7 +23,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import joints
 from skysim.dynamics.multibody.actuators import TRIM
-from skysim.scene.sections.vehicle import TrimConfig, VehicleConfig, WheelsConfig
+from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"
 
@@ -258,18 +258,6 @@ class Trims:
         return MassProperties(at_zero.mass_kg, center_m, at_zero.inertia_kg_m2 + inertia)
 
 
-def held_position_m(config: TrimConfig, names: tuple[str, ...]) -> Floats:
-    """(n,) positions of the scene, rounded to whole steps of the motors. Raises InputError for a wrong number."""
-    if config.position_m and len(config.position_m) != len(names):
-        raise InputError(
-            "vehicle.trim.position",
-            f"{len(config.position_m)} values",
-            f"{len(names)}, one for each of {', '.join(names)}, or none",
-        )
-    position_m = np.array(config.position_m or (0.0,) * len(names))
-    return config.step_m * np.round(position_m / config.step_m)
-
-
 def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:
     """Move the trim masses of a spec to their positions and remove their joints; model is the compiled spec before."""
     # 1. Axes and centers at position zero, from the compiled model.
@@ -282,7 +270,17 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     axes = data.xaxis[ids].T.copy()
     centers_m = data.subtree_com[bodies].T.copy()
     # 2. Move the bodies.
-    position_m = held_position_m(vehicle.trim, names) if vehicle.trim else np.zeros(0)
+    position_m = np.zeros(0)
+    if config := vehicle.trim:
+        if config.position_m and len(config.position_m) != len(names):
+            raise InputError(
+                "vehicle.trim.position",
+                f"{len(config.position_m)} values",
+                f"{len(names)}, one for each of {', '.join(names)}, or none",
+            )
+        # Whole steps of the motors.
+        wanted_m = np.array(config.position_m or (0.0,) * len(names))
+        position_m = config.step_m * np.round(wanted_m / config.step_m)
     for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:

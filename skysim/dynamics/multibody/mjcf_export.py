@@ -17,6 +17,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
@@ -29,7 +30,7 @@ from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig, RoomConfig
+from skysim.scene.sections.light import RoomConfig
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Ellipsoid, Plane, Surface
 
@@ -70,10 +71,6 @@ def mjcf(
 
     Parameters
     ----------
-    vehicle
-        Vehicle of the scene
-    scene
-        The scene
     sources
         LEDs in lab coordinates (m), or stars; the brightest stars are put on a sphere
     lab_from_body
@@ -93,7 +90,7 @@ def mjcf(
             f"camera name {LAB_CAMERA!r} is reserved for the view of the laboratory; rename it",
         )
     on_earth = vehicle.config.mount == "air_bearing"
-    dome = scene.light if isinstance(scene.light, DomeConfig) else None
+    dome = scene.dome
     inside = surface.build_surface(dome.surface) if dome else SKY
     hide_tilt_stop(spec)
     inline_meshes(spec, vehicle.model)
@@ -111,7 +108,11 @@ def mjcf(
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
     add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
-    add_start_keyframe(spec, vehicle, scene, lab_from_body)
+    rate_rad_s = guidance.body_rate_rad_s(scene, lab_from_body)
+    start = Simulation(vehicle, lab_from_body, rate_rad_s, 0.0).data
+    spec.add_key(
+        name="start", qpos=start.qpos, qvel=start.qvel, act=start.act, ctrl=start.ctrl
+    )
     # 4. Text.
     with mujoco_warnings(), full_precision():
         compile_spec(spec, SCENES / scene.vehicle.model)
@@ -134,10 +135,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
         if not mesh.file:
             continue
         compiled_mesh = model.mesh(mesh.name or Path(mesh.file).stem)
-        first = int(compiled_mesh.vertadr[0])
-        count = int(compiled_mesh.vertnum[0])
-        begin = int(compiled_mesh.faceadr[0])
-        faces = int(compiled_mesh.facenum[0])
+        vertices_m, faces = mesh_arrays(model, compiled_mesh.id)
         file_from_compiled = Rotation.from_quat(
             model.mesh_quat[compiled_mesh.id], scalar_first=True
         )
@@ -146,11 +144,16 @@ def inline_meshes(spec: Any, model: Any) -> None:
         mesh.scale = [1.0, 1.0, 1.0]
         mesh.refpos = [0.0, 0.0, 0.0]
         mesh.refquat = [1.0, 0.0, 0.0, 0.0]
-        mesh.uservert = (
-            file_from_compiled.apply(model.mesh_vert[first : first + count])
-            + model.mesh_pos[compiled_mesh.id]
-        ).ravel()
-        mesh.userface = model.mesh_face[begin : begin + faces].ravel()
+        placed_m = file_from_compiled.apply(vertices_m) + model.mesh_pos[compiled_mesh.id]
+        mesh.uservert = placed_m.ravel()
+        mesh.userface = faces.ravel()
+
+
+def mesh_arrays(model: Any, k: int) -> tuple[Floats, NDArray[np.int32]]:
+    """(N, 3) vertices and (M, 3) faces of mesh k of a compiled model."""
+    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
+    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
+    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()
 
 
 def add_backdrop(spec: Any, on_earth: bool) -> None:
@@ -328,41 +331,34 @@ def add_sheet(
     b = np.roll(index, -1, axis=1)[:-1].ravel()
     c = np.roll(index, -1, axis=1)[1:].ravel()
     inwards = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    for side, faces, rgba in (
-        ("inside", inwards, inside_rgba),
-        ("outside", inwards[:, ::-1], outside_rgba),
-    ):
-        add_mesh(
-            spec,
-            spec.worldbody,
-            f"{name}_{side}",
-            rings_m.reshape(-1, 3),
-            faces,
-            rgba,
-            GROUP_LIGHTS,
-        )
+    points_m = rings_m.reshape(-1, 3)
+    add_mesh(spec, f"{name}_inside", points_m, inwards, inside_rgba)
+    add_mesh(spec, f"{name}_outside", points_m, inwards[:, ::-1], outside_rgba)
 
 
 def add_mesh(
     spec: Any,
-    body: Any,
     name: str,
     vertices_m: Floats,
     faces: Ints,
     rgba: Any,
-    group: int,
+    body: Any = None,
+    group: int = GROUP_LIGHTS,
     **more: Any,
 ) -> None:
-    """Add a mesh, open or closed, and its geom; its inertia is that of a shell, which needs no volume."""
+    """Add a mesh, open or closed, and its geom on a body, by default in the lab.
+
+    Its inertia is that of a shell, which needs no volume.
+    """
     mesh = spec.add_mesh(
         name=name,
         uservert=np.round(vertices_m, 6).ravel(),
         userface=faces.astype(np.int32).ravel(),
     )
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    add_visual_geom(
-        body, name, mujoco.mjtGeom.mjGEOM_MESH, meshname=name, rgba=rgba, group=group, **more
-    )
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    more |= {"meshname": name, "rgba": rgba, "group": group}
+    add_visual_geom(body or spec.worldbody, name, kind, **more)
 
 
 def add_lights(spec: Any, sources: Sources) -> None:
@@ -387,16 +383,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
         vertices, faces = octahedra(position_m[level == step], radius_m[level == step])
         rgba = [*(LIT_RGB * (DIM + (1 - DIM) * step / LEVELS)), 1.0]
         name = f"stage_{'stars' if stars else 'leds'}_{step}"
-        add_mesh(
-            spec,
-            spec.worldbody,
-            name,
-            vertices,
-            faces,
-            rgba,
-            GROUP_LIGHTS,
-            material=glow.name,
-        )
+        add_mesh(spec, name, vertices, faces, rgba, material=glow.name)
 
 
 def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, Ints]:
@@ -422,15 +409,10 @@ def field_corners(
     the sky.
     """
     # Corners are half a pixel outside of the outer pixels' centers.
-    x = (
-        np.array([-0.5, camera.width_px - 0.5, camera.width_px - 0.5, -0.5])
-        - camera.center_px[0]
-    )
-    y = (
-        np.array([-0.5, -0.5, camera.height_px - 0.5, camera.height_px - 0.5])
-        - camera.center_px[1]
-    )
-    rays_cam = np.column_stack([x, y, np.full(4, camera.focal_px)])
+    size_px = np.array([camera.width_px, camera.height_px])
+    corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size_px - 0.5
+    xy_px = corners_px - camera.center_px
+    rays_cam = np.column_stack([xy_px, np.full(4, camera.focal_px)])
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()
     rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
@@ -447,7 +429,7 @@ def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     glow = spec.add_material(name="stage_field", emission=0.6, specular=0.0)
     more = {"material": glow.name, "group": GROUP_FIELD}
     vertices = np.vstack([tip, corners_m])
-    add_mesh(spec, bus, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], **more)
+    add_mesh(spec, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], bus, **more)
     # Edges of the pyramid: a ray to each corner, and the side to the previous corner.
     length_m = np.linalg.norm(corners_m - tip, axis=1).min()
     for k, corner in enumerate(corners_m):
@@ -475,12 +457,10 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     tangent = np.tan(np.radians(FOVY_DEG / 2))
     distance = max(1.25 * size / tangent, wide * (1.05 / (4 / 3 * tangent) + 0.35))
     middle = np.array([0.0, 0.0, top - size])
-    return (
-        middle + distance * direction(-62.0, 8.0),
-        middle,
-        np.array([0.0, 0.0, 1.0]),
-        0.55 * distance,
-    )
+    # From the azimuth -62 deg and 8 deg above.
+    toward_eye = Rotation.from_euler("ZY", [-62.0, -8.0], degrees=True).apply([1.0, 0.0, 0.0])
+    up = np.array([0.0, 0.0, 1.0])
+    return middle + distance * toward_eye, middle, up, 0.55 * distance
 
 
 def sky_view(
@@ -495,13 +475,6 @@ def sky_view(
         boresight
     )
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
-
-
-def direction(azimuth_deg: float, elevation_deg: float) -> Floats:
-    """(3,) unit vector in lab axes."""
-    azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    ring = np.cos(elevation)
-    return np.array([ring * np.cos(azimuth), ring * np.sin(azimuth), np.sin(elevation)])
 
 
 def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
@@ -525,16 +498,6 @@ def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: floa
     spec.visual.map.zfar = 50.0
     spec.visual.global_.azimuth = float(np.degrees(np.arctan2(-back[1], -back[0])))
     spec.visual.global_.elevation = float(-np.degrees(np.arcsin(back[2])))
-
-
-def add_start_keyframe(
-    spec: Any, vehicle: VehicleModel, scene: Scene, lab_from_body: Rotation
-) -> None:
-    """Add the keyframe `start`: attitude and rate, wheel and rotor speeds, gimbal angles and servo set-points."""
-    rate_rad_s = guidance.body_rate_rad_s(scene, lab_from_body)
-    simulation = Simulation(vehicle, lab_from_body, rate_rad_s, 0.0)
-    data = simulation.data
-    spec.add_key(name="start", qpos=data.qpos, qvel=data.qvel, act=data.act, ctrl=data.ctrl)
 
 
 @contextmanager

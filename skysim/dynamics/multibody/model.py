@@ -228,31 +228,25 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
 
     The body that carries the camera moves, or the camera itself if it is on bus. Only the camera turns.
     """
+    camera = spec.camera(CAMERA)
     if any(vehicle.camera_rotation_deg):
-        turn_camera(spec, vehicle.camera_rotation_deg)
+        # The rotation vector is in the camera's axes (+x right, +y down, +z boresight).
+        wxyz = spec.compile().camera(CAMERA).quat
+        file_from_turned = Rotation.from_rotvec(vehicle.camera_rotation_deg, degrees=True)
+        mjcam_from_turned = CAM_FROM_MJCAM.inv() * file_from_turned * CAM_FROM_MJCAM
+        parent_from_turned = Rotation.from_quat(wxyz, scalar_first=True) * mjcam_from_turned
+        camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+        camera.quat = parent_from_turned.as_quat(scalar_first=True)
     if vehicle.camera_m is None:
         return
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    camera = spec.camera(CAMERA)
     carrier = camera if camera.parent.name == "bus" else camera.parent
     R_lab_from_parent = data.body(carrier.parent.name).xmat.reshape(3, 3)
     mujoco.mj_camlight(model, data)
     offset_m = np.array(vehicle.camera_m) - data.camera(CAMERA).xpos
     carrier.pos = carrier.pos + R_lab_from_parent.T @ offset_m
-
-
-def turn_camera(spec: Any, rotation_deg: tuple[float, float, float]) -> None:
-    """Turn the camera by a rotation vector in its own axes (+x right, +y down, +z boresight)."""
-    parent_from_file = Rotation.from_quat(
-        spec.compile().camera(CAMERA).quat, scalar_first=True
-    )
-    file_from_turned = Rotation.from_rotvec(rotation_deg, degrees=True)
-    mjcam_from_turned = CAM_FROM_MJCAM.inv() * file_from_turned * CAM_FROM_MJCAM
-    camera = spec.camera(CAMERA)
-    camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    camera.quat = (parent_from_file * mjcam_from_turned).as_quat(scalar_first=True)
 
 
 def gravity_lab_m_s2(vehicle: VehicleConfig) -> list[float]:

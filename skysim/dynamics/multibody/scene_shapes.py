@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN
+from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN, mesh_arrays
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 
 KINDS = {
@@ -88,11 +88,9 @@ def laboratory(mjcf: str) -> Laboratory:
 
 def is_shown(model: mujoco.MjModel, n: int) -> bool:
     """Whether the geom with index n is visible and is no light."""
-    kind = mujoco.mjtGeom(model.geom_type[n])
-    name = model.geom(n).name
-    return (
-        kind in KINDS and model.geom_group[n] != GROUP_HIDDEN and not name.startswith(LIGHTS)
-    )
+    known = mujoco.mjtGeom(model.geom_type[n]) in KINDS
+    is_light = model.geom(n).name.startswith(LIGHTS)
+    return known and model.geom_group[n] != GROUP_HIDDEN and not is_light
 
 
 def shape(model: mujoco.MjModel, data: mujoco.MjData, n: int) -> Shape:
@@ -127,7 +125,4 @@ def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
     """Vertices (N, 3) and faces (M, 3) of the mesh of a geom; empty for other kinds."""
     if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)
-    k = model.geom_dataid[n]
-    vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
-    faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])
-    return model.mesh_vert[vertices].astype(float), model.mesh_face[faces].copy()
+    return mesh_arrays(model, model.geom_dataid[n])

@@ -27,16 +27,14 @@ from skysim.dynamics.multibody.actuator_kind import (
     add_motor,
     joints,
     member_values,
-    positive_values,
     scale_to_limit,
-    unit_columns,
 )
 from skysim.scene.sections.vehicle import WheelsConfig
 
 WHEEL = "wheel_"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class WheelSet:
     """A set of n reaction wheels. A motor torque u on a wheel acts oppositely on the body: T = -sum axis u.
 
@@ -52,11 +50,6 @@ class WheelSet:
         Greatest speed relative to the body
     motor_from_torque
         (n, 3) minus the pseudo-inverse of the axes
-
-    Raises
-    ------
-    InputError
-        If axes are not unit vectors, or inertias are not positive.
     """
 
     axes: Floats
@@ -66,13 +59,9 @@ class WheelSet:
     motor_from_torque: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        axes = unit_columns(self.axes, "wheel axes")
-        object.__setattr__(self, "axes", axes)
-        inertia = positive_values(self.inertia_kg_m2, axes.shape[1], "wheel inertia_kg_m2")
-        object.__setattr__(self, "inertia_kg_m2", inertia)
         # T = -axes u, solved for u.
-        object.__setattr__(
-            self, "motor_from_torque", -np.linalg.pinv(axes, rcond=RANK_TOLERANCE)
+        self.motor_from_torque = np.asarray(
+            -np.linalg.pinv(self.axes, rcond=RANK_TOLERANCE), np.float64
         )
 
     def momentum(self, speed_rad_s: Floats) -> Floats:

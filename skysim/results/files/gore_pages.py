@@ -27,6 +27,7 @@ from skysim.results.files.templates import (
     Polyline,
     Shape,
     SheetText,
+    cross,
     gore,
     gore_count,
     moved,
@@ -59,39 +60,37 @@ def pages(dome: Dome, paper: str) -> Iterator[Page]:
         raise InputError("paper", *unknown_name("paper", paper, PAPERS))
     width_mm, height_mm = SHEETS_MM.get(paper, (math.inf, math.inf))
     count = gore_count(dome, 1e-3 * (width_mm - 2 * MARGIN_MM))
-    all_gores = (gore(dome, number, count) for number in range(count))
-    if paper == "roll":
-        yield from roll_pages(dome.name, list(all_gores))
+    gores = [gore(dome, number, count) for number in range(count)]
+    if paper not in SHEETS_MM:
+        yield from long_pages(dome.name, gores, ROLL_MM if paper == "roll" else 0.0)
         return
-    for number, one in enumerate(all_gores, 1):
+    for number, one in enumerate(gores, 1):
         title = f"{dome.name}: gore {number} of {count}, seen from inside"
-        if paper == "gore":
-            yield whole_page(title, one.shapes, np.ptp(one.outline_mm, axis=0).tolist(), one)
-        else:
-            yield from sheet_pages(title, one, width_mm, height_mm)
+        yield from sheet_pages(title, one, width_mm, height_mm)
 
 
-def whole_page(title: str, shapes: list[Shape], size_mm: list[float], first: Gore) -> Page:
-    """A page as large as what it shows, and at least as wide as its title."""
-    half_mm = float(first.outline_mm[:, 0].max())
-    width_mm = max(size_mm[0], 1.5 * RULE_MM) + 2 * MARGIN_MM
+def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
+    """As many gores side by side as a page of this width has room for; one on a page that is as large as the gore.
+
+    A page is at least as wide as its title.
+    """
+    half_mm = max(float(one.outline_mm[:, 0].max()) for one in gores)
+    length_mm = max(float(one.outline_mm[:, 1].max()) for one in gores)
+    step_mm = 2 * half_mm + GAP_MM
+    across = max(1, int((width_mm - 2 * MARGIN_MM + GAP_MM) // step_mm))
+    page_mm = max(width_mm, 2 * (half_mm + MARGIN_MM), 1.5 * RULE_MM + 2 * MARGIN_MM)
     # The title of a gore is above its apex.
-    height_mm = size_mm[1] + 2 * MARGIN_MM + HEAD_MM + CAPTION_MM
-    return Page(width_mm, height_mm, title, (-half_mm, -CAPTION_MM), shapes)
-
-
-def roll_pages(name: str, gores: list[Gore]) -> Iterator[Page]:
-    """As many gores side by side as the roll is wide, again and again."""
-    step_mm = 2 * float(gores[0].outline_mm[:, 0].max()) + GAP_MM
-    across = max(1, int((ROLL_MM - 2 * MARGIN_MM + GAP_MM) // step_mm))
-    height_mm = float(max(one.outline_mm[:, 1].max() for one in gores))
+    height_mm = length_mm + 2 * MARGIN_MM + HEAD_MM + CAPTION_MM
     for first in range(0, len(gores), across):
         some = gores[first : first + across]
         shapes = [
             moved(shape, n * step_mm, 0) for n, one in enumerate(some) for shape in one.shapes
         ]
-        title = f"{name}: gores {first + 1} to {first + len(some)} of {len(gores)}, seen from inside"
-        yield whole_page(title, shapes, [ROLL_MM - 2 * MARGIN_MM, height_mm], some[0])
+        which = (
+            f"gores {first + 1} to {first + len(some)}" if width_mm else f"gore {first + 1}"
+        )
+        title = f"{name}: {which} of {len(gores)}, seen from inside"
+        yield Page(page_mm, height_mm, title, (-half_mm, -CAPTION_MM), shapes)
 
 
 def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Iterator[Page]:
@@ -113,12 +112,8 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
 
 def registration_mark(x_mm: float, y_mm: float) -> list[Shape]:
     """A circle with a cross."""
-    reach_mm = 1.5 * MARK_MM
-    return [
-        Circle(x_mm, y_mm, MARK_MM, "MARKS"),
-        Polyline(np.array([[x_mm - reach_mm, y_mm], [x_mm + reach_mm, y_mm]]), layer="MARKS"),
-        Polyline(np.array([[x_mm, y_mm - reach_mm], [x_mm, y_mm + reach_mm]]), layer="MARKS"),
-    ]
+    circle = Circle(x_mm, y_mm, MARK_MM, "MARKS")
+    return [circle, *cross(x_mm, y_mm, 1.5 * MARK_MM, "MARKS")]
 
 
 def write_pdf(path: Path, dome: Dome, paper: str) -> int:

@@ -25,7 +25,7 @@ from skysim.core.types import Floats, Sources
 from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
-from skysim.scene.sections.leds import LedConfig, PwmConfig, SequentialConfig
+from skysim.scene.sections.leds import PwmConfig, SequentialConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import Ints
@@ -232,7 +232,7 @@ class PartsList(NamedTuple):
 
 
 class DomeDesign(NamedTuple):
-    """A dome as designed: what the functions of this module count."""
+    """A dome as designed; boards may stand out beyond the cap of the layout."""
 
     light: DomeConfig
     surface: Surface
@@ -271,14 +271,11 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     design = build_design(scene)
     layout = design.light.layout
     leds = len(design.leds)
-    shell = SHELLS.get(design.light.surface.kind, "shell")
-    found: Quantities = (
-        {}
-        if isinstance(layout, LcdConfig)
-        else {shell: cap_area_m2(design.surface, design.cap_deg)}
-    )
-    found |= MOUNTED.get(layout.kind, single_leds)(design)
+    found: Quantities = {"panel": 1}  # an LCD panel comes with all that drives it
     if not isinstance(layout, LcdConfig):
+        shell = SHELLS.get(design.light.surface.kind, "shell")
+        found = {shell: cap_area_m2(design.surface, design.cap_deg)}
+        found |= MOUNTED.get(layout.kind, single_leds)(design)
         found |= electronics(design) | {"power_supply": leds}
     if design.light.led.code and design.light.led.code.bit_time_s == "frame":
         found["trigger"] = 1
@@ -290,11 +287,11 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     return found
 
 
-def build_design(scene: Scene) -> DomeDesign:
-    """The scene's dome as designed. Raises InputError without a dome."""
+def build_design(scene: Scene, what: str = "parts") -> DomeDesign:
+    """The scene's dome as designed. Raises InputError without a dome, which has no `what`."""
     light = scene.dome
     if light is None:
-        raise InputError("light.kind", f"{scene.light.kind} has no parts", "dome")
+        raise InputError("light.kind", f"{scene.light.kind} has no {what}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
     return DomeDesign(
@@ -347,16 +344,10 @@ def fibers(design: DomeDesign) -> Quantities:
     }
 
 
-def panel(design: DomeDesign) -> Quantities:
-    """An LCD panel, with all that drives it."""
-    return {"panel": 1}
-
-
 MOUNTED: dict[str, Callable[[DomeDesign], Quantities]] = {
     "patch_boards": boards,
     "string": tape,
     "fibers": fibers,
-    "lcd": panel,
 }
 
 
@@ -384,11 +375,8 @@ def electronics(design: DomeDesign) -> Quantities:
     if led.drive.kind == "direct" and led.code is None:
         return {"resistor": count}
     channels: Quantities = {"driver": count, "microcontroller": count}
-    return channels | {"filter": count} if has_filter(led) else channels
-
-
-def has_filter(led: LedConfig) -> bool:
-    return isinstance(led.drive, PwmConfig) and led.drive.filter is not None
+    filtered = isinstance(led.drive, PwmConfig) and led.drive.filter is not None
+    return channels | {"filter": count} if filtered else channels
 
 
 def to_csv(parts: PartsList, name: str) -> str:

@@ -286,15 +286,9 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     from astropy.table import Table
 
     sources = truth.sources
-    table = Table(
-        {
-            "id": sources.id,
-            "x_px": sources.xy_px[:, 0],
-            "y_px": sources.xy_px[:, 1],
-            "flux_x_px": sources.flux_xy_px[:, 0],
-            "flux_y_px": sources.flux_xy_px[:, 1],
-        }
-    )
+    table = Table({"id": sources.id})
+    table["x_px"], table["y_px"] = sources.xy_px.T
+    table["flux_x_px"], table["flux_y_px"] = sources.flux_xy_px.T
     for name in ("electrons", "peak_e", "streak_px", "area_px", "snr", "saturated"):
         table[name] = getattr(sources, name)
     for name in table.colnames[1:-1]:
@@ -311,12 +305,9 @@ def write_truth(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         **{f"{name}_xyzw": getattr(truth, name).as_quat().tolist() for name in ATTITUDES},
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
         "hidden": truth.hidden.tolist(),
-        "lab": "ICRS axes" if scene.stars else "bearing center, z up",
+        "lab": STARS if scene.stars else "bearing center, z up",
     }
-    if truth.bodies:
-        table.meta["bodies"] = [dataclasses.asdict(body) for body in truth.bodies]
-    if truth.satellites:
-        table.meta["satellites"] = [
-            dataclasses.asdict(satellite) for satellite in truth.satellites
-        ]
+    for name, found in (("bodies", truth.bodies), ("satellites", truth.satellites)):
+        if found:
+            table.meta[name] = [dataclasses.asdict(one) for one in found]
     write_table(path, table)

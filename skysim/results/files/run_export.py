@@ -139,7 +139,7 @@ PROBE_BYTES = 1 << 20
 # Progress bar over items: items, count, label.
 Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]
 
-# Unit by the ending of a column's name; the longest matching ending applies.
+# Unit by the ending of a column's name; the first ending that matches applies.
 UNITS = {
     "_deg_s": "deg/s",
     "_deg_h": "deg/h",
@@ -168,30 +168,19 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
     """
     stars = run.is_celestial
     frames = (ICRF, CAMERA) if stars else (LAB, BODY)
-    true = [
-        (truth.frame, truth.mid_utc, truth.t_mid_s, attitude(truth, stars))
-        for truth in truths(run, bar)
-    ]
-    name = str(run.meta["scene"])
-    seed = run.meta["seed"]
-    epochs = {frame: utc for frame, utc, _, _ in true}
-
-    def write(
-        stem: str,
-        content: str,
-        utc: list[datetime.datetime],
-        a_from_b: Rotation,
-        between: tuple[str, str] = frames,
-    ) -> Path:
-        comments = [f"{content} of skysim, scene {name}, seed {seed}"]
-        path = out / f"{stem}.aem"
-        files.write_text(path, message(name, comments, between, utc, a_from_b))
-        return path
-
-    a_from_b = Rotation.concatenate([rotation for *_, rotation in true])
-    written = [
-        write("truth", "True mean attitude in the exposure", list(epochs.values()), a_from_b)
-    ]
+    true = list(truths(run, bar))
+    epochs = {truth.frame: truth.mid_utc for truth in true}
+    # Mean lab_from_cam or lab_from_body, the same convention as `Recording.solved`.
+    a_from_b = Rotation.concatenate(
+        [
+            Rotation.from_quat(truth.mean_cam_from_lab_xyzw).inv()
+            if stars
+            else Rotation.from_quat(truth.mean_lab_from_body_xyzw)
+            for truth in true
+        ]
+    )
+    content = "True mean attitude in the exposure"
+    found = [("truth", content, frames, list(epochs.values()), a_from_b)]
     solved = run.solved()
     if solved is not None:
         unknown = [frame for frame in solved[0].tolist() if frame not in epochs]
@@ -202,29 +191,21 @@ def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
                 "frames with truth",
             )
         utc = [epochs[frame] for frame in solved[0].tolist()]
-        written.append(
-            write(
-                "solutions",
-                "Attitude found by the star tracker",
-                utc,
-                solved[1],
-            )
-        )
+        content = "Attitude found by the star tracker"
+        found.append(("solutions", content, frames, utc, solved[1]))
     motion = run.motion()
     if motion is not None:
-        start = true[0][1] - datetime.timedelta(seconds=true[0][2])
+        start = true[0].mid_utc - datetime.timedelta(seconds=true[0].t_mid_s)
         utc = [start + datetime.timedelta(seconds=t_s) for t_s in motion[0].tolist()]
-        between = (ICRF if stars else LAB, BODY)
         content = "True motion of the vehicle, without jitter,"
-        written.append(write("motion", content, utc, motion[1], between))
+        found.append(("motion", content, (frames[0], BODY), utc, motion[1]))
+    name = str(run.meta["scene"])
+    written = []
+    for stem, content, between, utc, rotations in found:
+        notes = [f"{content} of skysim, scene {name}, seed {run.meta['seed']}"]
+        written.append(out / f"{stem}.aem")
+        files.write_text(written[-1], message(name, notes, between, utc, rotations))
     return written
-
-
-def attitude(truth: FrameTruth, stars: bool) -> Rotation:
-    """Mean lab_from_cam under the stars, lab_from_body in a laboratory; the same convention as `Recording.solved`."""
-    if stars:
-        return Rotation.from_quat(truth.mean_cam_from_lab_xyzw).inv()
-    return Rotation.from_quat(truth.mean_lab_from_body_xyzw)
 
 
 def truths(run: Recording, bar: Bar) -> Iterator[FrameTruth]:
@@ -337,8 +318,7 @@ def to_arrow(table: Any, run: Recording) -> Any:
 
 def unit_of(name: str) -> str:
     """Unit of a column from the ending of its name; empty if it has none."""
-    ending = max((suffix for suffix in UNITS if name.endswith(suffix)), key=len, default="")
-    return UNITS.get(ending, "")
+    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
 def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:

@@ -22,13 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.results.files.parts import build_design
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.layouts.string import directions
-from skysim.sources.dome.surface import Surface, build_surface, perpendicular
+from skysim.sources.dome.surface import Surface, perpendicular
 
 # A flat drawing in millimeters, as SVG to print and as DXF for a cutter.
 
@@ -117,7 +116,6 @@ def to_dxf(drawing: Drawing) -> str:
 
 def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
     """The group codes and values of a shape; a dashed line is on a layer of its own."""
-    kind = "CIRCLE" if isinstance(shape, Circle) else "TEXT"
     layer = (8, shape.layer)
     if isinstance(shape, Polyline):
         layer = (8, "HELP" if shape.dashed else shape.layer)
@@ -126,13 +124,9 @@ def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
             yield from ((0, "VERTEX"), layer, (10, x), (20, height_mm - y), (30, 0.0))
         yield from ((0, "SEQEND"), layer)
         return
-    yield from (
-        (0, kind),
-        layer,
-        (10, float(shape.x_mm)),
-        (20, float(height_mm - shape.y_mm)),
-        (30, 0.0),
-    )
+    yield 0, "CIRCLE" if isinstance(shape, Circle) else "TEXT"
+    yield layer
+    yield from ((10, float(shape.x_mm)), (20, float(height_mm - shape.y_mm)), (30, 0.0))
     if isinstance(shape, Circle):
         yield 40, float(shape.radius_mm)
     else:
@@ -185,20 +179,15 @@ def template(lab: Lab, ending: str) -> str:
 
 def dome_of(lab: Lab) -> Dome:
     """The dome that a scene's builder makes. Raises InputError without a dome."""
-    light = lab.scene.dome
-    if light is None:
-        raise InputError("light.kind", f"{lab.scene.light.kind} has no templates", "dome")
-    surface = build_surface(light.surface)
-    leds = design_leds(light, surface, lab.camera.band)
-    # Boards stand out.
-    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    design = build_design(lab.scene, "templates")
+    leds = design.leds
     return Dome(
         lab.scene.name,
-        surface,
-        cap_deg,
+        design.surface,
+        design.cap_deg,
         leds.id,
         leds.place[:, :3],
-        light.led.disk_diameter_m / 2,
+        design.light.led.disk_diameter_m / 2,
     )
 
 
@@ -263,8 +252,13 @@ def gore(dome: Dome, number: int, count: int) -> Gore:
         1e3 * FROM_INSIDE * on_paper_m(dome.surface, some, meridian_rad)
         for some in (edge, rays[own])
     )
-    shapes = [
-        *gore_shapes(outline_mm, f"{number + 1}: {math.degrees(meridian_rad):.4g} deg"),
+    x_mm, y_mm = outline_mm[0]
+    meridian_mm = np.array([[x_mm, y_mm], [x_mm, outline_mm[:, 1].max()]])
+    title = f"{number + 1}: {math.degrees(meridian_rad):.4g} deg"
+    shapes: list[Shape] = [
+        Polyline(outline_mm, closed=True),
+        Polyline(meridian_mm, dashed=True),
+        SheetText(x_mm - 12, y_mm - 2, 4.0, title),
         *marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m),
     ]
     return Gore(outline_mm, shapes)
@@ -317,21 +311,21 @@ def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
     return directions(tilt_rad, meridian_rad + aside_rad)
 
 
-def gore_shapes(outline_mm: Floats, title: str) -> Iterator[Shape]:
-    """The outline of a gore, its central meridian and its title at the apex."""
-    apex = outline_mm[0]
-    yield Polyline(outline_mm, closed=True)
-    yield Polyline(np.array([apex, [apex[0], outline_mm[:, 1].max()]]), dashed=True)
-    yield SheetText(apex[0] - 12, apex[1] - 2, 4.0, title)
-
-
 def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
     """A circle with a cross for each LED, and its number."""
     for number, (x, y) in zip(numbers, xy_mm, strict=True):
         yield Circle(x, y, radius_mm)
-        yield Polyline(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
-        yield Polyline(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
+        yield from cross(x, y, 1.0, "CENTERS")
         yield SheetText(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
+
+
+def cross(x_mm: float, y_mm: float, reach_mm: float, layer: str) -> list[Shape]:
+    """Two lines through a point."""
+    middle = np.array([x_mm, y_mm])
+    return [
+        Polyline(np.array([middle - arm, middle + arm]), layer=layer)
+        for arm in reach_mm * np.eye(2)
+    ]
 
 
 def shell_obj(dome: Dome) -> str:
@@ -357,16 +351,13 @@ def shell_obj(dome: Dome) -> str:
         high = 2 + (ring + 1) * SECTORS
         corners = zip(around + low, onward + low, onward + high, around + high, strict=True)
         lines += [f"f {a} {b} {c} {d}" for a, b, c, d in corners]
-    used = len(vertices_m)
-    for number, place_m, inward in zip(
-        dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True
-    ):
+    leds = zip(dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True)
+    for n, (number, place_m, inward) in enumerate(leds):
+        # A face counts from the pyramid's first vertex, 1-based.
+        first = len(vertices_m) + 4 * n + 1
+        faces = (first + np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])).tolist()
         lines += [f"o led_{number}", *vertex_lines(pyramid_m(place_m, inward))]
-        lines += [
-            f"f {used + a} {used + b} {used + c}"
-            for a, b, c in ((1, 2, 3), (1, 4, 2), (2, 4, 3), (3, 4, 1))
-        ]
-        used += 4
+        lines += [f"f {a} {b} {c}" for a, b, c in faces]
     return "\n".join([*lines, ""])
 
 

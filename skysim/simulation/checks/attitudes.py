@@ -18,7 +18,6 @@ from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.lab import Lab
 
 MAX_FRAMES = 400  # frames among which the fastest and the most tilted one are sought
@@ -139,7 +138,7 @@ def within_reach(
     """
     n = np.arange(DIRECTIONS)
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
         lab_from_cam = Rotation.from_euler(
             "ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad])
@@ -177,7 +176,7 @@ def describe(attitudes: CheckedAttitudes, n: int, lab: Lab) -> str:
     """Attitude n in words: RA and Dec of the boresight, or roll, pitch, yaw and tilt of the vehicle; and the time."""
     lab_from_body = attitudes.lab_from_body[n]
     t_s = attitudes.t_s[n]
-    if isinstance(lab.scene.light, StarsConfig):
+    if lab.scene.stars:
         x, y, z = boresights(lab_from_body, lab)
         ra_deg = math.degrees(math.atan2(y, x)) % 360
         dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))

@@ -15,12 +15,10 @@ from scipy.spatial import cKDTree
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
-from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks.views import CameraModel
 from skysim.simulation.lab import Lab
 from skysim.tracking import dome_map_file
@@ -32,6 +30,7 @@ from skysim.tracking.onboard_model import (
     assumed_stars,
     calibration,
     onboard_dome,
+    rows_of,
 )
 
 REACH_PX = 7.0  # greatest distance of a neighbor that displaces a centroid
@@ -50,16 +49,6 @@ class Beliefs:
     direction_error
         (N, 3) measured minus believed direction of each star in lab axes, from the catalog's errors and from
         neighbors; zeros for LEDs
-    led_sigma_m, lever_sigma_m
-        Standard deviations of the surveyed places along each axis (rms of the LEDs if an instrument measured them)
-    surface_sigma_m
-        Standard deviation of the surveyed surface along its normal, common to all LEDs
-    rotation_rad
-        (3,) rotation vector of the survey's axes, in lab axes
-    lever_error_m
-        (3,) believed minus true position of the camera, in body axes
-    focal_error, focal_sigma
-        Relative error of the focal length, and its relative standard deviation
     camera
         Camera with the believed distortion
     faintest_mag
@@ -68,23 +57,35 @@ class Beliefs:
         Epoch of its star catalog; NaN under a dome
     dome
         Camera, map and lever of the tracker, with the LEDs in the order of `lights`; None under other lights
+    led_sigma_m, lever_sigma_m
+        Standard deviations of the surveyed places along each axis (rms of the LEDs if an instrument measured them)
+    focal_sigma
+        Relative standard deviation of the focal length
+    rotation_rad
+        (3,) rotation vector of the survey's axes, in lab axes
+    lever_error_m
+        (3,) believed minus true position of the camera, in body axes
+    surface_sigma_m
+        Standard deviation of the surveyed surface along its normal, common to all LEDs
+    focal_error
+        Relative error of the focal length
     faults
         Differences of `tracker.map` from the scene beyond what its survey can explain, in words
     """
 
     lights: Sources
     direction_error: Floats
-    led_sigma_m: float
-    lever_sigma_m: float
-    surface_sigma_m: float
-    rotation_rad: Floats
-    lever_error_m: Floats
-    focal_error: float
-    focal_sigma: float
     camera: CameraConfig
     faintest_mag: float
     epoch_jyear: float
-    dome: tuple[Camera, LedMap, Lever] | None = None
+    dome: tuple[Camera, LedMap, Lever] | None
+    led_sigma_m: float
+    lever_sigma_m: float
+    focal_sigma: float
+    rotation_rad: Floats
+    lever_error_m: Floats
+    surface_sigma_m: float = 0.0
+    focal_error: float = 0.0
     faults: tuple[str, ...] = ()
 
     @property
@@ -100,53 +101,45 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     tracker = scene.tracker
     believed = assumed_camera(scene)
     dome = None
-    if isinstance(scene.light, DomeConfig):
-        dome = onboard_dome(scene, scene.light, lab.camera.mount, lab.camera.sources)
+    if scene.dome:
+        dome = onboard_dome(scene, scene.dome, lab.camera.mount, lab.camera.sources)
     lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera, dome)
     config = scene.camera.model_copy(update={"distortion": believed.distortion})
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
-    lever_error_m = (
-        np.zeros(3)
-        if assumed_m is None
-        else np.array(assumed_m) - lab.camera.mount.camera_body_m
-    )
+    lever_error_m = np.zeros(3)
+    if assumed_m is not None:
+        lever_error_m = np.array(assumed_m) - lab.camera.mount.camera_body_m
     # 2. A self-calibrated map has its own uncertainties, and its axes and lever are right on average, unless it was
     # made of other hardware.
-    rest = (config, faintest_mag, epoch_jyear, dome)
+    known = (lights, direction_error, config, faintest_mag, epoch_jyear, dome)
     if tracker.map:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
-            lights,
-            direction_error,
+            *known,
             float(np.median(mapped.sigma_m)),
             mapped.lever_sigma_m,
-            0.0,
-            np.zeros(3),
-            np.zeros(3),
-            0.0,
             mapped.focal_sigma_px / mapped.focal_px,
-            *rest,
-            map_faults(mapped, lab, lights.place[:, :3]),
+            np.zeros(3),
+            np.zeros(3),
+            faults=map_faults(mapped, lab, lights.place[:, :3]),
         )
     # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
-    surface_m = scene.light.surface.error_m if isinstance(scene.light, DomeConfig) else 0.0
+    surface_m = scene.dome.surface.error_m if scene.dome else 0.0
     led_sigma_m = survey.led_sigma_m
     own_m2 = dome[1].covariance_m2 if dome else None
     if own_m2 is not None:
         led_sigma_m = float(np.sqrt(np.trace(own_m2, axis1=1, axis2=2).mean() / 3))
     return Beliefs(
-        lights,
-        direction_error,
+        *known,
         led_sigma_m,
         survey.lever_sigma_m,
-        surface_m,
+        survey.focal_length_sigma_m / scene.camera.focal_length_m,
         np.radians(survey.rotation_deg),
         lever_error_m,
+        surface_m,
         0.0 if survey.focal_length_sigma_m else focal_error,
-        survey.focal_length_sigma_m / scene.camera.focal_length_m,
-        *rest,
     )
 
 
@@ -179,38 +172,27 @@ def map_faults(mapped: DomeMap, lab: Lab, place_m: Floats) -> tuple[str, ...]:
 def known_lights(
     lab: Lab, camera: CameraModel, dome: tuple[Camera, LedMap, Lever] | None
 ) -> tuple[Sources, Floats, float, float]:
-    """The N sources that the tracker knows, their direction errors (N, 3), the faintest magnitude, the epoch."""
-    if dome:
-        sources = lab.camera.sources
-        order = np.argsort(sources.id)
-        row = np.searchsorted(sources.id, dome[1].id, sorter=order)
-        sources = sources.take(order[row])
-        return sources, np.zeros((len(sources), 3)), math.inf, math.nan
-    stars = believed_stars(lab)
-    lights, error = known_stars(lab, stars, camera)
-    return lights, error, float(stars.v_mag.max(initial=-math.inf)), stars.epoch_yr
-
-
-def believed_stars(lab: Lab) -> StarCatalog:
-    """The tracker's stars at their believed directions in lab axes, with unresolved doubles merged.
+    """The N sources that the tracker knows, their direction errors (N, 3), the faintest magnitude, the epoch.
 
     Raises InputError for a catalog that cannot be read.
     """
+    if dome:
+        sources = lab.camera.sources
+        sources = sources.take(rows_of(dome[1].id, sources.id))
+        return sources, np.zeros((len(sources), 3)), math.inf, math.nan
+    # Stars at their believed directions, with unresolved doubles merged.
     scene = lab.scene
     stars, directions = assumed_stars(scene, assumed_orbit(scene))
     merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px
-    return catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
-
-
-def known_stars(lab: Lab, stars: StarCatalog, camera: CameraModel) -> tuple[Sources, Floats]:
-    """The N stars that the tracker knows, and measured minus believed direction (N, 3) of each, in lab axes."""
+    stars = catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
     sources = lab.camera.sources
     row, star = common(sources.id, stars.id)
     place = normalized(sources.place[:, :3])
-    shift = neighbor_shift(
-        place, sources.strength * lab.camera.optics.collecting_m2, row, camera
-    )
-    return sources.take(row), place[row] + shift - stars.vectors[star]
+    rate_e_s = sources.strength * lab.camera.optics.collecting_m2
+    shift = neighbor_shift(place, rate_e_s, row, camera)
+    error = place[row] + shift - stars.vectors[star]
+    faintest_mag = float(stars.v_mag.max(initial=-math.inf))
+    return sources.take(row), error, faintest_mag, stars.epoch_yr
 
 
 def neighbor_shift(place: Floats, rate_e_s: Floats, row: Ints, camera: CameraModel) -> Floats:
@@ -326,14 +308,14 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
         lines.append(
             f"LEDs measured by a {instrument.kind.replace('_', ' ')} (tracker.survey.instrument)"
         )
-    elif not known and isinstance(scene.light, DomeConfig):
+    elif not known and scene.dome:
         lines.append("every LED and the lever exactly (tracker.survey)")
     lines += [f"{fault} ({source})" for fault in beliefs.faults]
     if beliefs.rotation_rad.any():
         lines.append(
             f"the survey's axes rotated by {np.degrees(np.linalg.norm(beliefs.rotation_rad)) * 3600:.3g}″"
         )
-    if beliefs.lever_error_m.any() and isinstance(scene.light, DomeConfig):
+    if beliefs.lever_error_m.any() and scene.dome:
         lines.append(
             f"the lever wrong by {1e3 * np.linalg.norm(beliefs.lever_error_m):.3g} mm (assumed_camera_body)"
         )

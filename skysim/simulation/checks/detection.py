@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -28,14 +28,14 @@ from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import saturation_dn
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.types import Bools, Floats, Ints
-from skysim.scene.sections.camera import DetectorConfig
-from skysim.scene.sections.light import DomeConfig
+from skysim.scene.scene import Scene
 from skysim.simulation.checks import beliefs
 from skysim.simulation.checks.beliefs import Beliefs
 from skysim.simulation.checks.views import CameraModel, View, peak_share
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.factory import assumed_settings
+from skysim.tracking.onboard_model import rows_of
 
 # Variance that the detectors' filter [1 2 1] / 4 adds to an image, along each axis
 BINOMIAL_VARIANCE_PX2 = 0.5
@@ -57,7 +57,8 @@ PHASES = 64  # number of phases of the pulses relative to the exposure
 MAX_PULSES = 500
 
 
-class Context(NamedTuple):
+@dataclass(frozen=True)
+class Context:
     """The data that all checks share.
 
     Attributes
@@ -70,8 +71,6 @@ class Context(NamedTuple):
         Camera
     surface
         Surface of the dome; None under the stars
-    known_id, known_row
-        (N,) ascending numbers of the lights that the tracker knows, and their rows in its beliefs
     timing_s
         (N,) standard deviation of the mean time within an exposure of each light that the tracker knows
     """
@@ -81,35 +80,42 @@ class Context(NamedTuple):
     beliefs: Beliefs
     camera: CameraModel
     surface: Surface | None
-    known_id: Ints
-    known_row: Ints
     timing_s: Floats
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.lab.scene
+
+    @property
+    def full_e(self) -> float:
+        """Electrons in a pixel at the saturation of converter or well."""
+        detector = self.scene.camera.detector
+        return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
 
     def rows_of(self, ids: Ints) -> Ints:
         """(M,) rows in the tracker's beliefs of lights with these numbers; -1 for lights that it does not know."""
-        if not len(self.known_id):
+        known = self.beliefs.lights.id
+        if not len(known):
             return np.full(len(ids), -1)
-        at = np.minimum(np.searchsorted(self.known_id, ids), len(self.known_id) - 1)
-        return np.where(self.known_id[at] == ids, self.known_row[at], -1)
+        row = rows_of(ids, known)
+        return np.where(known[row] == ids, row, -1)
 
 
 def context_of(lab: Lab) -> Context:
     """The context of a lab. Raises InputError for a map or a catalog that cannot be read."""
     camera = CameraModel.of(lab)
     believed = beliefs.of(lab, camera)
-    light = lab.scene.light
+    dome = lab.scene.dome
     lights = believed.lights
-    surface = build_surface(light.surface) if isinstance(light, DomeConfig) else None
+    surface = build_surface(dome.surface) if dome else None
     timing_s = timing_sigma_s(lights.period_s, lights.on_s, lab.scene.exposure.time_s)
-    row = np.argsort(lights.id, kind="stable")
     return Context(
         lab,
         assumed_settings(lab.scene),
         believed,
         camera,
         surface,
-        lights.id[row],
-        row,
         timing_s,
     )
 
@@ -122,7 +128,7 @@ def threshold_e(context: Context, streak_px: Floats = STILL_PX) -> float:
     settings = context.settings
     camera = context.camera
     if settings.detector == "thesis":
-        detector = context.lab.scene.camera.detector
+        detector = context.scene.camera.detector
         threshold_dn = settings.intensity_threshold * saturation_dn(detector)
         return max(
             (threshold_dn - detector.offset_dn) * detector.gain_e_dn - camera.background_e,
@@ -132,11 +138,6 @@ def threshold_e(context: Context, streak_px: Floats = STILL_PX) -> float:
     along = settings.detector == "default" and SHORTEST_PX <= length_px <= MAX_STREAK_PX
     taps = line_taps(tuple(streak_px) if along else (0.0, 0.0))
     return settings.threshold_sigma * noise_factor(taps) * camera.noise_e
-
-
-def full_scale_e(detector: DetectorConfig) -> float:
-    """Electrons in a pixel at the saturation of converter or well."""
-    return (saturation_dn(detector) - detector.offset_dn) * detector.gain_e_dn
 
 
 def peak_ratio(view: View, context: Context) -> Floats:
@@ -214,7 +215,7 @@ def broken(view: View, context: Context) -> Bools:
 def usable(view: View, context: Context) -> View:
     """The brightest lights, at most `tracker.brightest`, whose images are detected and entirely on the detector."""
     settings = context.settings
-    config = context.lab.scene.camera
+    config = context.scene.camera
     # Distance of each image from the nearest edges, which must exceed its half size.
     far_px = np.array([config.width_px, config.height_px]) - 1 - view.xy_px
     edge = np.minimum(view.xy_px, far_px)
@@ -263,7 +264,8 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
         along = (view.sigma_px**2 + length_px**2 / 12) / n_e
         across = view.sigma_px**2 / n_e
     else:
-        along, across = weighted_variance(view, n_e, noise_e2, WEIGHTS.get(centroider, fit))
+        weight = WEIGHTS.get(centroider, WEIGHTS["fit"])
+        along, across = weighted_variance(view, n_e, noise_e2, weight)
         along = along + end_sigma_px(view, context) ** 2
         if centroider == "weighted" and len(view):
             curve_px2 = sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
@@ -273,7 +275,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     varies = lab.scene.camera.detector.prnu if prnu is None else prnu
     pattern = varies**2 / (8 * np.pi) * (1 + disk)
     # 3. Saturation.
-    plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= full_scale_e(lab.scene.camera.detector))
+    plateau = SATURATED_SIGMA_PX**2 * (view.peak_e >= context.full_e)
     unit = view.streak_px / np.maximum(length_px, 1e-12)[:, None]
     along_path = unit[:, :, None] * unit[:, None, :]
     # 4. Timing.
@@ -288,21 +290,14 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
 # Weights of the pixels in centroiders: functions of the distance from the center along an axis, of that from the
 # center, of the image, of its derivative, and of the variance of the pixels. Lengths are in deviations of the blur.
 Weight = Callable[[Floats, Floats, Floats, Floats, Floats], Floats]
-
-
-def fit(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
-    """Weighted least squares, which reaches the Cramer-Rao bound."""
-    return slope / variance
-
-
-def window(u: Floats, r: Floats, image: Floats, slope: Floats, variance: Floats) -> Floats:
-    """A Gaussian of twice the image's variance."""
-    return u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum()))
-
-
 WEIGHTS: dict[str, Weight] = {
+    # Weighted least squares, which reaches the Cramer-Rao bound: all centroiders that are not named here.
+    "fit": lambda u, r, image, slope, variance: slope / variance,
     "weighted": lambda u, r, image, slope, variance: u * image,
-    "gaussian_window": window,
+    # A Gaussian of twice the image's variance.
+    "gaussian_window": lambda u, r, image, slope, variance: (
+        u * np.exp(-(r**2) / (2 * (r**2 * image).sum() / image.sum()))
+    ),
 }
 
 

@@ -19,10 +19,10 @@ from skysim.core.types import Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.detection import Context, threshold_e
+from skysim.simulation.checks.detection import threshold_e
 from skysim.simulation.checks.expected_error import believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
-from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.lights.lab_room import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import surface
@@ -40,10 +40,11 @@ MAX_IMAGE_PX = 32.0
 
 def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     """The warnings about assumptions of the tracker, one line each, for a camera inside the dome."""
-    assert isinstance(scene.light, DomeConfig)
-    inside = surface.build_surface(scene.light.surface)
+    light = scene.dome
+    assert light is not None
+    inside = surface.build_surface(light.surface)
     lines = [
-        surface_fit_warning(scene.light, inside),
+        surface_fit_warning(light, inside),
         ellipsoid_warning(inside),
         image_width_warning(scene, sources, mount),
         exposure_warning(scene, sources),
@@ -54,9 +55,8 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
     """Warn if the camera is outside of the dome at the start (lab_from_body), where its frames may be black."""
     camera_m = start.apply(mount.camera_body_m)
-    if not isinstance(scene.light, DomeConfig) or surface.build_surface(
-        scene.light.surface
-    ).inside(camera_m):
+    light = scene.dome
+    if light is None or surface.build_surface(light.surface).inside(camera_m):
         return ""
     return (
         f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
@@ -152,38 +152,36 @@ class Lookalike(NamedTuple):
     coincidence_m: float
 
 
-def of(context: Context, samples: CheckedSamples) -> Lookalike | None:
+def of(plan: Plan) -> Lookalike | None:
     """The fields of a dome that look alike; None for few or coded LEDs, or stars."""
-    if why_not_compared(context, samples):
+    if why_not_compared(plan):
         return None
-    found, coincidence_m = compared(context, samples, BELOW, MAX_WORK)
+    found, coincidence_m = compared(plan, BELOW, MAX_WORK)
     if not len(found.led):
         return None
     return Lookalike(float((found.fraction > BELOW).mean()), len(found.led), coincidence_m)
 
 
-def why_not_compared(context: Context, samples: CheckedSamples) -> str:
+def why_not_compared(plan: Plan) -> str:
     """The reason why fields cannot be compared; empty if they can."""
-    if not isinstance(context.lab.scene.light, DomeConfig):
+    if not plan.scene.dome:
         return "light.kind: stars: only the layout of a dome can be ambiguous; allowed: dome"
-    if context.lab.scene.tracker.decoder is not None:
+    if plan.scene.tracker.decoder is not None:
         return "tracker.decoder: coded LEDs are named by their codes, so that no field is ambiguous; allowed: none"
-    mean = float(samples.reach.counts().mean())
+    mean = float(plan.reach.counts().mean())
     if mean < MIN_LEDS:
         return f"light.layout: {mean:.2g} LEDs in a field on average; allowed: {MIN_LEDS} or more"
     return ""
 
 
-def compared(
-    context: Context, samples: CheckedSamples, least: float, most_work: int
-) -> tuple[Ambiguity, float]:
+def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float]:
     """The most similar other field of each field within the greatest tilt, and the distance of coincidence in m.
 
     A field is centered on an LED.
 
     Parameters
     ----------
-    context, samples
+    plan
         Data of the checks
     least
         Least fraction of coincident LEDs; less similar fields are not sought
@@ -191,17 +189,17 @@ def compared(
         Greatest number of fields times LEDs in a field; the fields at the least tilts are compared
     """
     # 1. Distance within which LEDs coincide, from the tracker's standard deviation of an image position.
-    lab = context.lab
-    camera = context.camera.optics.camera
-    sigma_px = [believed_sigma_px(view, context) for view in samples.reach.used if len(view)]
-    distance_m = float(np.median(samples.reach.joined("distance_m")))
+    lab = plan.lab
+    camera = plan.camera.optics.camera
+    sigma_px = [believed_sigma_px(view, plan) for view in plan.reach.used if len(view)]
+    distance_m = float(np.median(plan.reach.joined("distance_m")))
     typical_px = float(np.median(np.concatenate(sigma_px)))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
-    place_m = context.beliefs.lights.place[:, :3]
-    most = int(most_work / np.mean([len(view) for view in samples.reach.seen]))
+    place_m = plan.beliefs.lights.place[:, :3]
+    most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
-    tilt_rad = float(attitudes.tilts_rad(samples.reach.attitudes).max())
+    tilt_rad = float(attitudes.tilts_rad(plan.reach.attitudes).max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))
     # 3. Comparison, with circular fields of the detector's area.
@@ -246,10 +244,10 @@ def finding(found: Lookalike, light: DomeConfig) -> str:
 # Images of LEDs in the dome's wall.
 
 
-def mirror_images(context: Context, samples: CheckedSamples) -> str:
+def mirror_images(plan: Plan) -> str:
     """Warn if the tracker detects images of LEDs in the wall, which are false lights."""
-    lab = context.lab
-    frames = samples.frames
+    lab = plan.lab
+    frames = plan.frames
     mirror = find_light(lab.camera.lights, Mirror)
     found = {n: others[IMAGES] for n, others in enumerate(frames.others) if IMAGES in others}
     if mirror is None or not found:
@@ -257,9 +255,9 @@ def mirror_images(context: Context, samples: CheckedSamples) -> str:
     n = max(found, key=lambda n: len(found[n]))
     peak_e = (
         max(float(images.peak_e.max()) for images in found.values())
-        - context.camera.background_e
+        - plan.camera.background_e
     )
-    share = threshold_e(context) / peak_e
+    share = threshold_e(plan) / peak_e
     specular = mirror.dome.config.specular
     cure = "make the wall matt"
     key = "specular" if specular else "refractive_index"

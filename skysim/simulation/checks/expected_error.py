@@ -30,7 +30,8 @@ camera's position, so its J_i has three more columns. Errors of star places are 
 
 1. The gain K_i of each light (`gains`).
 2. The errors e_i of each cause (`CAUSES`).
-3. Their covariances of w (`covariance`). The variances about x and y add up to cross, that about z is roll.
+3. Their covariances of w (`of_independent`, `of_common`). The variances about x and y add up to cross, that about z is
+   roll.
 """
 
 from __future__ import annotations
@@ -57,41 +58,23 @@ from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
 from skysim.sources.dome import survey_errors
 
 
-class Independent(NamedTuple):
-    """An error that is independent in each light: covariances (n, 2, 2) of the image positions in px^2."""
-
-    covariance_px2: Floats
-
-
-class Common(NamedTuple):
-    """Errors common to all lights: displacements (n, 2, k) of the image positions in px by k unit-variance errors."""
-
-    displacement_px: Floats
-
-
 class Expected(NamedTuple):
-    """Variances (A,) of the attitude error at A attitudes in rad^2, by cause; NaN with too few lights.
+    """Variances (A,) of the angles `cross` and `roll` at A attitudes in rad^2, by cause; NaN with too few lights.
 
     They are NaN also where most streaks break: those that are left are not fitted as well as expected.
     """
 
-    cross_rad2: dict[str, Floats]
-    roll_rad2: dict[str, Floats]
-
-    def by_cause(self, angle: str) -> dict[str, Floats]:
-        """The variances of the angle `cross` or `roll`, by cause."""
-        return self.cross_rad2 if angle == "cross" else self.roll_rad2
+    rad2: dict[str, dict[str, Floats]]
 
     def total(self, angle: str) -> Floats:
         """(A,) variance of the angle `cross` or `roll` by all causes together; NaN with too few lights."""
-        return np.asarray(sum(self.by_cause(angle).values()))
+        return np.asarray(sum(self.rad2[angle].values()))
 
     def rms_arcsec(self) -> tuple[float, float]:
         """Root mean square of cross and roll over the attitudes in arcsec; NaN without any solution."""
@@ -104,38 +87,38 @@ def mean_root(variance_rad2: Floats) -> float:
     return float(np.sqrt(finite.mean()) / ARCSEC_RAD) if len(finite) else math.nan
 
 
-# Causes of the attitude error. Each returns the errors of the image positions, or None if the scene does not have it.
+# Causes of the attitude error. Each returns None if the scene does not have it, else the displacements (n, 2, k) of the
+# image positions in px by k errors of unit variance that all lights share. Errors of surveyed LEDs are independent:
+# they are covariances (n, 2, 2) in px^2.
 
 
-def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Independent | None:
+def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors of the surveyed LED positions, S_i = sigma^2 G_i G_i', or G_i C_i G_i' if an instrument gives C_i."""
     dome = context.beliefs.dome
     if dome and dome[1].covariance_m2 is not None:
         # Derivative of the image by a position in lab axes.
         gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()
         own_m2 = dome[1].covariance_m2[view.row]
-        return Independent(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
+        return np.asarray(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
     sigma_m = context.beliefs.led_sigma_m
     if not sigma_m:
         return None
-    return Independent(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
+    return np.asarray(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
 
 
-def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors of the set-up of the survey's instrument, common to all LEDs."""
-    instrument = context.lab.scene.tracker.survey.instrument
+    instrument = context.scene.tracker.survey.instrument
     if instrument is None:
         return None
     shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
-    parts = [
-        displacement(view, shift_m, lab_from_cam).displacement_px for shift_m in shifts_m
-    ]
-    return Common(np.concatenate(parts, axis=2)) if parts else None
+    parts = [displacement(view, shift_m, lab_from_cam) for shift_m in shifts_m]
+    return np.concatenate(parts, axis=2) if parts else None
 
 
-def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors that LEDs, lever and lens of a survey by the camera share: E_i = G_i dP_i + the change by the lens."""
     dome = context.beliefs.dome
     if dome is None or not context.beliefs.has_common_camera:
@@ -144,10 +127,10 @@ def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Commo
     shift_m = common_shifts_m(leds, view.row, lever, lab_from_cam.inv())
     moved_px = np.einsum("nij,mnj->nim", view.gradient, shift_m)
     by_lens_px = common_images_px(leds, camera, view.offset_m) - camera.pixels(view.offset_m)
-    return Common(moved_px + np.moveaxis(by_lens_px, 0, 2))
+    return moved_px + np.moveaxis(by_lens_px, 0, 2)
 
 
-def other_map(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def other_map(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Images by the map minus the true ones, if the map was made of other hardware than the scene's."""
     dome = context.beliefs.dome
     if dome is None or not context.beliefs.faults:
@@ -155,18 +138,18 @@ def other_map(view: View, lab_from_cam: Rotation, context: Context) -> Common | 
     camera, leds, lever = dome
     body_from_lab = (lab_from_cam * lever.cam_from_body).inv()
     mapped_px = project(body_from_lab, leds.position_m[view.row], lever, camera)
-    return Common(np.nan_to_num(mapped_px - view.xy_px)[:, :, None])
+    return np.nan_to_num(mapped_px - view.xy_px)[:, :, None]
 
 
-def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Error of the surveyed lever (camera's position), E_i = -sigma G_i."""
     sigma_m = context.beliefs.lever_sigma_m
     if not sigma_m or context.beliefs.has_common_camera:
         return None
-    return Common(-sigma_m * view.gradient)
+    return -sigma_m * view.gradient
 
 
-def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Error of the surveyed surface along its normal, E_i = sigma G_i R n_i."""
     sigma_m = context.beliefs.surface_sigma_m
     surface = context.surface
@@ -176,7 +159,7 @@ def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Comm
     return displacement(view, -sigma_m * normal, lab_from_cam)
 
 
-def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Rotation r of the survey's axes, E_i = G_i R (r x P_i)."""
     rotation_rad = context.beliefs.rotation_rad
     if not rotation_rad.any():
@@ -185,21 +168,21 @@ def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Com
     return displacement(view, shift_m, lab_from_cam)
 
 
-def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Error of the lever that the scene makes the tracker assume, E_i = -G_i error."""
     error_m = context.beliefs.lever_error_m
     if not error_m.any() or context.surface is None:
         return None
     error_cam_m = context.lab.camera.mount.cam_from_body.apply(error_m)
-    return Common(-(view.gradient @ error_cam_m)[:, :, None])
+    return -(view.gradient @ error_cam_m)[:, :, None]
 
 
-def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Relative error of the focal length, E_i = error (x_i - center)."""
     error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
     if not error or context.beliefs.has_common_camera:
         return None
-    return Common(error * from_center_px(view, context))
+    return error * from_center_px(view, context)
 
 
 def from_center_px(view: View, context: Context) -> Floats:
@@ -207,43 +190,42 @@ def from_center_px(view: View, context: Context) -> Floats:
     return (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
 
 
-def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Difference of the image positions with the believed and the true distortion."""
     believed = context.beliefs.camera
     if believed.distortion == context.camera.optics.camera.distortion:
         return None
     shift_px = Optics.from_camera(believed).project(view.offset_m) - view.xy_px
-    return Common(np.nan_to_num(shift_px)[:, :, None])
+    return np.nan_to_num(shift_px)[:, :, None]
 
 
-def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors of the stars' believed directions, from the catalog and from neighbors."""
     error = context.beliefs.direction_error[view.row]
     return displacement(view, error, lab_from_cam) if error.any() else None
 
 
-def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Common | None:
+def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Motion of the images during the difference of true and assumed delay of their rows from the middle row."""
     camera = context.camera.optics.camera
     if not isinstance(camera.shutter, RollingShutterConfig):
         return None
-    assumed_s = context.lab.scene.tracker.assumed_row_time_s
+    assumed_s = context.scene.tracker.assumed_row_time_s
     error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
     if not error_s:
         return None
     delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
-    velocity_px_s = view.streak_px / context.lab.scene.exposure.time_s
-    return Common((velocity_px_s * delay_s[:, None])[:, :, None])
+    velocity_px_s = view.streak_px / context.scene.exposure.time_s
+    return (velocity_px_s * delay_s[:, None])[:, :, None]
 
 
-def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Common:
+def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Floats:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
     shift_cam = lab_from_cam.inv().apply(shift_lab)
-    return Common(np.einsum("nij,nj->ni", view.gradient, shift_cam)[:, :, None])
+    return np.einsum("nij,nj->ni", view.gradient, shift_cam)[:, :, None]
 
 
-CAUSES: dict[str, Callable[[View, Rotation, Context], Independent | Common | None]] = {
-    "LED survey": led_survey,
+CAUSES: dict[str, Callable[[View, Rotation, Context], Floats | None]] = {
     "common survey": common_survey,
     "survey set-up": survey_setup,
     "lever survey": lever_survey,
@@ -265,8 +247,9 @@ UNKNOWN_TO_TRACKER = (
 )
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
-# Two more causes, which are no displacements of all images.
+# More causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
+LED_SURVEY = "LED survey"
 SOLVER = "solver"
 EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 
@@ -304,11 +287,14 @@ def gains(view: View, covariance_px2: Floats, fitted: Floats | None = None) -> F
     return (inverse @ np.swapaxes(weighted, 1, 2))[:, :3]
 
 
-def covariance(gain: Floats, errors: Independent | Common) -> Floats:
-    """(3, 3) covariance of the rotation in camera axes in rad^2: sum K_i S_i K_i', or B B' with B = sum K_i E_i."""
-    if isinstance(errors, Independent):
-        return np.einsum("nij,njk,nlk->il", gain, errors.covariance_px2, gain)
-    response = np.einsum("nij,njk->ik", gain, errors.displacement_px)
+def of_independent(gain: Floats, covariance_px2: Floats) -> Floats:
+    """(3, 3) covariance of the rotation in camera axes in rad^2 by errors of single lights: sum K_i S_i K_i'."""
+    return np.einsum("nij,njk,nlk->il", gain, covariance_px2, gain)
+
+
+def of_common(gain: Floats, displacement_px: Floats) -> Floats:
+    """(3, 3) covariance of the rotation in camera axes in rad^2 by errors of all lights: B B', B = sum K_i E_i."""
+    response = np.einsum("nij,njk->ik", gain, displacement_px)
     return response @ response.T
 
 
@@ -373,10 +359,10 @@ def fits_focal_length(context: Context) -> bool:
 
 def finds_focal_length(context: Context) -> bool:
     """Whether the tracker finds the right focal length: by a fit, or by the default identifier under the stars."""
-    scene = context.lab.scene
+    scene = context.scene
     if fits_focal_length(context):
         return abs(context.beliefs.focal_error) < FOCAL_UNCERTAINTY
-    if not isinstance(scene.light, StarsConfig):
+    if not scene.stars:
         return False
     by_default = scene.tracker.identifier in (None, "default")
     return by_default and abs(context.beliefs.focal_error) < WRONG_FOCAL
@@ -395,9 +381,9 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     # 1. Displacements.
     shifts = {}
     for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE):
-        errors = CAUSES[name](view, lab_from_cam, context)
-        if isinstance(errors, Common):
-            shifts[name] = errors.displacement_px
+        shift_px = CAUSES[name](view, lab_from_cam, context)
+        if shift_px is not None:
+            shifts[name] = shift_px
     if context.beliefs.focal_sigma or finds_focal_length(context):
         shifts.pop("focal length", None)  # the tracker corrects it
     if not shifts:
@@ -449,22 +435,20 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
 
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
-    names = (CENTROIDS, *CAUSES, SOLVER)
-    cross = {name: np.zeros(len(views)) for name in names}
-    roll = {name: np.zeros(len(views)) for name in names}
+    names = (CENTROIDS, LED_SURVEY, *CAUSES, SOLVER)
+    cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
     cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
         variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
         for name, variance in variances.items():
             cross[name][a] = variance[:2].sum()
             roll[name][a] = variance[2]
-    return Expected(cross, roll)
+    return Expected({"cross": cross, "roll": roll})
 
 
 def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:
     """(3,) variances about the camera's axes at one attitude in rad^2, by cause; NaN with too few lights."""
     # 1. Gains, with the parameters that the tracker fits as well.
-    noise = Independent(centroid_variance(view, context))
     fitted = None
     if fits_focal_length(context):
         fitted = from_center_px(view, context)
@@ -476,14 +460,15 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
         gain = gains(view, believed_px2(view, context), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
-    # 2. Causes.
-    causes = {name: cause(view, lab_from_cam, context) for name, cause in CAUSES.items()}
-    causes[CENTROIDS] = noise
-    # 3. Variances, and the solver's own error squared.
-    variances = {
-        name: np.diag(covariance(gain, errors))
-        for name, errors in causes.items()
-        if errors is not None
-    }
+    # 2. and 3. Covariances by each cause, and the solver's own error squared.
+    found = {CENTROIDS: of_independent(gain, centroid_variance(view, context))}
+    survey_px2 = led_survey(view, lab_from_cam, context)
+    if survey_px2 is not None:
+        found[LED_SURVEY] = of_independent(gain, survey_px2)
+    for name, cause in CAUSES.items():
+        shift_px = cause(view, lab_from_cam, context)
+        if shift_px is not None:
+            found[name] = of_common(gain, shift_px)
+    variances = {name: np.diag(matrix) for name, matrix in found.items()}
     bias = solver_error(view, lab_from_cam, context)
     return variances if bias is None else variances | {SOLVER: bias**2}

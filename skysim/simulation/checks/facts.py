@@ -1,6 +1,6 @@
 """The facts of a plan as text and as numbers: field, lights, image size, peak, smear, focus, beliefs, expected error.
 
-Each function in `FACTS` returns one fact from the context and the samples, or None if the plan does not have it.
+Each function in `FACTS` returns one fact from the plan, or None if the plan does not have it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
-from skysim.simulation.checks.detection import Context, centroid_variance, full_scale_e
+from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
-from skysim.simulation.checks.sampling import CheckedSamples, Sampled
+from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.vehicle_facts import Fact, short
 from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
@@ -40,9 +39,9 @@ UNTESTED = (
 )
 
 
-def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
+def field_of_view(plan: Plan) -> Fact:
     """Angles between the centers of opposite edges and between opposite corners of the detector, without distortion."""
-    lens = context.camera.optics.camera.calibration()
+    lens = plan.camera.optics.camera.calibration()
     return Fact(
         "field of view",
         [lens.field_text()],
@@ -50,30 +49,30 @@ def field_of_view(context: Context, samples: CheckedSamples) -> Fact:
     )
 
 
-def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
+def lights_in_field(plan: Plan) -> Fact:
     """Number of lights that the tracker knows and detects in the field: mean, least, and the attitude of the least."""
-    lab = context.lab
+    lab = plan.lab
     lines = []
     values = {}
-    tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
+    tilt_deg = math.degrees(attitudes.tilts_rad(plan.reach.attitudes).max())
     reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
-    if isinstance(lab.scene.light, StarsConfig):
+    if lab.scene.stars:
         reach = "in the whole sky"
     for key, what, sampled in (
-        ("frames", "at the frames", samples.frames),
-        ("reach", reach, samples.reach),
+        ("frames", "at the frames", plan.frames),
+        ("reach", reach, plan.reach),
     ):
         counts = sampled.counts()
         seen = np.array([len(view) for view in sampled.seen])
         least_of = sampled
         of = ""
-        if sampled is samples.reach:
+        if sampled is plan.reach:
             # The frames are in reach too.
-            least_of = min(samples, key=lambda one: one.counts().min())
+            least_of = min(plan.frames, plan.reach, key=lambda one: one.counts().min())
             of = f"of {len(counts)} attitudes and the frames "
         least = int(least_of.counts().min())
         where = attitudes.describe(least_of.attitudes, int(least_of.counts().argmin()), lab)
-        limit = context.settings.max_blobs
+        limit = plan.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = (
             f" (of {seen.mean():.1f} on the chip{cut})"
@@ -101,9 +100,9 @@ def lights_in_field(context: Context, samples: CheckedSamples) -> Fact:
     return Fact("lights in the field", lines, values)
 
 
-def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
+def other_lights(plan: Plan) -> Fact | None:
     """Lights at the frames that the tracker detects and does not know, by name; None if there are none."""
-    others = samples.frames.others
+    others = plan.frames.others
     lines = []
     values = {}
     for name in sorted({name for one in others for name in one}):
@@ -116,13 +115,13 @@ def other_lights(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("other lights", lines, values) if lines else None
 
 
-def spot(context: Context, samples: CheckedSamples) -> Fact:
+def spot(plan: Plan) -> Fact:
     """Width of the median image without motion, and its parts: lens, LED and defocus."""
-    sampled = samples.frames if sum(map(len, samples.frames.seen)) else samples.reach
+    sampled = plan.frames if sum(map(len, plan.frames.seen)) else plan.reach
     sigma, disk, defocus = (
         sampled.joined(name) for name in ("sigma_px", "disk_px", "defocus_px")
     )
-    lens_px = GAUSSIAN_WIDTH * context.camera.lens_px
+    lens_px = GAUSSIAN_WIDTH * plan.camera.lens_px
     if not len(sigma):
         return Fact(
             "image size",
@@ -132,7 +131,7 @@ def spot(context: Context, samples: CheckedSamples) -> Fact:
     width, disk_px, defocus_px = (
         float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
     )
-    led = f", LED {disk_px:.1f}" if isinstance(context.lab.scene.light, DomeConfig) else ""
+    led = f", LED {disk_px:.1f}" if plan.scene.dome else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
     values = {
         "width_px": width,
@@ -143,15 +142,15 @@ def spot(context: Context, samples: CheckedSamples) -> Fact:
     return Fact("image size", [text], values)
 
 
-def fill(context: Context, samples: CheckedSamples) -> Floats:
+def fill(plan: Plan) -> Floats:
     """(n,) peaks of all lights at the frames over the full well, or over the range of the converter if that is less."""
-    return samples.frames.joined("peak_e") / full_scale_e(context.lab.scene.camera.detector)
+    return plan.frames.joined("peak_e") / plan.full_e
 
 
-def peak(context: Context, samples: CheckedSamples) -> Fact:
+def peak(plan: Plan) -> Fact:
     """Mean electrons in the brightest pixel of a centered image over the full well."""
-    ratio = fill(context, samples)
-    full_e = full_scale_e(context.lab.scene.camera.detector)
+    ratio = fill(plan)
+    full_e = plan.full_e
     if not len(ratio):
         return Fact("peak", ["no light in the field"], {"full_e": full_e})
     full = float((ratio >= 1).mean())
@@ -166,9 +165,9 @@ def peak(context: Context, samples: CheckedSamples) -> Fact:
     return Fact("peak", [text + full_text], values)
 
 
-def smear(context: Context, samples: CheckedSamples) -> Fact:
+def smear(plan: Plan) -> Fact:
     """Path of the images during an exposure at the mean rates of the frames, their jitter included."""
-    frames = samples.frames
+    frames = plan.frames
     rate_deg_s = np.degrees(frames.attitudes.speed_rad_s)
     length_px = np.array(
         [np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known]
@@ -183,7 +182,7 @@ def smear(context: Context, samples: CheckedSamples) -> Fact:
         "median_px": np.median(length_px),
         "rate_deg_s": rate_deg_s[fastest],
     }
-    uneven = uneven_px(context, frames.attitudes.t_s, context.camera.exposure_s)
+    uneven = uneven_px(plan, frames.attitudes.t_s, plan.camera.exposure_s)
     if uneven:
         values["uneven_px"] = uneven
         text += f"; jitter moves images by {short(uneven, 2)} px (rms) beside that path"
@@ -242,9 +241,7 @@ class CapMargin(NamedTuple):
         return f"{text} {self.corner_deg:.1f}°: margin {edge} and {self.cap_deg - self.corner_deg:+.1f}°"
 
 
-def cap_margin(
-    context: Context, samples: CheckedSamples, tilt_deg: float | None = None
-) -> CapMargin | None:
+def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     """The cap of the LEDs and the reach of the field at a tilt; None without a layout that fills a cap.
 
     Any side or corner of the field may point outward. `field_reach_deg` traces rays at their angles from the boresight
@@ -253,26 +250,24 @@ def cap_margin(
 
     Parameters
     ----------
-    context, samples
+    plan
         Data of the checks
     tilt_deg
         The tilt; None for the greatest of the attitudes in reach
     """
-    light = context.lab.scene.light
-    camera = context.camera.optics.camera
-    if not isinstance(light, DomeConfig) or context.surface is None:
+    light = plan.scene.dome
+    camera = plan.camera.optics.camera
+    if light is None or plan.surface is None:
         return None
     points = light.points
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
-    cap_deg = (
-        max_tilt_deg(context.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
-    )
+    cap_deg = max_tilt_deg(plan.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
     if tilt_deg is None:
-        tilt_deg = math.degrees(attitudes.tilts_rad(samples.reach.attitudes).max())
-    edge = field_reach_deg(context, max(camera.width_px, camera.height_px) / 2, tilt_deg)
-    corner = field_reach_deg(context, camera.corner_px, tilt_deg)
+        tilt_deg = math.degrees(attitudes.tilts_rad(plan.reach.attitudes).max())
+    edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)
+    corner = field_reach_deg(plan, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)
 
 
@@ -302,10 +297,10 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     return needed_deg
 
 
-def cap(context: Context, samples: CheckedSamples) -> Fact | None:
+def cap(plan: Plan) -> Fact | None:
     """Margin of the LED cap over the tilt plus half the field, at the greatest tilt in reach and at the tilt stop."""
-    found = cap_margin(context, samples)
-    vehicle = context.lab.scene.vehicle
+    found = cap_margin(plan)
+    vehicle = plan.scene.vehicle
     if found is None:
         return None
     wider = (
@@ -318,7 +313,7 @@ def cap(context: Context, samples: CheckedSamples) -> Fact | None:
     ]
     values = {**found._asdict(), "margin_deg": found.cap_deg - found.needed_deg}
     if vehicle.mount == "air_bearing" and vehicle.tilt_stop_deg > found.tilt_deg + 0.05:
-        stop = cap_margin(context, samples, vehicle.tilt_stop_deg)
+        stop = cap_margin(plan, vehicle.tilt_stop_deg)
         assert stop is not None
         lines.append(f"at the tilt stop, {stop.tilt_deg:g}°, {stop.text}")
         values |= {
@@ -328,11 +323,11 @@ def cap(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("LED cap", lines, values)
 
 
-def room(context: Context, samples: CheckedSamples) -> Fact | None:
+def room(plan: Plan) -> Fact | None:
     """The size of the dome and its parts in the room and its door; a scene that does not fit was refused before."""
-    light = context.lab.scene.light
-    surface = context.surface
-    if not isinstance(light, DomeConfig) or light.room is None or surface is None:
+    light = plan.scene.dome
+    surface = plan.surface
+    if light is None or light.room is None or surface is None:
         return None
     limits = light.room
     values = fit(light.room, surface, light.points.cap_deg)
@@ -357,14 +352,14 @@ def room(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("room", [text], values)
 
 
-def wall(context: Context, samples: CheckedSamples) -> Fact | None:
+def wall(plan: Plan) -> Fact | None:
     """Area, volume and mass of a formed wall without its flange; None without `surface.wall`."""
-    light = context.lab.scene.light
-    config = getattr(getattr(light, "surface", None), "wall", None)
-    if config is None or not isinstance(light, DomeConfig):
+    light = plan.scene.dome
+    config = getattr(light.surface, "wall", None) if light else None
+    if light is None or config is None:
         return None
-    assert isinstance(context.surface, Radial)
-    size = wall_size(context.surface, light.points.cap_deg)
+    assert isinstance(plan.surface, Radial)
+    size = wall_size(plan.surface, light.points.cap_deg)
     text = f"inside {size.area_m2:.3f} m², volume {1e3 * size.volume_m3:.2f} L"
     values = size._asdict()
     if config.density_kg_m3 is not None:
@@ -373,9 +368,9 @@ def wall(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("dome's wall", [text + ", without ribs and flange"], values)
 
 
-def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
+def depth_of_focus(plan: Plan) -> Fact:
     """Distances u at which the defocus disk is one pixel wide: 1 / u = 1 / focus ± pixel / (pupil image_distance)."""
-    camera = context.camera.optics.camera
+    camera = plan.camera.optics.camera
     spread = camera.pixel_m / (camera.pupil_m * camera.image_distance_m)
     near_m = 1 / (1 / camera.focus_m + spread)
     far_m = 1 / (1 / camera.focus_m - spread) if 1 / camera.focus_m > spread else math.inf
@@ -383,7 +378,9 @@ def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
         f"{value:.3g} m" if math.isfinite(value) else "infinity" for value in (near_m, far_m)
     )
     text = f"from {near} to {far} (defocus below one pixel)"
-    distance_m = np.concatenate([sampled.joined("distance_m") for sampled in samples])
+    distance_m = np.concatenate(
+        [sampled.joined("distance_m") for sampled in (plan.frames, plan.reach)]
+    )
     values = {"near_m": near_m, "far_m": far_m}
     if len(distance_m) and np.isfinite(distance_m).all():
         low_m = distance_m.min()
@@ -396,9 +393,9 @@ def depth_of_focus(context: Context, samples: CheckedSamples) -> Fact:
     return Fact("depth of focus", [text], values)
 
 
-def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
+def tracker_beliefs(plan: Plan) -> Fact:
     """The beliefs of the tracker that are uncertain or wrong."""
-    believed = context.beliefs
+    believed = plan.beliefs
     values = {
         "led_sigma_m": believed.led_sigma_m,
         "lever_sigma_m": believed.lever_sigma_m,
@@ -411,19 +408,19 @@ def tracker_beliefs(context: Context, samples: CheckedSamples) -> Fact:
         "catalog_epoch_jyear": believed.epoch_jyear,
         "map_faults": list(believed.faults),
     }
-    lines = beliefs.describe(believed, context.lab.scene)
-    if context.settings.acceptance == "thesis":
+    lines = beliefs.describe(believed, plan.scene)
+    if plan.settings.acceptance == "thesis":
         lines = [*lines, UNTESTED]
     return Fact(TRACKER_KNOWS, lines, values)
 
 
-def expected_error(context: Context, samples: CheckedSamples) -> Fact:
+def expected_error(plan: Plan) -> Fact:
     """Expected cross and roll error, 1 sigma, and their causes, the largest first."""
     lines: list[str] = []
     values: dict[str, Any] = {}
     for key, what, sampled in (
-        ("frames", "at the frames", samples.frames),
-        ("reach", "in reach", samples.reach),
+        ("frames", "at the frames", plan.frames),
+        ("reach", "in reach", plan.reach),
     ):
         failing = int(np.isnan(sampled.error.total("roll")).sum())
         broken = int(sampled.broken().sum())
@@ -436,7 +433,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         worst = ""
         if key == "reach" and known and failing < total:
             n = int(np.nanargmax(sampled.error.total("roll")))
-            where = attitudes.describe(sampled.attitudes, n, context.lab)
+            where = attitudes.describe(sampled.attitudes, n, plan.lab)
             worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
         errors = errors_text(cross, roll) if known else "unknown"
         rates = attitudes.rates_text(sampled.attitudes)
@@ -445,12 +442,12 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
             "cross_arcsec": cross,
             "roll_arcsec": roll,
             "without_solution": failing,
-            "centroid_px": centroid_px(context, sampled),
+            "centroid_px": centroid_px(plan, sampled),
         }
         values[key] |= {
             f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
         }
-    chosen = samples.frames if np.isfinite(values["frames"]["roll_arcsec"]) else samples.reach
+    chosen = plan.frames if np.isfinite(values["frames"]["roll_arcsec"]) else plan.reach
     lines += [
         f"{angle}: {cause_text(chosen, angle)}"
         for angle in ("cross", "roll")
@@ -460,7 +457,7 @@ def expected_error(context: Context, samples: CheckedSamples) -> Fact:
         "cross: sqrt(x² + y²), x and y the errors about both axes across the boresight"
     )
     named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
-    if named & {*SURVEYED, *(["focal length"] if context.beliefs.focal_sigma else [])}:
+    if named & {*SURVEYED, *(["focal length"] if plan.beliefs.focal_sigma else [])}:
         lines.append(
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
         )
@@ -496,13 +493,13 @@ UNIT_ERRORS = {
 }
 
 
-def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
+def requirements(plan: Plan) -> Fact | None:
     """The expected value of each required error or share at the frames, None without requirements.
 
     The errors are normal with the expected variances, those about both axes across the boresight equal. `drawn_once` is
     the share of the variance by errors that a run draws once, of cross or roll, whichever is more.
     """
-    error = samples.frames.error
+    error = plan.frames.error
     known = np.isfinite(error.total("cross"))
     cross, roll = (
         np.outer(np.sqrt(error.total(angle)), unit) / ARCSEC_RAD
@@ -511,7 +508,7 @@ def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
     sizes = {"cross": cross, "roll": roll, "angle": np.hypot(cross, roll)}
     lines = []
     values: dict[str, Any] = {}
-    for name, limit in context.lab.scene.require.items():
+    for name, limit in plan.scene.require.items():
         limits = re.findall(r"([a-z]+)_arcsec_([\d.]+)", name)
         quantile = re.fullmatch(r"([a-z]+)_arcsec_(?:median|[a-z]+(\d+))", name)
         expected = math.nan
@@ -530,7 +527,7 @@ def requirements(context: Context, samples: CheckedSamples) -> Fact | None:
         lines.append(f"{name}: {text}")
         values[name] = {"limit": limit, "expected": expected}
     shares = [
-        sum(error.by_cause(angle)[name] for name in DRAWN_ONCE) / error.total(angle)
+        sum(error.rad2[angle][name] for name in DRAWN_ONCE) / error.total(angle)
         for angle in UNIT_ERRORS
     ]
     values["drawn_once"] = (
@@ -546,7 +543,7 @@ DRAWN_ONCE = (*SURVEYED, "focal length")
 
 def causes(sampled: Sampled, angle: str) -> dict[str, float]:
     """The rms over the attitudes of the error by each cause in arcsec, the largest first."""
-    by_cause = sampled.error.by_cause(angle)
+    by_cause = sampled.error.rad2[angle]
     known = np.isfinite(sampled.error.total(angle))
     size = {name: mean_root(variance[known]) for name, variance in by_cause.items()}
     return {
@@ -568,7 +565,7 @@ def cause_text(sampled: Sampled, angle: str) -> str:
     return ", ".join(parts)
 
 
-FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
+FACTS: tuple[Callable[[Plan], Fact | None], ...] = (
     field_of_view,
     lights_in_field,
     other_lights,

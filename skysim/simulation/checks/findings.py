@@ -21,12 +21,10 @@ from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes, vehicle_facts
 from skysim.simulation.checks.detection import (
     Context,
     detected_area_px,
-    full_scale_e,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
@@ -35,7 +33,7 @@ from skysim.simulation.checks.expected_error import (
     mismatch,
 )
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short, uneven_px
-from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
 from skysim.sources.dome.layouts.placing import largest_cap_deg
@@ -67,19 +65,19 @@ MAX_TAG_RATIO = 1.3
 MAX_TAG_ARCSEC = 1.0
 
 
-def saturation(context: Context, samples: CheckedSamples) -> str:
+def saturation(plan: Plan) -> str:
     """Warn if many lights are saturated."""
-    ratio = fill(context, samples)
-    scene = context.lab.scene
+    ratio = fill(plan)
+    scene = plan.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
-    if full <= MAX_SATURATED or bright_background(context, samples):
+    if full <= MAX_SATURATED or bright_background(plan):
         return ""
     factor = TARGET_FILL / float(np.quantile(ratio, 1 - MAX_SATURATED))
     text = (
         f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
-        f" {full_scale_e(scene.camera.detector):.0f} electrons; change it to"
+        f" {plan.full_e:.0f} electrons; change it to"
     )
-    (first, value), *more = dimmer(context, factor).items()
+    (first, value), *more = dimmer(plan, factor).items()
     others = "".join(f", or {key} to {other}" for key, other in more)
     if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
         others += (
@@ -94,7 +92,7 @@ def dimmer(context: Context, factor: float) -> dict[str, str]:
     An exposure is recommended only if it is not shorter than SHORTEST_S and the LED drive's cycle, in which each LED is
     lit once, and an f-number only up to LARGEST_F_NUMBER. Stars always get an exposure.
     """
-    scene = context.lab.scene
+    scene = context.scene
     sources = context.lab.camera.sources
     cures = led_strength(scene, factor)
     cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
@@ -116,11 +114,11 @@ def led_strength(scene: Scene, factor: float) -> dict[str, str]:
     return {"light.led.radiant_intensity": f"{short(radiant_uw_sr, 2)} uW / sr"}
 
 
-def bright_background(context: Context, samples: CheckedSamples) -> str:
+def bright_background(plan: Plan) -> str:
     """Warn if extended light alone fills the pixels."""
-    scene = context.lab.scene
-    camera = context.camera
-    full_e = full_scale_e(scene.camera.detector)
+    scene = plan.scene
+    camera = plan.camera
+    full_e = plan.full_e
     if camera.background_e < MAX_BACKGROUND * full_e:
         return ""
     shorter_ms = (
@@ -134,13 +132,13 @@ def bright_background(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def black_level(context: Context, samples: CheckedSamples) -> str:
+def black_level(plan: Plan) -> str:
     """Warn if a pixel without light is above the fixed threshold of the detector `thesis`."""
-    detector = context.lab.scene.camera.detector
-    level_dn = detector.offset_dn + context.camera.background_e / detector.gain_e_dn
-    share = context.settings.intensity_threshold
+    detector = plan.scene.camera.detector
+    level_dn = detector.offset_dn + plan.camera.background_e / detector.gain_e_dn
+    share = plan.settings.intensity_threshold
     threshold_dn = share * saturation_dn(detector)
-    if context.settings.detector != "thesis" or level_dn < threshold_dn:
+    if plan.settings.detector != "thesis" or level_dn < threshold_dn:
         return ""
     return (
         f"camera.detector.offset_dn: the black level of {short(level_dn, 3)} DN is above the threshold of"
@@ -149,9 +147,9 @@ def black_level(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def dark_corners(context: Context, samples: CheckedSamples) -> str:
+def dark_corners(plan: Plan) -> str:
     """Warn if the lens passes no light to a part of the detector."""
-    camera = context.camera.optics.camera
+    camera = plan.camera.optics.camera
     stops = camera.vignetting
     corner_deg = math.degrees(math.atan(camera.corner_px / camera.focal_px))
     if not isinstance(stops, TwoStopsConfig) or stops.cutoff_deg >= corner_deg:
@@ -162,7 +160,7 @@ def dark_corners(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def few_lights(context: Context, samples: CheckedSamples) -> str:
+def few_lights(plan: Plan) -> str:
     """Warn if the tracker has too few lights, in the frames or in the directions in reach.
 
     1. Return no warning if another one explains the problem: a cap that is too small, dark corners, a bright background
@@ -171,17 +169,17 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     3. Return no warning if enough lights are on the detector (`undetected` warns of those).
     4. Recommend more LEDs, or fainter stars.
     """
-    scene = context.lab.scene
+    scene = plan.scene
     needed = least_lights(scene)
     # 1. More lights where there are some would not help.
     explained = (cap_too_small, dark_corners, bright_background, black_level)
-    if any(find(context, samples) for find in explained):
+    if any(find(plan) for find in explained):
         return ""
     if scene.tracker.brightest is not None and scene.tracker.brightest < needed:
         return f"tracker.brightest: the tracker uses {scene.tracker.brightest} lights; change it to {needed} or more"
     # 2. No frame may have too few; of the directions in reach, some may.
     in_reach = MAX_FEW_SKY if scene.vehicle.mount == "free" else MAX_FEW
-    for sampled, allowed in ((samples.frames, 0.0), (samples.reach, in_reach)):
+    for sampled, allowed in ((plan.frames, 0.0), (plan.reach, in_reach)):
         counts = sampled.counts()
         unhidden = counts + sampled.hidden_counts()
         few = float((unhidden < needed).mean())
@@ -190,17 +188,17 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     else:
         return ""
     on_chip = np.array([len(view) for view in sampled.seen])
-    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), context.lab)
+    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), plan.lab)
     text = (
         f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
-        f" {'frames' if sampled is samples.frames else 'directions in reach'}, least {counts.min()} at {where}"
+        f" {'frames' if sampled is plan.frames else 'directions in reach'}, least {counts.min()} at {where}"
     )
     # 3. Lights on the detector.
     if (on_chip[counts < needed] >= needed).mean() > MIN_DETECTED:
         return ""
     # 4. Recommendation.
-    if isinstance(scene.light, DomeConfig):
-        key, change = denser(scene.light.layout, float(on_chip.mean()))
+    if scene.dome:
+        key, change = denser(scene.dome.layout, float(on_chip.mean()))
         return f"{key}: {text}; {change}"
     fainter = scene.tracker.limit_mag + 1
     sky_mag = getattr(scene.light, "limit_mag", None)
@@ -209,10 +207,10 @@ def few_lights(context: Context, samples: CheckedSamples) -> str:
     return f"tracker.limit_mag: {text}; change it to {fainter:g}, or take a shorter camera.focal_length"
 
 
-def hidden_lights(context: Context, samples: CheckedSamples) -> str:
+def hidden_lights(plan: Plan) -> str:
     """Warn if something hides so many lights at a frame that the tracker has too few."""
-    frames = samples.frames
-    scene = context.lab.scene
+    frames = plan.frames
+    scene = plan.scene
     counts = frames.counts()
     hidden = frames.hidden_counts()
     few = (counts < least_lights(scene)) & (counts + hidden >= least_lights(scene))
@@ -224,7 +222,7 @@ def hidden_lights(context: Context, samples: CheckedSamples) -> str:
     what = f"all behind {name}" if behind == expected else f"{behind} of them behind {name}"
     what += "".join(f", {count} behind {other}" for other, count in others)
     return (
-        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, context.lab)},"
+        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, plan.lab)},"
         f" {what}; so at {100 * few.mean():.0f} % of the frames; point elsewhere, or change the time"
     )
 
@@ -251,29 +249,25 @@ def denser(layout: Layout, mean: float) -> tuple[str, str]:
     return key + ".limit_mag" * limited, f"add LEDs: {factor:.1f} times as many"
 
 
-def undetected(context: Context, samples: CheckedSamples) -> str:
+def undetected(plan: Plan) -> str:
     """Warn if most lights on the detector are too faint or too small to be detected."""
-    scene = context.lab.scene
-    settings = context.settings
+    scene = plan.scene
+    settings = plan.settings
     # The tracker takes at most max_blobs of a frame.
-    seen = sum(min(len(view), settings.max_blobs) for view in samples.frames.seen)
-    used = sum(map(len, samples.frames.used))
+    seen = sum(min(len(view), settings.max_blobs) for view in plan.frames.seen)
+    used = sum(map(len, plan.frames.used))
     explained = (bright_background, black_level, dark_corners, long_smear)
-    if (
-        not seen
-        or used >= MIN_DETECTED * seen
-        or any(find(context, samples) for find in explained)
-    ):
+    if not seen or used >= MIN_DETECTED * seen or any(find(plan) for find in explained):
         return ""
-    area = np.concatenate([detected_area_px(view, context) for view in samples.frames.seen])
+    area = np.concatenate([detected_area_px(view, plan) for view in plan.frames.seen])
     text = f"the tracker detects {100 * used / seen:.0f} % of the lights in the field"
     if np.median(area) > 0.5:
         return (
             f"tracker.min_area_px: {text}: images have {np.median(area):.0f} px above the threshold, it wants"
             f" {settings.min_area_px}; change it to {max(int(np.median(area) / 3), 1)}"
         )
-    peak_e = samples.frames.joined("peak_e") - context.camera.background_e
-    factor = 3 * threshold_e(context) / max(float(np.median(peak_e)), 1e-3)
+    peak_e = plan.frames.joined("peak_e") - plan.camera.background_e
+    factor = 3 * threshold_e(plan) / max(float(np.median(peak_e)), 1e-3)
     text = f"{text}: the others are below the threshold"
     if scene.tracker.threshold_sigma > HIGH_THRESHOLD:
         return f"tracker.threshold_sigma: {text} of {scene.tracker.threshold_sigma:g} sigma; change it to 5"
@@ -297,17 +291,17 @@ def brighter(scene: Scene, factor: float, text: str) -> str:
     return f"{key}: {text}; change it to {value}"
 
 
-def not_where_expected(context: Context, samples: CheckedSamples) -> str:
+def not_where_expected(plan: Plan) -> str:
     """Warn if errors that are unknown to the tracker displace images beyond its matching radius."""
-    frames = samples.frames
-    scene = context.lab.scene
-    cam_from_body = context.lab.camera.mount.cam_from_body
+    frames = plan.frames
+    scene = plan.scene
+    cam_from_body = plan.lab.camera.mount.cam_from_body
     found = [
         one
         for view, lab_from_body in zip(
             frames.used, frames.attitudes.lab_from_body, strict=True
         )
-        if (one := mismatch(view, lab_from_body * cam_from_body.inv(), context)) is not None
+        if (one := mismatch(view, lab_from_body * cam_from_body.inv(), plan)) is not None
     ]
     if not found:
         return ""
@@ -324,62 +318,67 @@ def not_where_expected(context: Context, samples: CheckedSamples) -> str:
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
     text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
-    return f"{MISMATCH_KEYS[cause]}: {text}; {CHANGES[cause](scene, excess)}"
+    key, change = ADVICE[cause]
+    return f"{key}: {text}; {change(scene, excess)}"
 
 
-def map_of_other_hardware(context: Context, samples: CheckedSamples) -> str:
+def map_of_other_hardware(plan: Plan) -> str:
     """Warn if the map of a survey differs from the scene by more than the survey's errors."""
-    faults = "; ".join(context.beliefs.faults)
+    faults = "; ".join(plan.beliefs.faults)
     return faults and (
         f"tracker.map: made of other hardware: {faults}; survey the dome again, or undo the change"
     )
 
 
-MISMATCH_KEYS = {
-    "focal length": "tracker.assumed_focal_length",
-    "distortion": "tracker.assumed_distortion",
-    "assumed lever": "tracker.assumed_camera_body",
-    "rolling shutter": "tracker.assumed_row_time",
-    "survey set-up": "tracker.survey.instrument",
-    "surface survey": "light.surface.error",
-    "common survey": "tracker.map",
-    "other map": "tracker.map",
-}
-# The recommended change, as a function of the scene and of the ratio of the displacement to the allowed one.
-CHANGES: dict[str, Callable[[Any, float], str]] = {
-    "focal length": lambda scene, excess: (
-        f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
+# By cause: the key, and the change as a function of the scene and of the ratio of the displacement to the
+# allowed one.
+ADVICE: dict[str, tuple[str, Callable[[Any, float], str]]] = {
+    "focal length": (
+        "tracker.assumed_focal_length",
+        lambda scene, excess: (
+            f"change it to {short(1e3 * scene.camera.focal_length_m, 5)} mm"
+        ),
     ),
-    "distortion": lambda scene, excess: (
-        f"change it to {list(scene.camera.distortion)}, the lens's"
+    "distortion": (
+        "tracker.assumed_distortion",
+        lambda scene, excess: f"change it to {list(scene.camera.distortion)}, the lens's",
     ),
-    "assumed lever": lambda scene, excess: (
-        "leave it out, or fit the place with tracker.solver: pnp"
+    "assumed lever": (
+        "tracker.assumed_camera_body",
+        lambda scene, excess: "leave it out, or fit the place with tracker.solver: pnp",
     ),
-    "rolling shutter": lambda scene, excess: (
-        "leave it out, so that the tracker corrects the rows for"
-        f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
+    "rolling shutter": (
+        "tracker.assumed_row_time",
+        lambda scene, excess: (
+            "leave it out, so that the tracker corrects the rows for"
+            f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
+        ),
     ),
-    "survey set-up": lambda scene, excess: (
-        f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+    "survey set-up": (
+        "tracker.survey.instrument",
+        lambda scene, excess: (
+            f"change it to one of smaller errors of the set-up, by a factor of {short(excess, 2)}"
+        ),
     ),
-    "surface survey": lambda scene, excess: (
-        f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
+    "surface survey": (
+        "light.surface.error",
+        lambda scene, excess: (
+            f"change it to {short(1e3 * scene.light.surface.error_m / excess, 2)} mm"
+        ),
     ),
-    "common survey": lambda scene, excess: "survey the dome with more frames",
-    "other map": lambda scene, excess: "survey the dome again",
+    "common survey": (
+        "tracker.map",
+        lambda scene, excess: "survey the dome with more frames",
+    ),
+    "other map": ("tracker.map", lambda scene, excess: "survey the dome again"),
 }
 
 
-def cap_too_small(context: Context, samples: CheckedSamples) -> str:
+def cap_too_small(plan: Plan) -> str:
     """Warn if the field reaches beyond the LEDs at the greatest tilt."""
-    found = cap_margin(context, samples)
-    light = context.lab.scene.light
-    if (
-        found is None
-        or not isinstance(light, DomeConfig)
-        or found.needed_deg <= found.cap_deg
-    ):
+    found = cap_margin(plan)
+    light = plan.scene.dome
+    if found is None or light is None or found.needed_deg <= found.cap_deg:
         return ""
     # No key changes the positions of listed LEDs.
     if light.points.kind == "listed":
@@ -390,8 +389,8 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
         if found.tilt_deg > found.cap_deg
         else "its edge has no LED"
     )
-    assert context.surface is not None
-    largest_deg = largest_cap_deg(context.surface)
+    assert plan.surface is not None
+    largest_deg = largest_cap_deg(plan.surface)
     reach = f"reaches {found.needed_deg:.1f} deg: {uncovered}; change it to"
     if found.needed_deg > largest_deg:
         reach = f"passes the rim of the surface: no cap covers it ({largest_deg:.1f} at most); tilt less"
@@ -405,9 +404,9 @@ def cap_too_small(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def out_of_focus(context: Context, samples: CheckedSamples) -> str:
+def out_of_focus(plan: Plan) -> str:
     """Warn if the defocus disk is wide compared with the image in focus."""
-    sampled = samples.frames
+    sampled = plan.frames
     defocus = sampled.joined("defocus_px")
     sigma = sampled.joined("sigma_px")
     distance_m = sampled.joined("distance_m")
@@ -426,10 +425,10 @@ def out_of_focus(context: Context, samples: CheckedSamples) -> str:
     return f"camera.focus: {text}; change it to {best}"
 
 
-def long_smear(context: Context, samples: CheckedSamples) -> str:
+def long_smear(plan: Plan) -> str:
     """Warn if images move by more than MAX_SMEAR_PX and MAX_SMEAR_WIDTHS of their own width."""
-    frames = samples.frames
-    scene = context.lab.scene
+    frames = plan.frames
+    scene = plan.scene
     length_px = frames.joined("streak_length_px")
     sigma = frames.joined("sigma_px")
     if not len(length_px):
@@ -451,15 +450,15 @@ def long_smear(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def uneven_motion(context: Context, samples: CheckedSamples) -> str:
+def uneven_motion(plan: Plan) -> str:
     """Warn if jitter moves the images unevenly within an exposure, which the expected errors leave out."""
-    scene = context.lab.scene
-    t_s = samples.frames.attitudes.t_s
-    moved_px = uneven_px(context, t_s, scene.exposure.time_s)
+    scene = plan.scene
+    t_s = plan.frames.attitudes.t_s
+    moved_px = uneven_px(plan, t_s, scene.exposure.time_s)
     if moved_px <= MAX_UNEVEN_PX:
         return ""
     shorter_s = scene.exposure.time_s
-    while uneven_px(context, t_s, shorter_s) > MAX_UNEVEN_PX:
+    while uneven_px(plan, t_s, shorter_s) > MAX_UNEVEN_PX:
         shorter_s /= 1.1
     return (
         f"exposure.time: jitter moves images by {short(moved_px, 2)} px (rms) beside their uniform path within an"
@@ -468,13 +467,13 @@ def uneven_motion(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
+def unknown_tag_error(plan: Plan) -> str:
     """Warn if time tags have larger errors than the filter assumes, and the vehicle rotates in that time."""
-    scene = context.lab.scene
+    scene = plan.scene
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
         return ""
-    rate_rad_s = float(samples.frames.attitudes.speed_rad_s.max())
+    rate_rad_s = float(plan.frames.attitudes.speed_rad_s.max())
     turn_arcsec = sigma_s * rate_rad_s / ARCSEC_RAD
     if turn_arcsec <= MAX_TAG_ARCSEC:
         return ""
@@ -485,15 +484,15 @@ def unknown_tag_error(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def thermal_drift(context: Context, samples: CheckedSamples) -> str:
+def thermal_drift(plan: Plan) -> str:
     """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
-    thermal_config = context.lab.scene.thermal
-    frames = samples.frames
+    thermal_config = plan.scene.thermal
+    frames = plan.frames
     if thermal_config is None:
         return ""
     at = frames.attitudes
     rows = zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)
-    turns = [drift_rad(*row, context) for row in rows]
+    turns = [drift_rad(*row, plan) for row in rows]
     cross_rad = np.hypot(*np.array(turns)[:, :2].T)
     expected_rad = np.sqrt(frames.error.total("cross"))
     if not (cross_rad > expected_rad).any():
@@ -513,7 +512,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
 
     It is sum K_i (drifted - surveyed image position); NaN with too few lights.
     """
-    config = context.lab.scene.thermal
+    config = context.scene.thermal
     assert config is not None
     if len(view) < MIN_LIGHTS:
         return np.full(3, np.nan)
@@ -536,7 +535,7 @@ def image_px(
     return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))
 
 
-FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
+FINDINGS: tuple[Callable[[Plan], str], ...] = (
     bright_background,
     black_level,
     saturation,

@@ -20,13 +20,12 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
-from skysim.scene.sections.light import DomeConfig, StarsConfig
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
-from skysim.simulation.checks.detection import Context, context_of
+from skysim.simulation.checks.detection import context_of
 from skysim.simulation.checks.facts import FACTS, Fact, errors_text
 from skysim.simulation.checks.findings import FINDINGS, hidden_lights
-from skysim.simulation.checks.sampling import CheckedSamples, sampled
+from skysim.simulation.checks.sampling import Plan, sampled
 from skysim.simulation.lab import Lab
 from skysim.simulation.motion import check_reference, shortfall
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
@@ -93,7 +92,6 @@ def check(
     if outside:
         return Check([], [outside])
     # 1. Attitudes.
-    context = context_of(lab)
     check_reference(
         guidance.plan(scene.motion, lab.start, lab.profiles),
         scene,
@@ -105,18 +103,15 @@ def check(
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
         frames = frames._replace(rate_body_rad_s=rates)
     # 2. Views.
-    samples = samples_of(context, frames, tilt_deg)
+    plan = plan_of(lab, frames, tilt_deg)
     # 3. Facts and warnings.
-    built = [
-        build(context, samples)
-        for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
-    ]
+    built = [build(plan) for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)]
     facts = [fact for fact in built if fact is not None]
-    findings = warnings_of(context, samples, drawn)
-    alike = dome_warnings.of(context, samples)
-    if alike is not None and isinstance(scene.light, DomeConfig):
+    findings = warnings_of(plan, drawn)
+    alike = dome_warnings.of(plan)
+    if alike is not None and scene.dome:
         facts.insert(2, dome_warnings.fact(alike))
-        warning = dome_warnings.finding(alike, scene.light)
+        warning = dome_warnings.finding(alike, scene.dome)
         findings += [warning] if warning else []
     findings += [*broken_assumptions(lab), *filter(None, [shortfall(lab)])]
     # 4. Heads.
@@ -129,16 +124,16 @@ def check(
     return Check(facts, findings)
 
 
-def warnings_of(context: Context, samples: CheckedSamples, drawn: bool) -> list[str]:
+def warnings_of(plan: Plan, drawn: bool) -> list[str]:
     """The warnings of the views; those about the directions of the frames only if these are not drawn."""
     found = [
-        find(context, samples)
+        find(plan)
         for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
         if not drawn or find not in POINTED_FINDINGS
     ]
     findings = [line for line in found if line]
     for finder in () if drawn else POINTED:
-        findings += finder(context, samples)
+        findings += finder(plan)
     return findings
 
 
@@ -148,30 +143,28 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
     A field is centered on an LED. LEDs are numbered by their rows in the tracker's map. Raises InputError if fields
     cannot be compared.
     """
-    context = context_of(lab)
-    samples = samples_of(context, attitudes.of_frames(lab), None)
-    if reason := dome_warnings.why_not_compared(context, samples):
+    plan = plan_of(lab, attitudes.of_frames(lab))
+    if reason := dome_warnings.why_not_compared(plan):
         raise InputError("", reason)
-    return dome_warnings.compared(context, samples, LEAST_ALIKE, MAP_WORK)
+    return dome_warnings.compared(plan, LEAST_ALIKE, MAP_WORK)
 
 
-def samples_of(
-    context: Context, frames: CheckedAttitudes, tilt_deg: float | None
-) -> CheckedSamples:
-    """The views of the camera at the frames and at the attitudes in reach."""
-    reach = attitudes.within_reach(
-        context.lab.scene, context.lab.camera.mount, frames, tilt_deg
+def plan_of(lab: Lab, frames: CheckedAttitudes, tilt_deg: float | None = None) -> Plan:
+    """The context with the views of the camera at the frames and at the attitudes in reach."""
+    context = context_of(lab)
+    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames, tilt_deg)
+    return Plan(
+        **vars(context), frames=sampled(frames, context), reach=sampled(reach, context)
     )
-    return CheckedSamples(sampled(frames, context), sampled(reach, context))
 
 
 def broken_assumptions(lab: Lab) -> list[str]:
     """Warnings that the scene breaks an assumption of its tracker, or of the WCS of its frames."""
     scene = lab.scene
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         warning = wcs.accuracy_warning(scene.camera.calibration())
         return [warning] if warning else []
-    if not isinstance(scene.light, DomeConfig):
+    if not scene.dome:
         return []
     return dome_warnings.warnings(scene, lab.camera.sources, lab.camera.mount)
 
@@ -237,11 +230,7 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
 def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
     """The warnings of head n that are not those of the main camera, with the key of the head."""
     # The mount of a head points it elsewhere, not the start of the motion.
-    lines = [
+    lines = (
         line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main
-    ]
-    return [
-        f"heads.{n}.{line}"
-        for line in lines
-        if line.startswith(OWN_KEYS) and line not in main
-    ]
+    )
+    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +77,9 @@ class Sampled(NamedTuple):
         return np.concatenate([getattr(view, name) for view in self.seen])
 
 
-class CheckedSamples(NamedTuple):
-    """Samples at the attitudes of the frames, and at attitudes in reach of the motion."""
+@dataclass(frozen=True)
+class Plan(Context):
+    """The data of the checks, with the samples at the attitudes of the frames and at those in reach of the motion."""
 
     frames: Sampled
     reach: Sampled

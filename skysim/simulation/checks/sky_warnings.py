@@ -12,26 +12,24 @@ from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
     STILL_PX,
     Context,
     centroid_variance,
-    full_scale_e,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
-    Independent,
     believed_px2,
-    covariance,
     gains,
+    of_common,
+    of_independent,
     star_places,
 )
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.findings import few_lights
-from skysim.simulation.checks.sampling import CheckedSamples, Sampled
+from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.views import peak_share
 from skysim.simulation.lights.atmosphere import AirEffects
 from skysim.simulation.lights.lens import stray_e_s
@@ -47,32 +45,32 @@ from skysim.tracking.tracker_interface import OWN
 MIN_RAISED_ARCSEC = 1.0  # least refraction that gives a warning
 
 
-def refraction(context: Context, samples: CheckedSamples) -> str:
+def refraction(plan: Plan) -> str:
     """Warn if refraction at the lowest frame exceeds the expected error and the tracker does not correct it.
 
     The refraction at the boresight is an error of the attitude. The difference of the refractions at both ends of the
     field shortens its height.
     """
-    lab = context.lab
-    at = samples.frames.attitudes
+    lab = plan.lab
+    at = plan.frames.attitudes
     atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
     boresight = attitudes.boresights(at.lab_from_body, lab)
     zenith = np.array(
-        [atmosphere.air.at(exposure.time).zenith for exposure in samples.frames.exposures]
+        [atmosphere.air.at(exposure.time).zenith for exposure in plan.frames.exposures]
     )
     altitude_rad = np.arcsin(np.sum(boresight * zenith, axis=1))
     n = int(altitude_rad.argmin())
     zenith_rad = math.pi / 2 - altitude_rad[n]
-    half_rad = context.camera.optics.field_rad
+    half_rad = plan.camera.optics.field_rad
     around_rad = zenith_rad + np.array([0.0, half_rad, -half_rad])
     middle, low, high = (
         atmosphere.air.refraction.bending_rad(np.abs(around_rad))
         * np.sign(around_rad)
         / ARCSEC_RAD
     )
-    expected_arcsec = samples.frames.error.rms_arcsec()[0]
+    expected_arcsec = plan.frames.error.rms_arcsec()[0]
     if not middle > max(
         MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec
     ):
@@ -95,14 +93,14 @@ NEAR_DEG = {
 }  # angle from the boresight within which stray light matters
 
 
-def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
+def bodies_near(plan: Plan) -> Iterator[str]:
     """Warn of each body in the field or near it, at the frame where it is nearest to the boresight."""
     # 1. The nearest frame of each body.
-    lab = context.lab
-    at = samples.frames.attitudes
+    lab = plan.lab
+    at = plan.frames.attitudes
     cam_from_lab = lab.camera.mount.cam_from_body * at.lab_from_body.inv()
     closest: dict[str, tuple[float, int, BodyLight]] = {}
-    for n, beam in enumerate(samples.frames.beams):
+    for n, beam in enumerate(plan.frames.beams):
         for body in beam.discs:
             z = float(cam_from_lab[n].apply(body.place.direction)[2])
             off = math.acos(max(min(z, 1.0), -1.0)), n, body
@@ -118,7 +116,7 @@ def bodies_near(context: Context, samples: CheckedSamples) -> Iterator[str]:
         if in_field(
             cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera
         ):
-            yield f"{what} is in the field, {far}: {short(peak_fill(context, body), 2)} times saturation"
+            yield f"{what} is in the field, {far}: {short(peak_fill(plan, body), 2)} times saturation"
         elif lab.scene.camera.baffle is None and off_rad < math.radians(
             NEAR_DEG.get(name, 0.0)
         ):
@@ -140,7 +138,7 @@ def peak_fill(context: Context, body: BodyLight) -> float:
     A partly lit body counts as a full disk of the lit area.
     """
     camera = context.camera
-    scene = context.lab.scene
+    scene = context.scene
     lit = (1 + math.cos(body.place.phase_rad)) / 2
     radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
     lens2_px2 = np.array([camera.lens_px**2])
@@ -148,7 +146,7 @@ def peak_fill(context: Context, body: BodyLight) -> float:
     none = np.zeros(1)
     electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
     share = float(peak_share(lens2_px2, radius, none, none)[0])
-    return electrons * share / full_scale_e(scene.camera.detector)
+    return electrons * share / context.full_e
 
 
 # Claimed errors: the expected normalized estimation error squared (NEES) under the stars.
@@ -168,7 +166,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     """
     found = []
     settings = replace(context.settings, centroid_sigma_px=floor_px)
-    claiming = context._replace(settings=settings)
+    claiming = replace(context, settings=settings)
     cam_from_body = context.lab.camera.mount.cam_from_body
     if not sampled.predicted():
         return math.nan
@@ -184,46 +182,46 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
             continue
         # C, then M.
         places = star_places(view, lab_from_body * cam_from_body.inv(), context)
-        errors = covariance(gain, Independent(centroid_variance(view, context)))
-        errors = errors if places is None else errors + covariance(gain, places)
+        errors = of_independent(gain, centroid_variance(view, context))
+        errors = errors if places is None else errors + of_common(gain, places)
         weighted = np.linalg.solve(believed, view.jacobian)
         information = np.einsum("nij,nik->jk", view.jacobian, weighted)
         found.append(float(np.trace(information @ errors)))
     return float(np.median(found)) if found else math.nan
 
 
-def claimed(context: Context, samples: CheckedSamples) -> float:
+def claimed(plan: Plan) -> float:
     """The expected NEES over the whole sky with the tracker's least centroid error; NaN under other lights."""
-    if not isinstance(context.lab.scene.light, StarsConfig):
+    if not plan.scene.stars:
         return math.nan
-    return expected_nees(samples.reach, context, context.settings.centroid_sigma_px)
+    return expected_nees(plan.reach, plan, plan.settings.centroid_sigma_px)
 
 
-def fact(context: Context, samples: CheckedSamples) -> Fact | None:
+def fact(plan: Plan) -> Fact | None:
     """The fact about the expected NEES; None under other lights."""
-    nees = claimed(context, samples)
+    nees = claimed(plan)
     if math.isnan(nees):
         return None
-    floor_px = context.settings.centroid_sigma_px
-    rates = attitudes.rates_text(samples.reach.attitudes)
+    floor_px = plan.settings.centroid_sigma_px
+    rates = attitudes.rates_text(plan.reach.attitudes)
     text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
 
-def floor_too_small(context: Context, samples: CheckedSamples) -> str:
+def floor_too_small(plan: Plan) -> str:
     """Warn if the tracker will claim too small errors because its least centroid error is too small.
 
     The recommended value, at which the claim is true, is found by bisection.
     """
-    nees = claimed(context, samples)
+    nees = claimed(plan)
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
     if factor <= MAX_FACTOR:
         return ""
-    low = context.settings.centroid_sigma_px
+    low = plan.settings.centroid_sigma_px
     high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        small = expected_nees(samples.reach, context, middle) > TRUE_NEES
+        small = expected_nees(plan.reach, plan, middle) > TRUE_NEES
         low, high = (middle, high) if small else (low, middle)
     return (
         f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"
@@ -237,47 +235,44 @@ MAX_LOSS_MAG = 0.5  # loss of limiting magnitude that gives no warning
 STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
 
 
-def stray_light(context: Context, samples: CheckedSamples) -> Iterator[str]:
+def stray_light(plan: Plan) -> Iterator[str]:
     """Warn if the noise of stray light hides faint stars.
 
     n0 is the noise of a pixel without stray light. With s electrons of stray light the noise is sqrt(n0^2 + s), and
     the faintest star is brighter by 1.25 log10(1 + s / n0^2) magnitudes.
     """
-    lab = context.lab
-    at = samples.frames.attitudes
+    lab = plan.lab
+    at = plan.frames.attitudes
     if lab.scene.camera.baffle is None:
         return
-    by_frame = [
-        stray_e_s(lab.camera.lights, exposure) for exposure in samples.frames.exposures
-    ]
-    stray_e = context.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
+    by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in plan.frames.exposures]
+    stray_e = plan.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n = int(stray_e.argmax())
-    own_e2 = context.camera.noise_e**2 - context.camera.stray_e
+    own_e2 = plan.camera.noise_e**2 - plan.camera.stray_e
     loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
     if loss_mag <= MAX_LOSS_MAG:
         return
     allowed_e = own_e2 * (10 ** (MAX_LOSS_MAG / 1.25) - 1)
     source = max(by_frame[n], key=lambda name: by_frame[n][name])
-    full_e = full_scale_e(lab.scene.camera.detector)
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
-        f" {source}, of {full_e:.0f} at saturation,"
+        f" {source}, of {plan.full_e:.0f} at saturation,"
         f" at {attitudes.describe(at, n, lab)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
 
 
-def exclusion(context: Context, samples: CheckedSamples) -> Iterator[str]:
+def exclusion(plan: Plan) -> Iterator[str]:
     """Warn if the boresight of a frame is within an exclusion angle of the orbit's tracker, at the nearest frame."""
-    lab = context.lab
-    at = samples.frames.attitudes
+    lab = plan.lab
+    at = plan.frames.attitudes
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
     boresight = attitudes.boresights(at.lab_from_body, lab)
     angles_deg = np.array(
         [
-            beside_deg(context, t, axis)
+            beside_deg(plan, t, axis)
             for t, axis in zip(at.t_s.tolist(), boresight, strict=True)
         ]
     )
@@ -313,17 +308,17 @@ DEEPEST_V = 10.0  # faintest magnitude of a catalog that `skysim catalog build` 
 SNR = 5.0
 
 
-def faintest_star(context: Context, samples: CheckedSamples) -> Fact | None:
+def faintest_star(plan: Plan) -> Fact | None:
     """V of the faintest star that the tracker detects, and of a star with the signal-to-noise ratio SNR."""
-    scene = context.lab.scene
-    believed = context.beliefs
-    if not isinstance(scene.light, StarsConfig):
+    scene = plan.scene
+    believed = plan.beliefs
+    if not scene.stars:
         return None
-    rate_deg_s = float(np.degrees(samples.frames.attitudes.speed_rad_s).min())
-    limit_mag = detection_limit_mag(context, samples)
-    snr_mag = snr_limit_mag(context, samples)
-    sky = context.lab.camera.sources.magnitude
-    known = known_share(context, limit_mag)
+    rate_deg_s = float(np.degrees(plan.frames.attitudes.speed_rad_s).min())
+    limit_mag = detection_limit_mag(plan)
+    snr_mag = snr_limit_mag(plan)
+    sky = plan.lab.camera.sources.magnitude
+    known = known_share(plan, limit_mag)
     lines = [
         f"the tracker detects V {limit_mag:.1f} (like the Sun) in {1e3 * scene.exposure.time_s:.4g} ms at"
         f" {rate_deg_s:.3g} deg/s; signal to noise {SNR:g} at V {snr_mag:.1f}",
@@ -346,19 +341,19 @@ def known_share(context: Context, limit_mag: float) -> float:
     return float((sky[seen] <= context.beliefs.faintest_mag).mean()) if seen.any() else 1.0
 
 
-def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
+def sky_too_shallow(plan: Plan) -> str:
     """Warn if the camera detects fainter stars than the simulated sky has."""
-    light = context.lab.scene.light
-    sky = context.lab.camera.sources.magnitude
-    if not isinstance(light, StarsConfig) or not len(sky):
+    stars = plan.scene.stars
+    sky = plan.lab.camera.sources.magnitude
+    if not stars or not len(sky):
         return ""
-    limit_mag = detection_limit_mag(context, samples)
+    limit_mag = detection_limit_mag(plan)
     faintest_mag = float(np.nanmax(sky))
     text = f"the camera detects stars to V {limit_mag:.1f}, but the sky ends at V {faintest_mag:.1f}; change it to"
-    if light.limit_mag is not None:
+    if stars.limit_mag is not None:
         # `few_lights` may recommend a fainter limit already.
-        said = few_lights(context, samples).startswith("light.limit_mag")
-        if said or limit_mag <= light.limit_mag + LIMIT_MARGIN_MAG:
+        said = few_lights(plan).startswith("light.limit_mag")
+        if said or limit_mag <= stars.limit_mag + LIMIT_MARGIN_MAG:
             return ""
         return f"light.limit_mag: {text} {math.ceil(2 * limit_mag) / 2:g}, or leave it out"
     if limit_mag <= min(faintest_mag + CATALOG_MARGIN_MAG, DEEPEST_V):
@@ -367,13 +362,13 @@ def sky_too_shallow(context: Context, samples: CheckedSamples) -> str:
     return f"light.catalog: {text} a file of `skysim catalog build --source gaia --limit {wanted:g}`"
 
 
-def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
+def tracker_too_shallow(plan: Plan) -> str:
     """Warn if most stars that the tracker detects are fainter than those that it knows."""
-    if not isinstance(context.lab.scene.light, StarsConfig):
+    if not plan.scene.stars:
         return ""
-    limit_mag = detection_limit_mag(context, samples)
-    faintest_mag = context.beliefs.faintest_mag
-    known = known_share(context, limit_mag)
+    limit_mag = detection_limit_mag(plan)
+    faintest_mag = plan.beliefs.faintest_mag
+    known = known_share(plan, limit_mag)
     if known >= MIN_KNOWN or limit_mag <= faintest_mag + LIMIT_MARGIN_MAG:
         return ""
     return (
@@ -383,15 +378,12 @@ def tracker_too_shallow(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def beyond_catalog(context: Context, samples: CheckedSamples) -> str:
+def beyond_catalog(plan: Plan) -> str:
     """Warn if the tracker's limit is beyond its catalog, which has no stars to add."""
-    scene = context.lab.scene
-    faintest_mag = context.beliefs.faintest_mag
+    scene = plan.scene
+    faintest_mag = plan.beliefs.faintest_mag
     limit_mag = scene.tracker.limit_mag
-    if (
-        not isinstance(scene.light, StarsConfig)
-        or limit_mag <= faintest_mag + CATALOG_MARGIN_MAG
-    ):
+    if not scene.stars or limit_mag <= faintest_mag + CATALOG_MARGIN_MAG:
         return ""
     return (
         f"tracker.limit_mag: V {limit_mag:g}, but tracker.catalog ends at V {faintest_mag:.1f}; change it to"
@@ -399,25 +391,25 @@ def beyond_catalog(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def detection_limit_mag(context: Context, samples: CheckedSamples) -> float:
+def detection_limit_mag(plan: Plan) -> float:
     """V of a star of the Sun's color that is detected in about half of the cases, at the slowest frame.
 
     An image of deviation s on a path L has the least area A = pi r^2 + 2 r L above the threshold T if its peak is
     T exp(r^2 / (2 s^2)), see `detection.detected_area_px`.
     """
-    camera = context.camera
-    streak_px = least_streak_px(samples)
+    camera = plan.camera
+    streak_px = least_streak_px(plan)
     length_px = float(np.hypot(*streak_px))
     blur2_px2 = camera.lens_px**2 + BINOMIAL_VARIANCE_PX2
     half_px = length_px / math.pi
-    radius_px = math.sqrt(half_px**2 + context.settings.min_area_px / math.pi) - half_px
-    peak_e = threshold_e(context, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
+    radius_px = math.sqrt(half_px**2 + plan.settings.min_area_px / math.pi) - half_px
+    peak_e = threshold_e(plan, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
     share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
-    return 2.5 * math.log10(bright_star_e(context) * share / peak_e)
+    return 2.5 * math.log10(bright_star_e(plan) * share / peak_e)
 
 
-def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
+def snr_limit_mag(plan: Plan) -> float:
     """V of a star of the Sun's color with a signal-to-noise ratio of 5 over the noise-equivalent area A.
 
     It is that of the slowest frame. With the noise n of a pixel,
@@ -427,11 +419,11 @@ def snr_limit_mag(context: Context, samples: CheckedSamples) -> float:
     A Gaussian of deviation s has A = 4 pi s^2; on a path L much longer than s it has 2 sqrt(pi) s L. The root of the
     sum of their squares is taken in between.
     """
-    camera = context.camera
+    camera = plan.camera
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
-    area_px = width_px * math.hypot(width_px, *least_streak_px(samples))
+    area_px = width_px * math.hypot(width_px, *least_streak_px(plan))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
-    return 2.5 * math.log10(bright_star_e(context) / signal_e)
+    return 2.5 * math.log10(bright_star_e(plan) / signal_e)
 
 
 def bright_star_e(context: Context) -> float:
@@ -441,9 +433,7 @@ def bright_star_e(context: Context) -> float:
     return light_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
 
 
-def least_streak_px(samples: CheckedSamples) -> Floats:
+def least_streak_px(plan: Plan) -> Floats:
     """(2,) path of the images at the slowest frame."""
-    paths_px = [
-        np.median(view.streak_px, axis=0) for view in samples.frames.known if len(view)
-    ]
+    paths_px = [np.median(view.streak_px, axis=0) for view in plan.frames.known if len(view)]
     return min(paths_px, key=np.linalg.norm, default=STILL_PX)

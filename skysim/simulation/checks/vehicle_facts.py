@@ -15,8 +15,7 @@ from skysim.core.types import Floats
 from skysim.core.units import significant
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.actuators import PREFIXES
-from skysim.simulation.checks.detection import Context
-from skysim.simulation.checks.sampling import CheckedSamples
+from skysim.simulation.checks.sampling import Plan
 
 MAX_MANEUVERS = 12  # number of maneuvers that are printed
 CLOSE_NAME = 0.6  # likeness from which a joint's name was meant for an actuator
@@ -40,9 +39,9 @@ def numbers(values: Any, digits: int) -> str:
     return ", ".join(short(one, digits) for one in significant(np.atleast_1d(values), digits))
 
 
-def mass_properties(context: Context, samples: CheckedSamples) -> Fact:
+def mass_properties(plan: Plan) -> Fact:
     """Mass, inertia about the bearing's center and center of mass, each with its origin: the scene or the model."""
-    vehicle = context.lab.vehicle
+    vehicle = plan.lab.vehicle
     config = vehicle.config
     mass = vehicle.mass
     quantities = (
@@ -59,47 +58,46 @@ def mass_properties(context: Context, samples: CheckedSamples) -> Fact:
     return Fact("vehicle", [", ".join(texts)], values)
 
 
-def actuators(context: Context, samples: CheckedSamples) -> Fact | None:
+def actuators(plan: Plan) -> Fact | None:
     """The actuators that are switched on: names, axes in body axes, limits, and greatest momentum."""
-    vehicle = context.lab.vehicle
+    vehicle = plan.lab.vehicle
     config = vehicle.config
-    momentum: Floats | None
     rows: list[tuple[str, str, Any, Floats | None]] = []
-    if config.wheels is not None:
-        momentum = vehicle.wheels.inertia_kg_m2 * config.wheels.speed_limit_rpm * RPM_RAD_S
-        limit = f"{short(config.wheels.torque_limit_nm)} N m"
-        rows.append(("wheels", limit, vehicle.wheels, momentum))
-    if config.cmgs is not None:
-        momentum = vehicle.rotors.inertia_kg_m2 * config.cmgs.rotor_rpm * RPM_RAD_S
-        limit = f"{short(config.cmgs.gimbal_rate_limit_deg_s)} deg/s"
-        rows.append(("cmgs", limit, vehicle.gimbals, momentum))
-    if config.fans is not None:
-        rows.append(("fans", f"{short(config.fans.thrust_limit_n)} N", vehicle.fans, None))
-    if config.trim is not None:
-        rows.append(("trim", f"{short(1e3 * config.trim.travel_m)} mm", vehicle.trims, None))
+    if wheels := config.wheels:
+        spun = vehicle.wheels.inertia_kg_m2 * wheels.speed_limit_rpm
+        rows.append(("wheels", f"{short(wheels.torque_limit_nm)} N m", vehicle.wheels, spun))
+    if cmgs := config.cmgs:
+        spun = vehicle.rotors.inertia_kg_m2 * cmgs.rotor_rpm
+        limit = f"{short(cmgs.gimbal_rate_limit_deg_s)} deg/s"
+        rows.append(("cmgs", limit, vehicle.gimbals, spun))
+    if fans := config.fans:
+        rows.append(("fans", f"{short(fans.thrust_limit_n)} N", vehicle.fans, None))
+    if trim := config.trim:
+        rows.append(("trim", f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
     lines = []
     values: dict[str, Any] = {}
-    for key, limit, members, momentum in rows:
-        parts = []
-        for n, name in enumerate(members.names):
-            axis = f"({numbers(members.axes[:, n], 3)})"
-            stored = (
-                f"about {axis}, {short(momentum[n])} N m s" if momentum is not None else ""
-            )
-            parts.append(f"{name} {stored or f'along {axis}'}")
-        lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
+    for key, limit, members, spun_rpm in rows:
         values[key] = {"names": list(members.names), "axes": members.axes.T.tolist()}
-        values[key] |= {} if momentum is None else {"momentum_nms": momentum.tolist()}
-    control = context.lab.scene.motion.control
+        texts = [f"along ({numbers(axis, 3)})" for axis in members.axes.T]
+        if spun_rpm is not None:
+            momentum_nms = (spun_rpm * RPM_RAD_S).tolist()
+            values[key]["momentum_nms"] = momentum_nms
+            texts = [
+                f"about ({numbers(axis, 3)}), {short(one)} N m s"
+                for axis, one in zip(members.axes.T, momentum_nms, strict=True)
+            ]
+        parts = map(" ".join, zip(members.names, texts, strict=True))
+        lines.append(f"{key} to {limit} each: {'; '.join(parts)}")
+    control = plan.scene.motion.control
     if control is not None and control.actuators == "ideal":
         lines.append(f"ideal torques to {short(config.torque_limit_nm)} N m about each axis")
         values["ideal"] = {"torque_limit_nm": config.torque_limit_nm}
     return Fact("actuators", lines, values) if lines else None
 
 
-def maneuver(context: Context, samples: CheckedSamples) -> Fact | None:
+def maneuver(plan: Plan) -> Fact | None:
     """Start and end of each maneuver, and of the exposures; None without a maneuver."""
-    lab = context.lab
+    lab = plan.lab
     maneuvers = lab.scene.motion.maneuver
     if not maneuvers:
         return None
@@ -124,17 +122,17 @@ def maneuver(context: Context, samples: CheckedSamples) -> Fact | None:
     return Fact("maneuver", lines, values)
 
 
-def inherited_vehicle(context: Context, samples: CheckedSamples) -> str:
+def inherited_vehicle(plan: Plan) -> str:
     """Warn if keys about the vehicle's body are those of a base scene with another vehicle."""
-    inherited = ", ".join(context.lab.scene.inherited)
+    inherited = ", ".join(plan.scene.inherited)
     if not inherited:
         return ""
     return f"vehicle.model: not that of the base, whose {inherited} the vehicle keeps; give its own"
 
 
-def free_joints(context: Context, samples: CheckedSamples) -> str:
+def free_joints(plan: Plan) -> str:
     """Warn of joints of the vehicle's file that no actuator drives, with the nearest name that would be one."""
-    free = context.lab.vehicle.free_joints
+    free = plan.lab.vehicle.free_joints
     if not free:
         return ""
     name = free[0]
@@ -152,20 +150,20 @@ def free_joints(context: Context, samples: CheckedSamples) -> str:
     )
 
 
-def ignored_parts(context: Context, samples: CheckedSamples) -> str:
+def ignored_parts(plan: Plan) -> str:
     """Warn of actuators and sensors of the vehicle's file, which have no effect."""
-    ignored = ", ".join(context.lab.vehicle.ignored)
+    ignored = ", ".join(plan.lab.vehicle.ignored)
     if not ignored:
         return ""
     return f"vehicle.model: {ignored}: not used; the scene's vehicle.wheels, cmgs, fans and imu are; remove them"
 
 
-FACTS: tuple[Callable[[Context, CheckedSamples], Fact | None], ...] = (
+FACTS: tuple[Callable[[Plan], Fact | None], ...] = (
     mass_properties,
     actuators,
     maneuver,
 )
-FINDINGS: tuple[Callable[[Context, CheckedSamples], str], ...] = (
+FINDINGS: tuple[Callable[[Plan], str], ...] = (
     inherited_vehicle,
     free_joints,
     ignored_parts,

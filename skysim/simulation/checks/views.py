@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.camera.optics import Optics
-from skysim.camera.projection import Poses, in_view, project, rates_e_s
+from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
 from skysim.core.types import Floats, Ints, Sources
-from skysim.simulation.exposure import expected_exposure
+from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lens import STRAY_LIGHT
 from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
@@ -163,22 +163,18 @@ class CameraModel(NamedTuple):
 
 
 def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
-    """Mean electrons in a pixel from the extended light of each light, by name, see `CameraModel`."""
-    found: dict[str, float] = {}
+    """Mean electrons in a pixel from the extended light of each light, by name, see `CameraModel`.
+
+    Light with edges that hides other lights is not in their background.
+    """
+    found = dict.fromkeys((lit.name for lit in beam.lits), 0.0)
     for lit in beam.lits:
-        smooth = float(np.mean(lit.glow())) if lit.glow else 0.0
-        found[lit.name] = found.get(lit.name, 0.0) + exposure_s * (
-            smooth + before_lights_e_s(lit)
-        )
+        if lit.glow:
+            found[lit.name] += exposure_s * float(np.mean(lit.glow()))
+        edged_e_s = lit.edged.e_s() if lit.edged and lit.hides is None else None
+        if lit.edged and edged_e_s is not None:
+            found[lit.name] += exposure_s * lit.edged.share * float(np.median(edged_e_s))
     return found
-
-
-def before_lights_e_s(lit: Lit) -> float:
-    """Electrons s^-1 px^-1 of light with edges in the background of other lights; 0 if it hides them."""
-    glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
-    return (
-        0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
-    )
 
 
 def view(
@@ -203,7 +199,7 @@ def view(
     assert lit.points is not None
     mount = exposure.mount
     optics = exposure.optics
-    row, (xy_px, distance_m, cos_out, cos_in) = on_detector(lit.points, optics, exposure.pose)
+    row, (xy_px, distance_m, cos_out, cos_in) = on_detector(lit.points, exposure)
     chosen = lit.points.take(row)
     # 2. Electrons.
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
@@ -234,16 +230,6 @@ def view(
         electrons * share + camera.background_e,
         hiding(occluders, chosen.place),
     )
-
-
-def on_detector(points: Sources, optics: Optics, pose: Poses) -> tuple[Ints, list[Floats]]:
-    """Rows of the points whose images are on the detector, and what `project` returns for these at the one pose."""
-    near = in_view(points, optics, pose, reach=0.0)
-    projected = [one[0] for one in project(points.take(near), optics, pose)]
-    xy_px = projected[0]
-    size = np.array([optics.camera.width_px, optics.camera.height_px])
-    on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
-    return near[on_chip], [one[on_chip] for one in projected]
 
 
 def paths_px(

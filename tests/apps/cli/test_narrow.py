@@ -12,7 +12,7 @@ from skysim.experiments.tracker_comparison import TrackerScore
 from skysim.results import report as as_text
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
-from skysim.results.run_report import frame_table, run_report
+from skysim.results.run_report import frame_table, motion_section, run_report
 
 TRIPLE = ("roll", "pitch", "yaw")
 
@@ -70,14 +70,14 @@ def report(motion: dict[str, float]) -> Report:
     stages = dict.fromkeys(
         ["render", "detector", "detect", "centroid", "identify", "solve"], 12.34
     )
-    pictures = {"annotated": picture, "motion_figure": b"", "views": []}
+    pictures = {"annotated": picture, "views": []}
     return run_report(
         "title",
         "skysim run x",
         TRIPLE,
         [row(0), row(1)],
         stages_ms=stages,
-        motion=motion,
+        motion=motion_section(motion, (), b""),
         facts=[],
         findings=[],
         **pictures,
