@@ -10,12 +10,14 @@ low-precision sidereal time and precession; the simulator integrates the refract
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimator.catalog.catalog import utc
 from estimator.core import checks
+from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
@@ -26,9 +28,12 @@ from estimator.core.constants import (
     STANDARD_TEMPERATURE_K,
     ZERO_CELSIUS_K,
 )
+from estimator.core.types import Attitude, Centroids
 
 # Greatest apparent zenith distance: the formula fails nearer to the horizon.
 LOWEST_RAD = np.radians(85.0)
+AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
+SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
 RAISING_STEPS = 6  # iterations of `raised`
 
 
@@ -202,3 +207,31 @@ def _bending(zenith_rad: Floats, a_rad: float, b_rad: float) -> Floats:
     """(N,) refraction A tan z + B tan^3 z, constant beyond LOWEST_RAD."""
     tangent = np.tan(np.minimum(zenith_rad, LOWEST_RAD))
     return a_rad * tangent + b_rad * tangent**3
+
+
+def solve_through_air(
+    solve: Callable[[Centroids], Attitude],
+    camera: Camera,
+    air: SiteAir,
+    t_s: float,
+    centroids: Centroids,
+) -> Attitude:
+    """Solve centroids seen through the air at t_s after the epoch for which the catalog has been refracted.
+
+    1. Solve with the catalog as it is; the Earth has rotated since the epoch.
+    2. The attitude determines the zenith, and so the directions in which the stars would have been seen at the epoch.
+       Move the centroids there.
+    3. Solve again; a second round makes the error of the first attitude's refraction, some arcseconds, negligible.
+    """
+    # 1. Catalog of the epoch
+    attitude = solve(centroids)
+    for _ in range(AIR_ROUNDS if abs(t_s) > SAME_AIR_S else 0):
+        if attitude.cam_from_ref is None:
+            break
+        # 2. Refraction now removed, that of the epoch applied
+        now = attitude.cam_from_ref.inv().apply(camera.rays(centroids.xy_px))
+        at_epoch = air.seen(air.without_air(now, t_s), 0.0)
+        xy_px = camera.pixels(attitude.cam_from_ref.apply(at_epoch))
+        # 3. Solution
+        attitude = solve(replace(centroids, xy_px=xy_px))
+    return attitude

@@ -16,6 +16,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -345,6 +346,51 @@ def process_frame(
         turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
     centroids = detect_and_centroid(image, camera, settings, clock, streak_px, turn_rad)
     return Report(solve(centroids, clock), centroids, clock.seconds)
+
+
+class FrameTracker:
+    """What the trackers do with a frame: detection and centroiding, then `solve_centroids` of each kind.
+
+    Attributes
+    ----------
+    camera
+        On-board calibration
+    settings
+        Algorithms of the stages, and their parameters
+    """
+
+    camera: Camera
+    settings: Settings
+
+    def solve_centroids(self, *args: Any, **named: Any) -> Attitude:
+        """Identify and solve centroids; each kind of tracker has its own."""
+        raise NotImplementedError
+
+    def solve(
+        self,
+        image: NDArray,
+        streak_px: Step | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+        **when: Any,
+    ) -> Report:
+        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
+
+        Parameters
+        ----------
+        streak_px
+            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or from `rate`
+        rate
+            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
+        exposure_s
+            Exposure time, to estimate the rate from streaks; None if unknown
+        when
+            Time `t_s` and number `frame` of the frame, as far as `solve_centroids` of the tracker takes them
+        """
+        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s, **when)
+        return process_frame(
+            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        )
 
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:

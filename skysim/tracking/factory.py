@@ -236,15 +236,12 @@ def solve_frame(
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
     try:
-        if isinstance(estimator, StarTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s
-            )
+        when: dict[str, float] = {}
+        if isinstance(estimator, StarTracker | CodedTracker):
+            when["t_s"] = frame.t_mid_s
         if isinstance(estimator, CodedTracker):
-            return estimator.solve(
-                frame.image_dn, streak_px, rate, frame.exposure_s, frame.t_mid_s, frame.index
-            )
-        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s)
+            when["frame"] = frame.index
+        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, **when)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())
 
