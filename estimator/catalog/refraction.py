@@ -18,7 +18,7 @@ import numpy as np
 from estimator.catalog.catalog import utc
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Allowed, Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
@@ -34,6 +34,13 @@ from estimator.core.types import Attitude, Centroids
 LOWEST_RAD = np.radians(85.0)
 AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
 SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
+NUMBERS = {
+    "latitude_deg": Allowed(-90, 90, "-90 to 90"),
+    "longitude_deg": Allowed(-360, 360, "-360 to 360"),
+    "pressure_hpa": Allowed(0, 1200, "0 to 1200"),
+    "temperature_c": Allowed(-100, 60, "-100 to 60"),
+    "wavelength_m": Allowed(3e-7, 3e-6, "3e-7 to 3e-6"),
+}
 RAISING_STEPS = 6  # iterations of `raised`
 
 
@@ -66,11 +73,7 @@ class SiteAir:
     wavelength_m: float = 600e-9
 
     def __post_init__(self) -> None:
-        checks.number("latitude_deg", self.latitude_deg, -90, 90, "-90 to 90")
-        checks.number("longitude_deg", self.longitude_deg, -360, 360, "-360 to 360")
-        checks.number("pressure_hpa", self.pressure_hpa, 0, 1200, "0 to 1200")
-        checks.number("temperature_c", self.temperature_c, -100, 60, "-100 to 60")
-        checks.number("wavelength_m", self.wavelength_m, 3e-7, 3e-6, "3e-7 to 3e-6")
+        checks.store_numbers(self, "", NUMBERS)
         utc(self.epoch)
 
     def zenith(self, t_s: float) -> Floats:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
+from estimator.core.checks import Allowed, Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
@@ -39,6 +39,12 @@ MISSED_FRAMES = 2  # missed frames after which a light's track ends, if LEDs are
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
 MIN_FREE_BITS = 8  # the same where the code's time is unknown
 PHASE_REACH = 25.0  # largest difference from the best misfit of a phase of the code's clock that is kept
+
+DECODER = {
+    "flux_sigma": Allowed(1e-6, 1.0, "1e-6 to 1"),
+    "gate_px": Allowed(1.0, 1e4, "1 to 10,000 pixels"),
+    "frames": Allowed(MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True, optional=True),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,17 +72,7 @@ class DecoderSettings:
     frames: int | None = None
 
     def __post_init__(self) -> None:
-        checks.number("decoder: flux_sigma", self.flux_sigma, 1e-6, 1.0, "1e-6 to 1")
-        checks.number("decoder: gate_px", self.gate_px, 1.0, 1e4, "1 to 10,000 pixels")
-        if self.frames is not None:
-            checks.number(
-                "decoder: frames",
-                self.frames,
-                MIN_BITS,
-                10_000,
-                f"{MIN_BITS} to 10,000",
-                True,
-            )
+        checks.store_numbers(self, "decoder: ", DECODER)
 
 
 class CodedTracker(DomeTracker):

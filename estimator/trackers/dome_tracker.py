@@ -42,7 +42,8 @@ from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
+from estimator.identification.direct_match import mutual_nearest
+from estimator.identification.led_index import build_dome_index, inner_field
 from estimator.identification.led_search import NO_MATCH
 from estimator.identification.refusals import advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
@@ -55,8 +56,7 @@ from estimator.trackers.pipeline import (
     check_algorithms,
     direction_sigma_rad,
 )
-from estimator.trackers.refinement import mutual_nearest
-from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
+from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.star_tracker import NO_STARS
 
 # Least centroid error of an LED, for effects outside of survey and calibration
@@ -109,7 +109,8 @@ def star_identifier(
     radius = leds.radius_m
     median_radius_m = float(np.median(radius))
     pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
-    points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
+    corners = camera.rays(camera.corners_px)
+    points = on_sphere(corners, pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
@@ -253,16 +254,8 @@ class DomeTracker(FrameTracker):
             return Attitude(NO_STARS)
         lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
-        if self.camera.row_time_s:
-            solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
-            return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(
-            self._solve_global(centroids, clock, exposure_s),
-            centroids,
-            exposure_s,
-            rate,
-            lights,
-        )
+        solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
+        return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
         """Return K centroids with their total errors, those of the LEDs' positions and the focal length included."""

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
@@ -51,15 +51,6 @@ MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could m
 BAD_PIXEL_SIGMA_PX = 0.06
 
 
-class Allowed(NamedTuple):
-    """Allowed values of a setting: low to high, in words, and whether they are whole numbers."""
-
-    low: float
-    high: float
-    words: str
-    whole: bool = False
-
-
 TINY = 1e-300
 GREATEST = 1e300
 POSITIVE = Allowed(TINY, GREATEST, "finite, above 0")
@@ -80,11 +71,8 @@ ALLOWED = {
     "magnitude_sigma": POSITIVE,
     "missed_dex": NOT_NEGATIVE,
     "reject": Allowed(0, int(max(Flag)) * 2 - 1, "bits of detection.classify.Flag", True),
-}
-# Settings that may also be None.
-OPTIONAL = {
-    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None"),
-    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None"),
+    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None", optional=True),
+    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None", optional=True),
 }
 
 
@@ -172,14 +160,7 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        for name, allowed in (ALLOWED | OPTIONAL).items():
-            value = getattr(self, name)
-            if value is None and name in OPTIONAL:
-                continue
-            value = checks.number(f"settings: {name}", value, *allowed)
-            object.__setattr__(
-                self, name, value
-            )  # a plain float or int, which compiled code knows
+        checks.store_numbers(self, "settings: ", ALLOWED)
         checks.of_type("settings: acceptance", self.acceptance, str)
         checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
         if self.assumed_deg is not None:

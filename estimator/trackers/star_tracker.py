@@ -51,7 +51,7 @@ from estimator.trackers.pipeline import (
     check_algorithms,
 )
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
-from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
+from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
     MIN_ERROR_PX,
@@ -62,7 +62,6 @@ from estimator.trackers.search_models import (
 
 NO_STARS = "too few stars detected"
 
-CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
 
@@ -135,11 +134,11 @@ class StarTracker(FrameTracker):
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
-        if settings.identifier == "default":
+        if default:
             self.sky = sky_index.build(
                 self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars)
             )
-            self.pairs = len(self.sky.pair)
+            patterns = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
             known = settings.zero_point_mag is not None
@@ -148,12 +147,12 @@ class StarTracker(FrameTracker):
                 longest_rad,
                 magnitude=index_stars.v_mag if known else None,
             )
-            self.pairs = len(self.index.pair)
+            patterns = len(self.index.pair)
         self.field_matcher = FieldMatcher(
-            camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
+            camera, self.stars, self.sky, settings, focal_uncertainty, patterns
         )
         # Field of view in tangents: least and largest x, least and largest y
-        corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
+        corners = camera.tangents(camera.corners_px)
         self.field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
         zero_point_mag = (
             np.nan if settings.zero_point_mag is None else settings.zero_point_mag
@@ -303,15 +302,11 @@ class StarTracker(FrameTracker):
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
-        if self.camera.row_time_s:
-            lights = Lights(
-                self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
-            )
-            once = functools.partial(self._solve_global, clock=clock, effort=effort)
-            return solve_rolling(self.camera, lights, centroids, once, rate, exposure_s)
-        return with_streak_rate(
-            self._solve_global(centroids, clock, effort), centroids, exposure_s, rate
+        lights = Lights(
+            self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
+        once = functools.partial(self._solve_global, clock=clock, effort=effort)
+        return solve_lights(self.camera, lights, centroids, once, rate, exposure_s)
 
     def with_errors(self, centroids: Centroids) -> Centroids:
         """Return the centroids with their total errors as covariances."""
