@@ -132,12 +132,10 @@ def solve(
         With one line for an image that cannot be read.
     """
     solver: Solver | DomeSolver
-    kind: type[PlateSolution | DomeSolution] = PlateSolution
     sky = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
     if dome:
         if any(one is not None for one in sky):
             raise InputError("solve.dome", "with a keyword of the sky", "dome and map alone")
-        kind = DomeSolution
         solver = make_dome_solver(dome, map)
     elif map:
         raise InputError("solve.map", "has no effect without a dome", "with the dome's scene")
@@ -153,6 +151,7 @@ def solve(
     else:
         solver = kept_solver(fov_deg, time_utc)
     result = read_and_solve(Path(path), solver)
+    kind: type[PlateSolution | DomeSolution] = DomeSolution if dome else PlateSolution
     return kind(**{one.name: result[one.name] for one in fields(kind)})
 
 
