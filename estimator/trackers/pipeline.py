@@ -338,14 +338,13 @@ class FrameTracker:
         On-board calibration
     settings
         Algorithms of the stages, and their parameters
+    solve_centroids
+        Method that identifies and solves centroids
     """
 
     camera: Camera
     settings: Settings
-
-    def solve_centroids(self, *args: Any, **named: Any) -> Attitude:
-        """Identify and solve centroids; each kind of tracker has its own."""
-        raise NotImplementedError
+    solve_centroids: Callable[..., Attitude]
 
     def solve(
         self,

@@ -30,15 +30,15 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
-from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
     Detections,
-    FlatCentroids,
     Sensor,
     detections_of,
+    flat_centroids,
 )
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit, warm_up
@@ -151,14 +151,22 @@ class StarTracker(FrameTracker):
         self.field_matcher = FieldMatcher(
             camera, self.stars, self.sky, settings, focal_uncertainty, patterns
         )
+
+    @functools.cached_property
+    def sensor(self) -> Sensor:
+        """Calibration and scale of the magnitudes, for compiled code."""
         # Field of view in tangents: least and largest x, least and largest y
-        corners = camera.tangents(camera.corners_px)
-        self.field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
-        zero_point_mag = (
-            np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        corners = self.camera.tangents(self.camera.corners_px)
+        field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
+        zero_mag = self.settings.zero_point_mag
+        return Sensor(
+            self.camera.focal_px,
+            self.camera.center_px,
+            self.camera.distortion,
+            field,
+            np.nan if zero_mag is None else zero_mag,
+            self.settings.magnitude_sigma,
         )
-        lens = camera.focal_px, camera.center_px, camera.distortion
-        self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
@@ -436,7 +444,7 @@ class StarTracker(FrameTracker):
             Relative uncertainty of the focal length, if it is larger than that of the tracker
         """
         uncertainty = max(self.focal_uncertainty, focal_uncertainty)
-        return detections_of(_lights(centroids, sigma_px), self.sensor, uncertainty)
+        return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
         self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
@@ -496,7 +504,7 @@ class StarTracker(FrameTracker):
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
         if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
-            lights = _lights(centroids, sigma_px)
+            lights = flat_centroids(centroids, sigma_px)
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
@@ -576,14 +584,6 @@ class StarTracker(FrameTracker):
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
         )
-
-
-def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
-    """Return centroids in the form for compiled code, with their total errors (N,)."""
-    spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
-    return FlatCentroids(
-        centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px
-    )
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:

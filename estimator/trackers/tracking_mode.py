@@ -294,7 +294,8 @@ class TrackingMode:
         )
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
-        half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
+        field = tracker.sensor.field
+        half = float(np.min(field[1::2] - field[::2])) / 2
         prior_volume = (2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)
         prior_gain_dex = log10(8 * pi**2 / prior_volume)
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
