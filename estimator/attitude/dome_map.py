@@ -255,6 +255,22 @@ def common_images_px(leds: LedMap, camera: Camera, rays_cam: Floats) -> Floats:
     return np.array([camera.with_lens(lens).pixels(rays_cam) for lens in lenses])
 
 
+def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
+    """Return the (L,) standard deviation of the direction to each LED from the camera, from the error of its position.
+
+    Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
+    line from the bearing is divided by the LED's own distance minus the lever.
+    """
+    radius_m = leds.radius_m
+    lever_m = float(np.linalg.norm(lever.camera_body_m))
+    if leds.covariance_m2 is None:
+        return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))
+    along = leds.position_m / radius_m[:, None]
+    total_m2 = np.trace(leds.covariance_m2, axis1=1, axis2=2)
+    along_m2 = np.einsum("ni,nij,nj->n", along, leds.covariance_m2, along)
+    return np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m)
+
+
 def check_map(leds: object) -> None:
     """Raise ImageError unless a map's arrays have matching shapes and usable numbers."""
     checks.of_type("leds", leds, LedMap)

@@ -171,6 +171,12 @@ def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
     return camera.focal_sigma * distance_px
 
 
+def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
+    """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
+    tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
+    return camera.focal_sigma * tangent / np.sqrt(2)
+
+
 def with_focal_error(
     covariance_rad2: Floats,
     camera: Camera,

@@ -10,13 +10,15 @@ low-precision sidereal time and precession; the simulator integrates the refract
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from estimator.catalog.catalog import utc
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.camera import Camera
+from estimator.core.checks import Allowed, Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
@@ -26,9 +28,19 @@ from estimator.core.constants import (
     STANDARD_TEMPERATURE_K,
     ZERO_CELSIUS_K,
 )
+from estimator.core.types import Attitude, Centroids
 
 # Greatest apparent zenith distance: the formula fails nearer to the horizon.
 LOWEST_RAD = np.radians(85.0)
+AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
+SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
+NUMBERS = {
+    "latitude_deg": Allowed(-90, 90, "-90 to 90"),
+    "longitude_deg": Allowed(-360, 360, "-360 to 360"),
+    "pressure_hpa": Allowed(0, 1200, "0 to 1200"),
+    "temperature_c": Allowed(-100, 60, "-100 to 60"),
+    "wavelength_m": Allowed(3e-7, 3e-6, "3e-7 to 3e-6"),
+}
 RAISING_STEPS = 6  # iterations of `raised`
 
 
@@ -61,11 +73,7 @@ class SiteAir:
     wavelength_m: float = 600e-9
 
     def __post_init__(self) -> None:
-        checks.number("latitude_deg", self.latitude_deg, -90, 90, "-90 to 90")
-        checks.number("longitude_deg", self.longitude_deg, -360, 360, "-360 to 360")
-        checks.number("pressure_hpa", self.pressure_hpa, 0, 1200, "0 to 1200")
-        checks.number("temperature_c", self.temperature_c, -100, 60, "-100 to 60")
-        checks.number("wavelength_m", self.wavelength_m, 3e-7, 3e-6, "3e-7 to 3e-6")
+        checks.store_numbers(self, "", NUMBERS)
         utc(self.epoch)
 
     def zenith(self, t_s: float) -> Floats:
@@ -202,3 +210,31 @@ def _bending(zenith_rad: Floats, a_rad: float, b_rad: float) -> Floats:
     """(N,) refraction A tan z + B tan^3 z, constant beyond LOWEST_RAD."""
     tangent = np.tan(np.minimum(zenith_rad, LOWEST_RAD))
     return a_rad * tangent + b_rad * tangent**3
+
+
+def solve_through_air(
+    solve: Callable[[Centroids], Attitude],
+    camera: Camera,
+    air: SiteAir,
+    t_s: float,
+    centroids: Centroids,
+) -> Attitude:
+    """Solve centroids seen through the air at t_s after the epoch for which the catalog has been refracted.
+
+    1. Solve with the catalog as it is; the Earth has rotated since the epoch.
+    2. The attitude determines the zenith, and so the directions in which the stars would have been seen at the epoch.
+       Move the centroids there.
+    3. Solve again; a second round makes the error of the first attitude's refraction, some arcseconds, negligible.
+    """
+    # 1. Catalog of the epoch
+    attitude = solve(centroids)
+    for _ in range(AIR_ROUNDS if abs(t_s) > SAME_AIR_S else 0):
+        if attitude.cam_from_ref is None:
+            break
+        # 2. Refraction now removed, that of the epoch applied
+        now = attitude.cam_from_ref.inv().apply(camera.rays(centroids.xy_px))
+        at_epoch = air.seen(air.without_air(now, t_s), 0.0)
+        xy_px = camera.pixels(attitude.cam_from_ref.apply(at_epoch))
+        # 3. Solution
+        attitude = solve(replace(centroids, xy_px=xy_px))
+    return attitude

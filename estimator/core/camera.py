@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.checks import Allowed, Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -25,6 +25,13 @@ NARROWEST_DEG = 1.6
 # Numbers of channels of an image with a channel axis: gray or color, without or with transparency.
 COLORS = (1, 2, 3, 4)
 
+NUMBERS = {
+    "width_px": Allowed(1, 1e6, "whole, 1 to 1e6", True),
+    "height_px": Allowed(1, 1e6, "whole, 1 to 1e6", True),
+    "focal_px": Allowed(1e-9, 1e12, "finite, above 0: focal length over pixel"),
+    "focal_sigma": Allowed(0.0, 0.5, "0 to 0.5, relative"),
+    "row_time_s": Allowed(-1.0, 1.0, "-1 to 1: seconds from row to row"),
+}
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
 
 
@@ -66,31 +73,7 @@ class Camera:
     def __post_init__(self) -> None:
         if self._is_plain():
             return
-        for name in ("width_px", "height_px"):
-            size = checks.number(
-                f"camera: {name}", getattr(self, name), 1, 1e6, "whole, 1 to 1e6", True
-            )
-            object.__setattr__(self, name, size)
-        focal = checks.number(
-            "camera: focal_px",
-            self.focal_px,
-            1e-9,
-            1e12,
-            "finite, above 0: focal length over pixel",
-        )
-        object.__setattr__(self, "focal_px", focal)
-        sigma = checks.number(
-            "camera: focal_sigma", self.focal_sigma, 0.0, 0.5, "0 to 0.5, relative"
-        )
-        object.__setattr__(self, "focal_sigma", sigma)
-        row_time = checks.number(
-            "camera: row_time_s",
-            self.row_time_s,
-            -1.0,
-            1.0,
-            "-1 to 1: seconds from row to row",
-        )
-        object.__setattr__(self, "row_time_s", row_time)
+        checks.store_numbers(self, "camera: ", NUMBERS)
         # Plain floats: compiled code would be compiled again for a tuple of integers.
         for name, count in (("center_px", 2), ("distortion", 5)):
             array = checks.floats(f"camera: {name}", getattr(self, name), (count,))
@@ -105,7 +88,6 @@ class Camera:
 
         It is a quick check, since a lens fit makes a hundred cameras.
         """
-        size = (self.width_px, self.height_px)
         lens = (self.center_px, self.distortion)
         if not (
             type(lens[0]) is type(lens[1]) is tuple
@@ -113,15 +95,12 @@ class Camera:
             and len(lens[1]) == 5
         ):
             return False
-        numbers = (self.focal_px, self.focal_sigma, self.row_time_s, *lens[0], *lens[1])
-        return (
-            all([type(one) is int and 0 < one <= 1e6 for one in size])
-            and all([type(one) is float for one in numbers])
-            and math.isfinite(sum(numbers))
-            and 1e-9 <= self.focal_px <= 1e12
-            and 0 <= self.focal_sigma <= 0.5
-            and abs(self.row_time_s) <= 1
-        )
+        for name, (low, high, _, whole, _) in NUMBERS.items():
+            value = getattr(self, name)
+            if type(value) is not (int if whole else float) or not low <= value <= high:
+                return False
+        numbers = (*lens[0], *lens[1])
+        return all([type(one) is float for one in numbers]) and math.isfinite(sum(numbers))
 
     @classmethod
     def from_fov(
@@ -182,6 +161,13 @@ class Camera:
         """Diagonal field of view: the angle between opposite corners, without distortion."""
         half = np.hypot(self.width_px, self.height_px) / 2
         return float(2 * np.arctan(half / self.focal_px))
+
+    @property
+    def corners_px(self) -> Floats:
+        """(4, 2) corners of the sensor, half a pixel beyond the centers of its corner pixels."""
+        right = self.width_px - 0.5
+        bottom = self.height_px - 0.5
+        return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
 
     def zoomed(self, factor: float) -> Camera:
         """Return a copy with the focal length multiplied by `factor`."""

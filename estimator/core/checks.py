@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -57,6 +57,27 @@ def number(
         if low <= plain <= high:
             return plain
     raise ImageError(f"{what} is {excerpt(value)}; allowed: {allowed}")
+
+
+class Allowed(NamedTuple):
+    """Allowed values of a number: low to high, in words; whether only whole numbers, and whether None too."""
+
+    low: float
+    high: float
+    words: str
+    whole: bool = False
+    optional: bool = False
+
+
+def store_numbers(owner: object, what: str, allowed: Mapping[str, Allowed]) -> None:
+    """Replace numbers of a frozen dataclass, by name, by plain floats and ints, which compiled code knows.
+
+    Raises ImageError for others, with `what` before the name.
+    """
+    for name, limits in allowed.items():
+        value = getattr(owner, name)
+        if value is not None or not limits.optional:
+            object.__setattr__(owner, name, number(f"{what}{name}", value, *limits[:4]))
 
 
 def of_type(what: str, value: object, *kinds: type) -> None:

@@ -10,11 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 THESIS_INTENSITY = 0.04  # Padro 2012, section 3.7
+
+
+PRIORS = {
+    "saturation": Allowed(-np.inf, np.inf, "a number; inf if unknown"),
+    "turn_rad": Allowed(-1e300, 1e300, "a finite number"),
+    "intensity_threshold": Allowed(1e-300, 1.0, "above 0, up to 1"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +54,7 @@ class FramePriors:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
-        least = checks.number(
-            "saturation", self.saturation, -np.inf, np.inf, "a number; inf if unknown"
-        )
-        object.__setattr__(self, "saturation", least)
-        turn_rad = checks.number("turn_rad", self.turn_rad, -1e300, 1e300, "a finite number")
-        object.__setattr__(self, "turn_rad", turn_rad)
-        share = checks.number(
-            "intensity_threshold", self.intensity_threshold, 1e-300, 1.0, "above 0, up to 1"
-        )
-        object.__setattr__(self, "intensity_threshold", share)
+        checks.store_numbers(self, "", PRIORS)
 
 
 NO_PRIORS = FramePriors()
@@ -365,6 +363,11 @@ class Attitude:
     def solved(self) -> bool:
         """Whether there is an attitude."""
         return self.cam_from_ref is not None
+
+    @property
+    def log10_chance(self) -> float:
+        """Logarithm of the expected number of equally good chance matches; 0 without a match."""
+        return self.match.log10_chance if self.match else 0.0
 
     @property
     def ra_dec_roll_deg(self) -> tuple[float, float, float]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
@@ -55,6 +56,21 @@ def to_star_match(match: DirectMatch, by_paper: bool = False) -> StarMatch | Non
     if len(match.observed) < MIN_MATCHES or chance > ACCEPT_LOG10_CHANCE:
         return None
     return StarMatch(match.observed, match.star, rotation(match.R_cam_from_ref), chance)
+
+
+def mutual_nearest(
+    observed_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Return mutual nearest neighbors within a radius: indices of observed_px, and `rows` of the predictions."""
+    if not len(predicted_px) or not len(observed_px):
+        return np.empty(0, int), np.empty(0, int)
+    distance, nearest = cKDTree(predicted_px).query(
+        observed_px, distance_upper_bound=radius_px
+    )
+    _, back = cKDTree(observed_px).query(predicted_px)
+    match = np.flatnonzero(np.isfinite(distance))
+    match = match[back[nearest[match]] == match]
+    return match, rows[nearest[match]]
 
 
 @jit

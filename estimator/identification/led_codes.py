@@ -31,10 +31,11 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Allowed, Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import Centroids
+from estimator.identification.direct_match import mutual_nearest
 
 GROSS = 7.0  # misfit of a gross error: one of a thousand
 ROUGH = 0.1  # `likely`: error of a light, as a fraction of the brightest frame
@@ -66,11 +67,8 @@ class LedCode:
                 "code: levels; allowed: 0 to 1, of each LED two different ones or more"
             )
         object.__setattr__(self, "levels", levels)
-        if self.bit_time_s is not None:
-            bit_time_s = checks.number(
-                "code: bit_time_s", self.bit_time_s, 1e-9, 1e9, "above 0, or None"
-            )
-            object.__setattr__(self, "bit_time_s", bit_time_s)
+        allowed = Allowed(1e-9, 1e9, "above 0, or None", optional=True)
+        checks.store_numbers(self, "code: ", {"bit_time_s": allowed})
 
     @property
     def bits(self) -> int:
@@ -359,39 +357,28 @@ class LightTracks:
         # 1. Turn the points by the motion.
         turn = now_from_then or Rotation.from_rotvec(self.rate_rad_s * elapsed_s)
         predicted_m = turn.apply(self.point_m)
-        # 2. Project them, and find their lights.
+        # 2. Project them, and find their lights. A point behind the camera has no pixel: it is outside of the sensor.
         xy_px = self.camera.pixels(predicted_m - self.pupil_m)
-        seen_m = on_sphere(self.camera.rays(centroids.xy_px), self.pupil_m, self.radius_m)
-        self.row = _mutual_nearest(xy_px, centroids.xy_px, self.gate_px)
-        # 3. Measure the motion.
-        self._measure_motion(seen_m, elapsed_s)
-        found = self.row >= 0
-        self.point_m = predicted_m
-        self.point_m[found] = seen_m[self.row[found]]
-        # 4. Record the brightness. A point behind the camera has no pixel: it is outside of the sensor.
         xy_px = np.nan_to_num(xy_px, nan=-1e9)
-        self._record(centroids, sigma, self.camera.contains(xy_px, BORDER_PX))
-        # 5. End tracks and begin new ones.
-        self.missed = np.where(found, 0, self.missed + 1)
-        waits = (self.missed <= self.patience) & self.camera.contains(xy_px)
-        self._keep(found | waits)
-        self._begin(centroids, sigma, seen_m)
-
-    def _measure_motion(self, seen_m: Floats, elapsed_s: float) -> None:
-        """Step 3: measure the rate of the lights between the last two frames, in camera axes.
-
-        The rate is unchanged unless two lights are seen in both frames.
-
-        Parameters
-        ----------
-        seen_m
-            (N, 3) points of the frame's lights on the sphere, in camera axes
-        """
+        seen_m = on_sphere(self.camera.rays(centroids.xy_px), self.pupil_m, self.radius_m)
+        track = np.arange(len(xy_px))
+        light, track = mutual_nearest(centroids.xy_px, xy_px, self.gate_px, track)
+        self.row = np.full(len(xy_px), -1)
+        self.row[track] = light
         found = self.row >= 0
+        # 3. Measure the rate of the lights, which is unchanged unless two of them are seen in both frames.
         if found.sum() >= 2 and elapsed_s > 0:
             # Wahba's problem: the rotation of the points from the last frame to this one.
             turn, _ = Rotation.align_vectors(seen_m[self.row[found]], self.point_m[found])
             self.rate_rad_s = turn.as_rotvec() / elapsed_s
+        self.point_m = predicted_m
+        self.point_m[found] = seen_m[self.row[found]]
+        # 4. Record the brightness.
+        self._record(centroids, sigma, self.camera.contains(xy_px, BORDER_PX))
+        # 5. End tracks and begin new ones.
+        self.missed = np.where(found, 0, self.missed + 1)
+        waits = (self.missed <= self.patience) & self.camera.contains(xy_px)
+        self._end_and_begin(found | waits, centroids, sigma, seen_m)
 
     def _record(self, centroids: Centroids, sigma: Floats, inside: NDArray[np.bool_]) -> None:
         """Step 4: store the brightness of each track; 0 for an LED that is dark well inside the field.
@@ -414,51 +401,21 @@ class LightTracks:
             greatest = np.fmax.reduce(self.sigma, axis=1, initial=0.0)
         self.sigma[dark, self.column] = greatest[dark]
 
-    def _keep(self, kept: NDArray[np.bool_]) -> None:
-        """Keep the tracks of a (T,) mask."""
-        for name in ("point_m", "light", "sigma", "row", "missed"):
-            setattr(self, name, getattr(self, name)[kept])
-
-    def _begin(self, centroids: Centroids, sigma: Floats, seen_m: Floats) -> None:
-        """Begin tracks for the lights that continue none."""
+    def _end_and_begin(
+        self, kept: NDArray[np.bool_], centroids: Centroids, sigma: Floats, seen_m: Floats
+    ) -> None:
+        """Step 5: keep the tracks of a (T,) mask, and begin tracks for the lights that continue none."""
         new = np.setdiff1d(np.arange(len(centroids)), self.row)
-        nothing = np.full((len(new), self.frames), np.nan)
-        self.point_m = np.vstack([self.point_m, seen_m[new]])
-        self.light = np.vstack([self.light, nothing])
-        self.sigma = np.vstack([self.sigma, nothing])
-        self.row = np.concatenate([self.row, new])
-        self.missed = np.concatenate([self.missed, np.zeros(len(new), np.int64)])
         # Their only measurement is that of this frame.
-        first = len(self.row) - len(new)
-        self.light[first:, self.column] = centroids.flux[new]
-        self.sigma[first:, self.column] = sigma[new]
-
-
-def _mutual_nearest(predicted_px: Floats, seen_px: Floats, gate_px: float) -> Ints:
-    """Row of the light nearest to each prediction, if both are each other's nearest within the gate.
-
-    Parameters
-    ----------
-    predicted_px, seen_px
-        (T, 2) predictions and (N, 2) lights, pixels
-    gate_px
-        Greatest distance
-
-    Returns
-    -------
-    Ints
-        (T,) rows of the lights, -1 without one
-    """
-    row = np.full(len(predicted_px), -1)
-    if not len(predicted_px) or not len(seen_px):
-        return row
-    distance = np.linalg.norm(predicted_px[:, None] - seen_px, axis=2)
-    # A prediction behind the camera has no pixel.
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    nearest = distance.argmin(axis=1)
-    track = np.arange(len(row))
-    # Nearest in both directions, and within the gate.
-    mutual = distance.argmin(axis=0)[nearest] == track
-    good = mutual & (distance[track, nearest] <= gate_px)
-    row[good] = nearest[good]
-    return row
+        light, error = np.full((2, len(new), self.frames), np.nan)
+        light[:, self.column] = centroids.flux[new]
+        error[:, self.column] = sigma[new]
+        begun = {
+            "point_m": seen_m[new],
+            "light": light,
+            "sigma": error,
+            "row": new,
+            "missed": np.zeros(len(new), np.int64),
+        }
+        for name, more in begun.items():
+            setattr(self, name, np.concatenate([getattr(self, name)[kept], more]))

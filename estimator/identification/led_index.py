@@ -115,7 +115,7 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     median_m = float(np.median(radius))
     lever_m = float(np.linalg.norm(lever.camera_body_m))
     # The greatest angle between two LEDs in one field.
-    rays = corner_rays(camera)
+    rays = camera.rays(camera.corners_px)
     inner, half_size = inner_field(rays)
     alpha = float(np.arccos(rays[:, 2].min()))
     # At a given angle from the boresight, the LED of the greatest radius has the greatest angle about the bearing.
@@ -143,13 +143,6 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
         float(lever.sigma_m / (radius.min() - lever_m)),
         np.zeros(0) if leds.flux_s is None else np.log(leds.flux_s),
         float(leds.flux_sigma),
-    )
-
-
-def corner_rays(camera: Camera) -> Floats:
-    """(4, 3) unit rays of the sensor's corners, in camera axes."""
-    return camera.rays(
-        np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * [camera.width_px, camera.height_px] - 0.5
     )
 
 

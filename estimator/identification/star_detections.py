@@ -15,6 +15,7 @@ from estimator.core import vectors
 from estimator.core.camera import Distortion, undistorted
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
+from estimator.core.types import NO_SPREAD, Centroids
 from estimator.identification.chance import GATE_SIGMA
 
 
@@ -97,6 +98,14 @@ class FlatCentroids(NamedTuple):
     flux: Floats
     spread_px2: Floats
     sigma_px: Floats
+
+
+def flat_centroids(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
+    """Centroids in the form for compiled code, with their total errors (N,)."""
+    spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
+    return FlatCentroids(
+        centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px
+    )
 
 
 @jit

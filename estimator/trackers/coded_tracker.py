@@ -14,16 +14,14 @@ A frame without enough bits, or whose lights contradict each other, has no attit
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Step
+from estimator.core.checks import Allowed, Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
@@ -31,10 +29,8 @@ from estimator.identification.led_codes import LedCode, LightTracks
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import (
     Clock,
-    Report,
     Settings,
     direction_sigma_rad,
-    process_frame,
 )
 from estimator.trackers.star_tracker import NO_STARS
 
@@ -43,6 +39,12 @@ MISSED_FRAMES = 2  # missed frames after which a light's track ends, if LEDs are
 MIN_BITS = 3  # a light measured in fewer frames could be any LED
 MIN_FREE_BITS = 8  # the same where the code's time is unknown
 PHASE_REACH = 25.0  # largest difference from the best misfit of a phase of the code's clock that is kept
+
+DECODER = {
+    "flux_sigma": Allowed(1e-6, 1.0, "1e-6 to 1"),
+    "gate_px": Allowed(1.0, 1e4, "1 to 10,000 pixels"),
+    "frames": Allowed(MIN_BITS, 10_000, f"{MIN_BITS} to 10,000", True, optional=True),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +72,7 @@ class DecoderSettings:
     frames: int | None = None
 
     def __post_init__(self) -> None:
-        checks.number("decoder: flux_sigma", self.flux_sigma, 1e-6, 1.0, "1e-6 to 1")
-        checks.number("decoder: gate_px", self.gate_px, 1.0, 1e4, "1 to 10,000 pixels")
-        if self.frames is not None:
-            checks.number(
-                "decoder: frames",
-                self.frames,
-                MIN_BITS,
-                10_000,
-                f"{MIN_BITS} to 10,000",
-                True,
-            )
+        checks.store_numbers(self, "decoder: ", DECODER)
 
 
 class CodedTracker(DomeTracker):
@@ -144,34 +136,6 @@ class CodedTracker(DomeTracker):
         self.last_s: float | None = None
         led_codes.misfits(*np.ones((4, 1, 1)))  # compiles or loads it before the frames
 
-    def solve(
-        self,
-        image: NDArray,
-        streak_px: Step | None = None,
-        rate: RateEstimate | None = None,
-        exposure_s: float | None = None,
-        t_s: float | None = None,
-        frame: int = 0,
-    ) -> Report:
-        """Solve the frame of number `frame`, exposed about t_s. Raises ImageError for bad input.
-
-        Parameters
-        ----------
-        streak_px, rate, exposure_s
-            Streak, rate and exposure time as in `DomeTracker.solve`; the rate also predicts the
-            lights' motion
-        t_s
-            Mid-exposure time; None if unknown
-        frame
-            Number of the frame
-        """
-        solve = partial(
-            self.solve_centroids, rate=rate, exposure_s=exposure_s, t_s=t_s, frame=frame
-        )
-        return process_frame(
-            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
-        )
-
     def solve_centroids(
         self,
         centroids: Centroids,
@@ -181,7 +145,17 @@ class CodedTracker(DomeTracker):
         t_s: float | None = None,
         frame: int = 0,
     ) -> Attitude:
-        """Track, name and solve centroids from any source; the other arguments as in `solve`."""
+        """Track, name and solve centroids from any source.
+
+        Parameters
+        ----------
+        rate, exposure_s
+            Rate and exposure time as in `solve`; the rate also predicts the lights' motion
+        t_s
+            Mid-exposure time; None if unknown
+        frame
+            Number of the frame
+        """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         clock = clock or Clock()

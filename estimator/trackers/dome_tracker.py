@@ -27,6 +27,7 @@ from estimator.attitude.dome_map import (
     check_map,
     common_images_px,
     common_shifts_m,
+    led_sigma_rad,
     on_sphere,
     on_surface,
     project,
@@ -36,27 +37,26 @@ from estimator.attitude.rotation_fit import fit_focal_ratio
 from estimator.catalog import pair_index
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Step
+from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from estimator.identification.led_index import build_dome_index, corner_rays, inner_field
+from estimator.identification.direct_match import mutual_nearest
+from estimator.identification.led_index import build_dome_index, inner_field
 from estimator.identification.led_search import NO_MATCH
 from estimator.identification.refusals import advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
-    Report,
+    FrameTracker,
     Settings,
     brightest,
     check_algorithms,
     direction_sigma_rad,
-    process_frame,
 )
-from estimator.trackers.refinement import mutual_nearest
-from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
+from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.star_tracker import NO_STARS
 
 # Least centroid error of an LED, for effects outside of survey and calibration
@@ -109,7 +109,8 @@ def star_identifier(
     radius = leds.radius_m
     median_radius_m = float(np.median(radius))
     pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
-    points = on_sphere(corner_rays(camera), pupil_m, median_radius_m) / median_radius_m
+    corners = camera.rays(camera.corners_px)
+    points = on_sphere(corners, pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
     reach_rad = np.arccos(np.clip((points @ points.T).min(), -1, 1))
     pairs = pair_index.build(leds.position_m / radius[:, None], reach_rad * 1.05, leds.board)
@@ -168,29 +169,7 @@ IDENTIFIERS: dict[str, Callable[[Camera, LedMap, Lever, Settings], Identify]] = 
 }
 
 
-def led_sigma_rad(leds: LedMap, lever: Lever) -> Floats:
-    """Return the (L,) standard deviation of the direction to each LED from the camera, from the error of its position.
-
-    Equal errors of all LEDs are divided by the least distance of any LED from the camera. Otherwise the rms across the
-    line from the bearing is divided by the LED's own distance minus the lever.
-    """
-    radius_m = leds.radius_m
-    lever_m = float(np.linalg.norm(lever.camera_body_m))
-    if leds.covariance_m2 is None:
-        return np.full(len(radius_m), leds.sigma_m / (radius_m.min() - lever_m))
-    along = leds.position_m / radius_m[:, None]
-    total_m2 = np.trace(leds.covariance_m2, axis1=1, axis2=2)
-    along_m2 = np.einsum("ni,nij,nj->n", along, leds.covariance_m2, along)
-    return np.sqrt((total_m2 - along_m2) / 2) / (radius_m - lever_m)
-
-
-def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
-    """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
-    tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
-    return camera.focal_sigma * tangent / np.sqrt(2)
-
-
-class DomeTracker:
+class DomeTracker(FrameTracker):
     """Lost-in-space tracker under an LED dome, with the camera on a lever arm about the bearing center.
 
     cam_from_ref of the result is cam_from_lab; `lever` converts it to the vehicle's attitude.
@@ -231,31 +210,6 @@ class DomeTracker:
         self.identify = IDENTIFIERS[settings.identifier](camera, leds, lever, settings)
         self.led_sigma_rad = led_sigma_rad(leds, lever)
         self.focal_fitted = False  # whether the camera's focal length is fitted to this frame
-
-    def solve(
-        self,
-        image: NDArray,
-        streak_px: Step | None = None,
-        rate: RateEstimate | None = None,
-        exposure_s: float | None = None,
-    ) -> Report:
-        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
-
-        Parameters
-        ----------
-        streak_px
-            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or
-            from `rate`
-        rate
-            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from
-            the frame
-        exposure_s
-            Exposure time, to estimate the rate from streaks; None if unknown
-        """
-        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
-        return process_frame(
-            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
-        )
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use: call it before the experiment.
@@ -300,25 +254,13 @@ class DomeTracker:
             return Attitude(NO_STARS)
         lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
-        if self.camera.row_time_s:
-            solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
-            return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(
-            self._solve_global(centroids, clock, exposure_s),
-            centroids,
-            exposure_s,
-            rate,
-            lights,
-        )
+        solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
+        return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
 
     def _with_errors(self, centroids: Centroids, star: NDArray) -> Centroids:
         """Return K centroids with their total errors, those of the LEDs' positions and the focal length included."""
-        rays = self.camera.rays(centroids.xy_px)
-        pixel_rad = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings),
-            focal_error_rad(rays, self.camera),
-        )
-        sigma_px = self.camera.focal_px * np.hypot(pixel_rad, self.led_sigma_rad[star])
+        sigma_rad = np.hypot(self._pixel_rad(centroids), self.led_sigma_rad[star])
+        sigma_px = self.camera.focal_px * sigma_rad
         return replace(centroids, sigma_px=sigma_px, covariance_px2=None)
 
     def _solve_global(
@@ -326,13 +268,12 @@ class DomeTracker:
     ) -> Attitude:
         """Identify and solve centroids of one time."""
         bright = brightest(centroids, self.settings)
-        rays = self.camera.rays(bright.xy_px)
-        sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
-        if self.settings.identifier not in FITS_FOCAL:
-            sigma_rad = np.hypot(sigma_rad, focal_error_rad(rays, self.camera))
-        match = self.identify(
-            rays, sigma_rad, bright.flux / exposure_s if exposure_s else None
-        )
+        if self.settings.identifier in FITS_FOCAL:
+            sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
+        else:
+            sigma_rad = self._pixel_rad(bright)
+        flux_s = bright.flux / exposure_s if exposure_s else None
+        match = self.identify(self.camera.rays(bright.xy_px), sigma_rad, flux_s)
         return self._solve_identified(centroids, match, clock)
 
     def _solve_identified(
@@ -394,8 +335,15 @@ class DomeTracker:
 
     def _focal_rad(self, rays: Floats) -> Floats:
         """Return the (N,) `focal_error_rad` of rays; 0 where the focal length is fitted, as the fit has its error."""
-        return (
-            np.zeros(len(rays)) if self.focal_fitted else focal_error_rad(rays, self.camera)
+        if self.focal_fitted:
+            return np.zeros(len(rays))
+        return systematic.focal_error_rad(rays, self.camera)
+
+    def _pixel_rad(self, centroids: Centroids) -> Floats:
+        """Return the (N,) standard deviations of the directions, from the centroids and the focal length."""
+        return np.hypot(
+            direction_sigma_rad(centroids, self.camera, self.settings),
+            self._focal_rad(self.camera.rays(centroids.xy_px)),
         )
 
     def _solve_calibrated(self, centroids: Centroids, match: StarMatch) -> Attitude:
@@ -408,33 +356,28 @@ class DomeTracker:
         star = match.star
         body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
-        pixel_rad = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings), self._focal_rad(rays)
-        )
+        pixel_rad = self._pixel_rad(centroids)
         # Matching radius: four standard deviations, at least 4 px
         typical_rad = float(np.median(np.hypot(pixel_rad, self.led_sigma_rad.max())))
         radius_px = max(4.0, 4 * self.camera.focal_px * typical_rad)
         try:
             # 3. Matches of the whole field
             for factor in (3.0, 1.0):
-                sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
-                body_from_lab, _ = self._solve(
-                    "rotation_only", rays, sigma_rad, observed, star, body_from_lab
+                body_from_lab, _, _ = self._solve(
+                    "rotation_only", rays, pixel_rad, observed, star, body_from_lab
                 )
                 observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
             # 4. Blends
-            sigma_rad = self._sigma_rad("rotation_only", pixel_rad, rays, observed, star)
+            sigma_rad = np.hypot(pixel_rad[observed], self.led_sigma_rad[star])
             observed, star, misfit = self._reject_blends(
                 centroids, sigma_rad, observed, star, body_from_lab
             )
             # 5. Attitude
-            solver = self.settings.solver
-            sigma_rad = self._sigma_rad(solver, pixel_rad, rays, observed, star)
-            body_from_lab, covariance = self._solve(
-                solver, rays, sigma_rad, observed, star, body_from_lab
+            body_from_lab, covariance, sigma_rad = self._solve(
+                self.settings.solver, rays, pixel_rad, observed, star, body_from_lab
             )
         except (ValueError, np.linalg.LinAlgError) as error:
             return Attitude(f"no attitude: {error}")
@@ -457,13 +400,6 @@ class DomeTracker:
             shared + lever_covariance,
             constant_rad2=lever_covariance,
         )
-
-    def _sigma_rad(
-        self, solver: str, pixel_rad: Floats, rays: Floats, observed: NDArray, star: NDArray
-    ) -> Floats:
-        """Return the (K,) standard deviation of a solver's residuals, from the centroids and the LED positions."""
-        by_centroid_rad = fitted_sigma_rad(solver, rays[observed], pixel_rad[observed])
-        return np.hypot(by_centroid_rad, self.led_sigma_rad[star])
 
     def _with_survey(
         self,
@@ -604,16 +540,23 @@ class DomeTracker:
         self,
         solver: str,
         rays: Floats,
-        sigma_rad: Floats,
+        pixel_rad: Floats,
         observed: NDArray,
         star: NDArray,
         body_from_lab: Rotation,
-    ) -> tuple[Rotation, Floats]:
-        """Return body_from_lab and its covariance in body axes, from the matched rays."""
+    ) -> tuple[Rotation, Floats, Floats]:
+        """Return body_from_lab, its covariance in body axes, and the (K,) standard deviations of the residuals.
+
+        Those are of the centroids, (N,) `pixel_rad`, and of the LEDs' positions.
+        """
+        seen = rays[observed]
+        by_centroid_rad = fitted_sigma_rad(solver, seen, pixel_rad[observed])
+        sigma_rad = np.hypot(by_centroid_rad, self.led_sigma_rad[star])
         position_m = self.leds.position_m[star]
-        return SOLVERS[solver](
-            rays[observed], sigma_rad, position_m, self.leds, self.lever, body_from_lab
+        solved = SOLVERS[solver](
+            seen, sigma_rad, position_m, self.leds, self.lever, body_from_lab
         )
+        return *solved, sigma_rad
 
     def _nearest(
         self, centroids: Centroids, body_from_lab: Rotation, radius_px: float

@@ -16,7 +16,8 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
@@ -50,15 +51,6 @@ MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could m
 BAD_PIXEL_SIGMA_PX = 0.06
 
 
-class Allowed(NamedTuple):
-    """Allowed values of a setting: low to high, in words, and whether they are whole numbers."""
-
-    low: float
-    high: float
-    words: str
-    whole: bool = False
-
-
 TINY = 1e-300
 GREATEST = 1e300
 POSITIVE = Allowed(TINY, GREATEST, "finite, above 0")
@@ -79,11 +71,8 @@ ALLOWED = {
     "magnitude_sigma": POSITIVE,
     "missed_dex": NOT_NEGATIVE,
     "reject": Allowed(0, int(max(Flag)) * 2 - 1, "bits of detection.classify.Flag", True),
-}
-# Settings that may also be None.
-OPTIONAL = {
-    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None"),
-    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None"),
+    "zero_point_mag": Allowed(-100, 100, "-100 to 100, or None", optional=True),
+    "cos_error": Allowed(1e-12, 0.1, "1e-12 to 0.1, or None", optional=True),
 }
 
 
@@ -171,14 +160,7 @@ class Settings:
         return object.__new__(cls)
 
     def __post_init__(self) -> None:
-        for name, allowed in (ALLOWED | OPTIONAL).items():
-            value = getattr(self, name)
-            if value is None and name in OPTIONAL:
-                continue
-            value = checks.number(f"settings: {name}", value, *allowed)
-            object.__setattr__(
-                self, name, value
-            )  # a plain float or int, which compiled code knows
+        checks.store_numbers(self, "settings: ", ALLOWED)
         checks.of_type("settings: acceptance", self.acceptance, str)
         checks.known("settings: acceptance", self.acceptance, ACCEPTANCES)
         if self.assumed_deg is not None:
@@ -345,6 +327,50 @@ def process_frame(
         turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
     centroids = detect_and_centroid(image, camera, settings, clock, streak_px, turn_rad)
     return Report(solve(centroids, clock), centroids, clock.seconds)
+
+
+class FrameTracker:
+    """What the trackers do with a frame: detection and centroiding, then `solve_centroids` of each kind.
+
+    Attributes
+    ----------
+    camera
+        On-board calibration
+    settings
+        Algorithms of the stages, and their parameters
+    solve_centroids
+        Method that identifies and solves centroids
+    """
+
+    camera: Camera
+    settings: Settings
+    solve_centroids: Callable[..., Attitude]
+
+    def solve(
+        self,
+        image: NDArray,
+        streak_px: Step | None = None,
+        rate: RateEstimate | None = None,
+        exposure_s: float | None = None,
+        **when: Any,
+    ) -> Report:
+        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
+
+        Parameters
+        ----------
+        streak_px
+            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or from `rate`
+        rate
+            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
+        exposure_s
+            Exposure time, to estimate the rate from streaks; None if unknown
+        when
+            Time `t_s` and number `frame` of the frame, as far as `solve_centroids` of the tracker takes them
+        """
+        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s, **when)
+        return process_frame(
+            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        )
 
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:

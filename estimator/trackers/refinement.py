@@ -13,7 +13,8 @@ From a candidate attitude, `FieldMatcher.refine` takes these steps:
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from estimator.core.checks import Floats
 from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
+from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings, direction_sigma_rad
@@ -46,6 +48,7 @@ BEHIND = 1e-3  # least z of a direction in the lens fit
 CONVERGED_FALL = 1e-6
 
 
+@dataclass(frozen=True)
 class FieldMatcher:
     """Matches detections to the catalog stars that a candidate attitude predicts on the sensor.
 
@@ -64,22 +67,17 @@ class FieldMatcher:
         Number of patterns that were searched, for the expected number of chance matches
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        stars: StarCatalog,
-        sky: SkyIndex,
-        settings: Settings,
-        focal_uncertainty: float,
-        patterns: int,
-    ) -> None:
-        self.camera = camera
-        self.stars = stars
-        self.sky = sky
-        self.settings = settings
-        self.focal_uncertainty = focal_uncertainty
-        self.patterns = patterns
-        self.tree = cKDTree(stars.vectors)
+    camera: Camera
+    stars: StarCatalog
+    sky: SkyIndex
+    settings: Settings
+    focal_uncertainty: float
+    patterns: int
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Directions of the stars, to find those of a field."""
+        return cKDTree(self.stars.vectors)
 
     @property
     def lens_radii_px(self) -> list[float]:
@@ -291,21 +289,6 @@ def log10_chance(
         matches = int((observed < count).sum())
         tails.append(log10_tail(max(count - 2, 0), matches - 2, p))
     return float(min(tails) + np.log10(len(counts)) + np.log10(patterns))
-
-
-def mutual_nearest(
-    observed_px: Floats, predicted_px: Floats, radius_px: float, rows: NDArray
-) -> tuple[NDArray, NDArray]:
-    """Return mutual nearest neighbors within a radius: indices of observed_px, and `rows` of the predictions."""
-    if not len(predicted_px) or not len(observed_px):
-        return np.empty(0, int), np.empty(0, int)
-    distance, nearest = cKDTree(predicted_px).query(
-        observed_px, distance_upper_bound=radius_px
-    )
-    _, back = cKDTree(observed_px).query(predicted_px)
-    match = np.flatnonzero(np.isfinite(distance))
-    match = match[back[nearest[match]] == match]
-    return match, rows[nearest[match]]
 
 
 def fit_camera(

@@ -74,6 +74,20 @@ class Lights(NamedTuple):
         )
 
 
+def solve_lights(
+    camera: Camera,
+    lights: Lights,
+    centroids: Centroids,
+    solve_global: Callable[[Centroids], Attitude],
+    rate: RateEstimate | None,
+    exposure_s: float | None,
+) -> Attitude:
+    """Return attitude and rate by either shutter; parameters as of `solve_rolling`."""
+    if camera.row_time_s:
+        return solve_rolling(camera, lights, centroids, solve_global, rate, exposure_s)
+    return with_streak_rate(solve_global(centroids), centroids, exposure_s, rate, lights)
+
+
 def solve_rolling(
     camera: Camera,
     lights: Lights,
@@ -102,17 +116,11 @@ def solve_rolling(
         # 2. to 4. Solution with a candidate
         start = (candidate, prior)
         attitude = _solve_with(camera, lights, centroids, solve_global, start, exposure_s)
-        if attitude.solved and (best is None or _chance(attitude) < _chance(best)):
+        if attitude.solved and (best is None or attitude.log10_chance < best.log10_chance):
             best = attitude
         if best is not None and candidate.sign_known:
             break
     return best or attitude
-
-
-def _chance(attitude: Attitude) -> float:
-    """Return log10 of the expected number of chance matches of a solution."""
-    assert attitude.match is not None
-    return attitude.match.log10_chance
 
 
 def _solve_with(
@@ -304,7 +312,9 @@ def with_streak_rate(
     camera = attitude.camera
     if match is None or camera is None or exposure_s is None:
         return attitude
-    sight = STARS if lights is None else _radii(lights, lights.place_ref[match.star])
+    sight = STARS
+    if lights is not None and lights.lever_cam_m.any():
+        sight = _radii(lights, lights.place_ref[match.star])
     streaks = from_streaks(camera, centroids.take(match.observed), exposure_s, sight)
     if not streaks:
         return attitude

@@ -13,46 +13,45 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
-from estimator.catalog.refraction import SiteAir
+from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints, Step
+from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
-from estimator.core.types import NO_SPREAD, Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
     Detections,
-    FlatCentroids,
     Sensor,
     detections_of,
+    flat_centroids,
 )
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit, warm_up
 from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import (
     Clock,
-    Report,
+    FrameTracker,
     Settings,
     brightest,
     check_algorithms,
-    process_frame,
 )
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
-from estimator.trackers.rolling_shutter import Lights, solve_rolling, with_streak_rate
+from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
     MIN_ERROR_PX,
@@ -62,15 +61,11 @@ from estimator.trackers.search_models import (
 )
 
 NO_STARS = "too few stars detected"
-AIR_ROUNDS = 2  # number of corrections for refraction at another time than the air's epoch
-SAME_AIR_S = 1.0  # time in which the zenith moves by 15", and a refraction changes by 0.02"
 
-
-CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 SETTINGS = Settings()
 
 
-class StarTracker:
+class StarTracker(FrameTracker):
     """Lost-in-space star tracker for the real sky.
 
     Attributes
@@ -139,11 +134,11 @@ class StarTracker:
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
-        if settings.identifier == "default":
+        if default:
             self.sky = sky_index.build(
                 self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars)
             )
-            self.pairs = len(self.sky.pair)
+            patterns = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
             known = settings.zero_point_mag is not None
@@ -152,18 +147,26 @@ class StarTracker:
                 longest_rad,
                 magnitude=index_stars.v_mag if known else None,
             )
-            self.pairs = len(self.index.pair)
+            patterns = len(self.index.pair)
         self.field_matcher = FieldMatcher(
-            camera, self.stars, self.sky, settings, focal_uncertainty, self.pairs
+            camera, self.stars, self.sky, settings, focal_uncertainty, patterns
         )
+
+    @functools.cached_property
+    def sensor(self) -> Sensor:
+        """Calibration and scale of the magnitudes, for compiled code."""
         # Field of view in tangents: least and largest x, least and largest y
-        corners = camera.tangents(CORNERS * [camera.width_px, camera.height_px] - 0.5)
-        self.field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
-        zero_point_mag = (
-            np.nan if settings.zero_point_mag is None else settings.zero_point_mag
+        corners = self.camera.tangents(self.camera.corners_px)
+        field = np.array([corners.min(axis=0), corners.max(axis=0)]).T.ravel()
+        zero_mag = self.settings.zero_point_mag
+        return Sensor(
+            self.camera.focal_px,
+            self.camera.center_px,
+            self.camera.distortion,
+            field,
+            np.nan if zero_mag is None else zero_mag,
+            self.settings.magnitude_sigma,
         )
-        lens = camera.focal_px, camera.center_px, camera.distortion
-        self.sensor = Sensor(*lens, self.field, zero_point_mag, settings.magnitude_sigma)
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
@@ -218,34 +221,6 @@ class StarTracker:
         vectors = catalog.apparent(stars, catalog.on_earth(catalog.utc(date)))
         return cls(camera, stars, vectors, settings, focal_uncertainty)
 
-    def solve(
-        self,
-        image: NDArray,
-        streak_px: Step | None = None,
-        rate: RateEstimate | None = None,
-        exposure_s: float | None = None,
-        t_s: float = 0.0,
-    ) -> Report:
-        """Solve one frame. Raises ImageError for bad input; the status reports any other failure.
-
-        Parameters
-        ----------
-        streak_px
-            (dx, dy) by which stars move during the exposure, from the gyro; None: unknown, or from `rate`
-        rate
-            Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
-        exposure_s
-            Exposure time, to estimate the rate from streaks; None if unknown
-        t_s
-            Time of the frame since the air's epoch
-        """
-        solve = functools.partial(self.solve_centroids, rate=rate, exposure_s=exposure_s)
-        if self.air is not None:
-            solve = functools.partial(self._solve_through_air, solve, self.air, t_s)
-        return process_frame(
-            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
-        )
-
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
         """Compile all that `solve` and `solve_centroids` use, and build the quads: call it before the flight.
 
@@ -295,6 +270,7 @@ class StarTracker:
         effort: int | None = None,
         rate: RateEstimate | None = None,
         exposure_s: float | None = None,
+        t_s: float = 0.0,
     ) -> Attitude:
         """Identify and solve centroids from any source (the truth included).
 
@@ -308,7 +284,18 @@ class StarTracker:
             Number of the only search to run, out of `efforts`, from 0; None: all of them in turn
         rate, exposure_s
             Rate and exposure time as in `solve`
+        t_s
+            Time of the frame since the air's epoch
         """
+        if self.air is not None and t_s:
+            solve = functools.partial(
+                self.solve_centroids,
+                clock=clock,
+                effort=effort,
+                rate=rate,
+                exposure_s=exposure_s,
+            )
+            return solve_through_air(solve, self.camera, self.air, t_s, centroids)
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         if effort is not None:
@@ -323,43 +310,11 @@ class StarTracker:
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS)
-        if self.camera.row_time_s:
-            lights = Lights(
-                self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
-            )
-            solve = functools.partial(self._solve_global, clock=clock, effort=effort)
-            return solve_rolling(self.camera, lights, centroids, solve, rate, exposure_s)
-        return with_streak_rate(
-            self._solve_global(centroids, clock, effort), centroids, exposure_s, rate
+        lights = Lights(
+            self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
-
-    def _solve_through_air(
-        self,
-        solve: Callable[[Centroids, Clock | None], Attitude],
-        air: SiteAir,
-        t_s: float,
-        centroids: Centroids,
-        clock: Clock | None = None,
-    ) -> Attitude:
-        """Solve centroids seen through the air at t_s after the epoch for which the catalog has been refracted.
-
-        1. Solve with the catalog as it is; the Earth has rotated since the epoch.
-        2. The attitude determines the zenith, and so the directions in which the stars would have been seen at the
-           epoch. Move the centroids there.
-        3. Solve again; a second round makes the error of the first attitude's refraction, some arcseconds, negligible.
-        """
-        # 1. Catalog of the epoch
-        attitude = solve(centroids, clock)
-        for _ in range(AIR_ROUNDS if abs(t_s) > SAME_AIR_S else 0):
-            if attitude.cam_from_ref is None:
-                break
-            # 2. Refraction now removed, that of the epoch applied
-            now = attitude.cam_from_ref.inv().apply(self.camera.rays(centroids.xy_px))
-            at_epoch = air.seen(air.without_air(now, t_s), 0.0)
-            xy_px = self.camera.pixels(attitude.cam_from_ref.apply(at_epoch))
-            # 3. Solution
-            attitude = solve(replace(centroids, xy_px=xy_px), clock)
-        return attitude
+        once = functools.partial(self._solve_global, clock=clock, effort=effort)
+        return solve_lights(self.camera, lights, centroids, once, rate, exposure_s)
 
     def with_errors(self, centroids: Centroids) -> Centroids:
         """Return the centroids with their total errors as covariances."""
@@ -382,31 +337,7 @@ class StarTracker:
     def _identify_by_paper(
         self, centroids: Centroids, clock: Clock, compared: Ints
     ) -> Attitude:
-        """Solve by a published identifier; `compared` counts the angles that it compares."""
-        for camera, match in self._candidates(centroids, compared):
-            clock.lap("identify")
-            if self.settings.acceptance == "thesis":
-                # The paper's rule has accepted this match: it is not tested with the whole field.
-                attitude = self.solve_matches(centroids, match.observed, match.star)
-            else:
-                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
-            clock.lap("solve")
-            if attitude.solved:
-                return attitude
-        clock.lap("identify")
-        assert self.index is not None
-        settings = self.settings
-        lights = len(brightest(centroids, settings))
-        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
-        why = advice(
-            settings.identifier, lights, settings.acceptance, in_field, settings.cos_error
-        )
-        return Attitude(f"{NO_MATCH}: {why}")
-
-    def _candidates(
-        self, centroids: Centroids, compared: Ints
-    ) -> Iterator[tuple[Camera, StarMatch]]:
-        """Return candidate cameras and matches by the published identifier that the settings name."""
+        """Solve by the published identifier of the settings; `compared` counts the angles that it compares."""
         from estimator.identification.registry import candidates  # several compiled modules
 
         settings = self.settings
@@ -415,7 +346,7 @@ class StarTracker:
         if settings.zero_point_mag is not None:
             options["magnitude"] = settings.zero_point_mag - 2.5 * np.log10(bright.flux)
             options["epsilon_mag"] = settings.magnitude_sigma
-        return candidates(
+        for camera, match in candidates(
             settings.identifier,
             bright,
             self.camera,
@@ -426,7 +357,27 @@ class StarTracker:
             cos_error=settings.cos_error,
             compared=compared,
             **options,
+        ):
+            clock.lap("identify")
+            if settings.acceptance == "thesis":
+                # The paper's rule has accepted this match: it is not tested with the whole field.
+                attitude = self.solve_matches(centroids, match.observed, match.star)
+            else:
+                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
+            clock.lap("solve")
+            if attitude.solved:
+                return attitude
+        clock.lap("identify")
+        assert self.index is not None
+        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
+        why = advice(
+            settings.identifier,
+            len(bright),
+            settings.acceptance,
+            in_field,
+            settings.cos_error,
         )
+        return Attitude(f"{NO_MATCH}: {why}")
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
@@ -493,7 +444,7 @@ class StarTracker:
             Relative uncertainty of the focal length, if it is larger than that of the tracker
         """
         uncertainty = max(self.focal_uncertainty, focal_uncertainty)
-        return detections_of(_lights(centroids, sigma_px), self.sensor, uncertainty)
+        return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
         self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
@@ -553,7 +504,7 @@ class StarTracker:
         most = self.settings.searched_stars
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
         if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
-            lights = _lights(centroids, sigma_px)
+            lights = flat_centroids(centroids, sigma_px)
             return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
@@ -633,14 +584,6 @@ class StarTracker:
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
         )
-
-
-def _lights(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
-    """Return centroids in the form for compiled code, with their total errors (N,)."""
-    spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
-    return FlatCentroids(
-        centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px
-    )
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:

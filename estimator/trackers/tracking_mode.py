@@ -178,17 +178,21 @@ class TrackingMode:
         if now_from_then is not None:
             checks.one_rotation("now_from_then", now_from_then)
         # 1. Prediction
-        predicted = (
-            None if self.tracker.camera.row_time_s else self._predict(t_s, now_from_then)
-        )
+        predicted = self._predict(t_s, now_from_then)
         clock = Clock()
         # 2. and 3. Windows
-        report = (
-            self._track(image, predicted, streak_px, clock) if predicted is not None else None
-        )
+        report = None
+        if predicted is not None:
+            report = self._track(image, predicted, streak_px, clock)
         # 4. Lost in space
         if report is None:
-            report = self._search(image, streak_px, clock, exposure_s)
+            tracker = self.tracker
+            centroids = detect_and_centroid(
+                image, tracker.camera, tracker.settings, clock, streak_px
+            )
+            attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
+            sigma_px = tracker.sigma_px(centroids)
+            report = self._report(attitude, centroids, sigma_px, clock, streak_px)
         report.attitude = self._with_rate(t_s, report.attitude, report.centroids, exposure_s)
         self._store(t_s, report.attitude)
         return report
@@ -212,9 +216,13 @@ class TrackingMode:
         warm_up.run(self.tracker.camera, xy_px, light, dtype, look)
 
     def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
-        """Return the predicted cam_from_ref, or None without a recent attitude."""
+        """Return the predicted cam_from_ref, or None without a recent attitude, and with a rolling shutter."""
         last = self.last
-        if last is None or not 0 <= t_s - last.t_s <= self.max_age_s:
+        if (
+            self.tracker.camera.row_time_s
+            or last is None
+            or not 0 <= t_s - last.t_s <= self.max_age_s
+        ):
             return None
         if now_from_then is None:
             now_from_then = Rotation.from_rotvec(last.rate_rad_s * (t_s - last.t_s))
@@ -286,7 +294,8 @@ class TrackingMode:
         )
         # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
         # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
-        half = float(np.min(tracker.field[1::2] - tracker.field[::2])) / 2
+        field = tracker.sensor.field
+        half = float(np.min(field[1::2] - field[::2])) / 2
         prior_volume = (2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)
         prior_gain_dex = log10(8 * pi**2 / prior_volume)
         if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
@@ -303,24 +312,7 @@ class TrackingMode:
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(
-            attitude, centroids, sigma_px, clock, len(window_centers_px), saturated, streak_px
-        )
-
-    def _search(
-        self,
-        image: NDArray,
-        streak_px: Step | None,
-        clock: Clock,
-        exposure_s: float | None,
-    ) -> TrackedReport:
-        """Solve the whole frame lost in space."""
-        tracker = self.tracker
-        centroids = detect_and_centroid(
-            image, tracker.camera, tracker.settings, clock, streak_px
-        )
-        attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
-        return self._report(
-            attitude, centroids, tracker.sigma_px(centroids), clock, 0, False, streak_px
+            attitude, centroids, sigma_px, clock, streak_px, len(window_centers_px), saturated
         )
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
@@ -372,11 +364,11 @@ class TrackingMode:
         centroids: Centroids,
         sigma_px: Floats,
         clock: Clock,
-        expected: int,
-        saturated: bool,
         streak_px: Step | None,
+        expected: int = 0,
+        saturated: bool = False,
     ) -> TrackedReport:
-        """Return the report with quality flags."""
+        """Return the report with quality flags; `expected` is the number of windows, 0 of a whole frame."""
         if attitude.match is None or attitude.cam_from_ref is None:
             return TrackedReport(attitude, centroids, clock.seconds)
         match: StarMatch = attitude.match
@@ -386,16 +378,15 @@ class TrackingMode:
         chi2 = float(np.sum((residual_px / sigma_px[match.observed][:, None]) ** 2))
         chi2_per_dof = chi2 / max(2 * len(match.star) - 3, 1)
         streak = float(np.hypot(*streak_px)) if streak_px is not None else 0.0
-        health = Health.GOOD
-        for flag, raised in (
-            (Health.SEARCHED, expected == 0),
-            (Health.FEW, len(match.star) <= 5),
-            (Health.MISSING, 2 * len(match.star) < expected),
-            (Health.ROUGH, chi2_per_dof > ROUGH),
-            (Health.SATURATED, saturated),
-            (Health.SMEARED, streak > 8),
-        ):
-            health |= flag if raised else Health.GOOD
+        raised = {
+            Health.SEARCHED: expected == 0,
+            Health.FEW: len(match.star) <= 5,
+            Health.MISSING: 2 * len(match.star) < expected,
+            Health.ROUGH: chi2_per_dof > ROUGH,
+            Health.SATURATED: saturated,
+            Health.SMEARED: streak > 8,
+        }
+        health = Health(sum(flag for flag, is_raised in raised.items() if is_raised))
         odds = -match.log10_chance
         return TrackedReport(
             attitude, centroids, clock.seconds, health, odds, chi2_per_dof, expected

@@ -90,16 +90,8 @@ def run(
     x = camera.width_px // 2
     square[y - 5 : y + 5, x - 5 : x + 5] = BRIGHT
     few = draw(camera, xy_px[:2], DIM * light[:2], kind, STREAK_PX)
-    frames: list[tuple[NDArray, Step | None]] = [
-        (dim, None),
-        (bright, None),
-        (square, (0.0, 0.0)),
-        (few, None),
-    ]
-    frames += [
-        (smeared, None),
-        (smeared, STREAK_PX),
-        (np.ascontiguousarray(dim[:, ::-1]), None),
-    ]
-    for image, streak_px in frames:
-        look(image, streak_px)
+    mirrored = np.ascontiguousarray(dim[:, ::-1])
+    for image in (dim, bright, few, smeared, mirrored):
+        look(image, None)
+    look(square, (0.0, 0.0))
+    look(smeared, STREAK_PX)

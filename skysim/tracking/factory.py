@@ -233,13 +233,13 @@ def solve_frame(
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
-    seen: list[Any] = [frame.image_dn, streak_px, rate, frame.exposure_s]
+    when: dict[str, Any] = {}
     if isinstance(estimator, StarTracker | CodedTracker):
-        seen.append(frame.t_mid_s)
+        when["t_s"] = frame.t_mid_s
     if isinstance(estimator, CodedTracker):
-        seen.append(frame.index)
+        when["frame"] = frame.index
     try:
-        return estimator.solve(*seen)
+        return estimator.solve(frame.image_dn, streak_px, rate, frame.exposure_s, **when)
     except ImageError as error:
         return Report(Attitude(str(error)), Centroids.empty())
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -18,9 +18,9 @@ from estimator.catalog import cat_file, catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, RateEstimate
+from estimator.core.types import Attitude
 from estimator.identification.led_codes import LedCode
-from estimator.trackers.pipeline import Report, Settings
+from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
@@ -285,17 +285,9 @@ class OrbitStarTracker(StarTracker):
         self.orbit = orbit
         self.start_m_s = state_at(orbit, 0.0).velocity_m_s
 
-    def solve(
-        self,
-        image: NDArray,
-        streak_px: tuple[float, float] | None = None,
-        rate: RateEstimate | None = None,
-        exposure_s: float | None = None,
-        t_s: float = 0.0,
-    ) -> Report:
-        """As `StarTracker.solve`; t_s is the time of the frame since the start of the orbit."""
-        report = super().solve(image, streak_px, rate, exposure_s)
-        return replace(report, attitude=self.corrected(report.attitude, t_s))
+    def solve_centroids(self, *args: Any, t_s: float = 0.0, **named: Any) -> Attitude:
+        """As `StarTracker.solve_centroids`; t_s is the time of the frame since the start of the orbit."""
+        return self.corrected(super().solve_centroids(*args, **named), t_s)
 
     def corrected(self, attitude: Attitude, t_s: float) -> Attitude:
         """The attitude of a frame at a time since the start, corrected by the rotation b x dv / c."""

@@ -36,7 +36,7 @@ OTHER_ATTITUDE = Rotation.from_rotvec([0.1, 0.2, 0.4])
 def test_every_field_from_two_to_a_hundred_degrees_has_a_tracker(
     width_px: int, height_px: int
 ) -> None:
-    cameras = plate_solver.FIELD_SEARCH.cameras(width_px, height_px)
+    cameras = searching.search_cameras(width_px, height_px)
     assert len(cameras) < 20
     for fov_deg in np.geomspace(2, 100, 400):
         focal_px = (width_px - 1) / 2 / np.tan(np.radians(fov_deg / 2))

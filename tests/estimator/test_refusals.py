@@ -322,8 +322,8 @@ OTHERS: list[Case] = [
     ),
     (
         "sky's",
-        lambda: DomeTracker(CAMERA, LEDS, LEVER, Settings()),
-        "identifier: 'default' is unknown.* led_pairs",
+        lambda: DomeTracker(CAMERA, LEDS, LEVER, Settings(identifier="shefex")),
+        "identifier: 'shefex' is unknown.* led_pairs",
     ),
     (
         "solve",

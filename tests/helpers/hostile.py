@@ -23,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.trackers.star_tracker import CORNERS
 from skysim.apps import plate_solver
 from skysim.apps.cli.terminal import progress
 from skysim.core.images import IMAGE_SUFFIXES
@@ -435,7 +434,7 @@ def wrong(answer: dict, skies: Skies) -> bool:
     cam_from_icrs = star_sources.cam_from_icrs(
         answer["ra_deg"], answer["dec_deg"], answer["roll_deg"]
     )
-    corners = camera().rays(CORNERS * [WIDTH, HEIGHT])
+    corners = camera().rays(camera().corners_px + 0.5)
     error_rad = (
         np.linalg.norm((cam_from_icrs * sky.inv()).apply(corners) - corners, axis=1).max()
         for sky in skies

@@ -28,7 +28,6 @@ from skysim.apps.plate_solver.plate_solution import (
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
-    FIELD_SEARCH,
     Solver,
     best_attitude,
     kept_solver,
@@ -39,7 +38,6 @@ from skysim.apps.plate_solver.solver import (
 )
 
 __all__ = [
-    "FIELD_SEARCH",
     "DomeSolution",
     "DomeSolver",
     "Outputs",

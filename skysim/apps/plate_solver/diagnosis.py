@@ -22,7 +22,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
 from skysim.apps.plate_solver.solver import (
-    FIELD_SEARCH,
+    WIDEST_DEG,
     Solver,
     best_attitude,
     solve_centroids,
@@ -244,7 +244,7 @@ def unknown_cause(refusal: Refusal) -> str:
         one.tried_fov_deg(*refusal.size_px)[0] for one in (unknown, *refusal.solvers)
     )
     text = (
-        f"no cause found: no field of {narrow_deg:.1g}° to {FIELD_SEARCH.widest_deg:g}° fits, nor the mirrored picture;"
+        f"no cause found: no field of {narrow_deg:.1g}° to {WIDEST_DEG:g}° fits, nor the mirrored picture;"
         " are there trees, lamps or clouds? crop them away"
     )
     share = sphere_share(refusal.size_px, solver.tried_fov_deg(*refusal.size_px)[0])

@@ -132,12 +132,10 @@ def solve(
         With one line for an image that cannot be read.
     """
     solver: Solver | DomeSolver
-    kind: type[PlateSolution | DomeSolution] = PlateSolution
     sky = (fov_deg, camera, time_utc, catalog, size_px, near_deg)
     if dome:
         if any(one is not None for one in sky):
             raise InputError("solve.dome", "with a keyword of the sky", "dome and map alone")
-        kind = DomeSolution
         solver = make_dome_solver(dome, map)
     elif map:
         raise InputError("solve.map", "has no effect without a dome", "with the dome's scene")
@@ -153,6 +151,7 @@ def solve(
     else:
         solver = kept_solver(fov_deg, time_utc)
     result = read_and_solve(Path(path), solver)
+    kind: type[PlateSolution | DomeSolution] = DomeSolution if dome else PlateSolution
     return kind(**{one.name: result[one.name] for one in fields(kind)})
 
 
@@ -397,17 +396,14 @@ def solve_picture(
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
     outcomes = []
-    centroids = dict[
-        int, Centroids
-    ]()  # by id of the pixels, shared by all fields of view tried on them
-    for hypothesis in tried:
-        reading = id(hypothesis.pixels)
-        solved = solve_array(
-            hypothesis.pixels, hypothesis.solver, date_utc, centroids.get(reading)
-        )
-        outcomes.append(SolvedReading(hypothesis, *solved, tried))
-        centroids[reading] = outcomes[-1].report.centroids
-        if outcomes[-1].report.attitude.solved:
+    # By the order of the rows, shared by all fields of view tried on the same pixels.
+    centroids: dict[bool, Centroids] = {}
+    for one in tried:
+        known = centroids.get(one.flipped)
+        report, tracker = solve_array(one.pixels, one.solver, date_utc, known)
+        outcomes.append(SolvedReading(one, report, tracker, tried))
+        centroids[one.flipped] = report.centroids
+        if report.attitude.solved:
             return outcomes[-1]
     return solve_again(outcomes, date_utc) or outcomes[0]
 
@@ -419,10 +415,11 @@ def solve_again(
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
         return None  # the camera is known with its saturation: its frames need no retries
-    for pixels in {
-        id(one.hypothesis.pixels): one.hypothesis.pixels for one in refused
-    }.values():
-        readings = [one for one in refused if one.hypothesis.pixels is pixels]
+    by_rows: dict[bool, list[SolvedReading]] = {}
+    for refusal in refused:
+        by_rows.setdefault(refusal.hypothesis.flipped, []).append(refusal)
+    for readings in by_rows.values():
+        pixels = readings[0].pixels
         settings = readings[0].hypothesis.solver.settings
         for retry in retries.retries(pixels, readings[0].report.centroids, settings):
             for one in (one.hypothesis for one in readings):
@@ -490,7 +487,7 @@ def outcome_fields(
             report, outcome.tracker, solver.stars
         )
         return seen | solved | {"hint": assumption}
-    rows_known = len({id(one.pixels) for one in outcome.tried}) == 1
+    rows_known = len({one.flipped for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(
         pixels, report.centroids, tuple(solvers), date_utc, rows_known
     )

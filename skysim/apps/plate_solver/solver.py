@@ -8,7 +8,7 @@ stars of the catalog, as many as its narrowest field needs.
 
 Every tracker is one more opportunity for a false match. With P the probability that the best match is due to chance,
 it is accepted if P <= P_accept / N (Bonferroni), and if no solution elsewhere on the sky has a P less than 1000 times
-as large (`FieldSearch.margin_dex`). N includes the hypotheses about a picture (`picture.py`), each of which is solved.
+as large (MARGIN_DEX). N includes the hypotheses about a picture (`picture.py`), each of which is solved.
 """
 
 from __future__ import annotations
@@ -56,72 +56,48 @@ THREADS = min(os.cpu_count() or 1, 8)
 DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
 
-@dataclass(frozen=True, slots=True)
-class FieldSearch:
-    """Options of the search over unknown horizontal fields of view.
+# Limits of the horizontal fields of view that are searched if the field is unknown, and the one that is tried first.
+WIDEST_DEG = 100.0
+NARROWEST_DEG = 2.0
+TYPICAL_DEG = 22.0
+MAX_UNCERTAINTY = 0.25  # greatest relative half-width of a range of focal lengths
+MAX_WARP = 0.04  # greatest u sin^2 a, see `search_cameras`, with the angle a of the corner
+OVERLAP = 0.01  # of neighboring ranges, as a fraction of the focal length
+STARS = 300.0  # mean number of catalog stars in the narrowest field of a tracker
+LEAST_STARS = (
+    4.0  # mean number in the middle of a range below which the catalog is too shallow for it
+)
+DECISIVE_LOG10_CHANCE = (
+    -10.0
+)  # a solution below this ends the search without trying other fields of view
+MARGIN_DEX = 3.0  # by which a solution must beat those with another attitude
+SAME_ATTITUDE_RAD = math.radians(0.2)  # angle below which two solutions are the same
 
-    A range is as wide as the codes of quads allow: a focal length wrong by the fraction u changes the code of stars at
-    the angle a from the boresight by up to 2 u sin^2 a (`star_quads._code_gate`). In narrow fields this is negligible,
-    and the lengths of an index's quads, in units of the field's height, limit the range.
 
-    Attributes
-    ----------
-    widest_deg, narrowest_deg
-        Limits of the fields of view
-    typical_deg
-        Field that is tried first
-    max_uncertainty
-        Greatest relative half-width of a range of focal lengths
-    max_warp
-        Greatest u sin^2 a, with the angle a of the corner
-    overlap
-        Overlap of neighboring ranges, as a fraction of the focal length
-    stars
-        Mean number of catalog stars in the narrowest field of a tracker
-    least_stars
-        Mean number in the middle of a range below which the catalog is too shallow for it
-    decisive_log10_chance
-        A solution below this ends the search without trying other fields of view
-    margin_dex
-        Difference by which a solution must beat those with another attitude
-    same_attitude_rad
-        Angle below which two solutions are the same
+def search_cameras(width_px: int, height_px: int) -> list[tuple[Camera, float]]:
+    """The cameras to try for an unknown field, each with its relative focal-length uncertainty.
+
+    They are in the order from the typical field outward. A range is as wide as the codes of quads allow: a focal length
+    wrong by the fraction u changes the code of stars at the angle a from the boresight by up to 2 u sin^2 a
+    (`star_quads._code_gate`). In narrow fields this is negligible, and the lengths of an index's quads, in units of the
+    field's height, limit the range.
     """
-
-    widest_deg: float = 100.0
-    narrowest_deg: float = 2.0
-    typical_deg: float = 22.0
-    max_uncertainty: float = 0.25
-    max_warp: float = 0.04
-    overlap: float = 0.01
-    stars: float = 300.0
-    least_stars: float = 4.0
-    decisive_log10_chance: float = -10.0
-    margin_dex: float = 3.0
-    same_attitude_rad: float = math.radians(0.2)
-
-    def cameras(self, width_px: int, height_px: int) -> list[tuple[Camera, float]]:
-        """The cameras to try, each with its relative focal-length uncertainty, from the typical field outward."""
-        out = []
-        narrowest, tangent = (
-            math.tan(math.radians(deg) / 2) for deg in (self.narrowest_deg, self.widest_deg)
-        )
-        diagonal2 = (
-            1 + (height_px / width_px) ** 2
-        )  # square of the half diagonal, in units of half the width
-        while tangent > narrowest:  # tangent of the half field at the lower end of a range
-            corner2 = diagonal2 * tangent**2
-            uncertainty = min(self.max_uncertainty, self.max_warp * (1 + corner2) / corner2)
-            # A focal length f covers f (1 - u) to f (1 + u).
-            tangent *= 1 - uncertainty
-            camera = Camera.from_fov(width_px, height_px, 2 * math.atan(tangent))
-            out.append((camera, uncertainty + self.overlap))
-            tangent /= 1 + uncertainty
-        typical_rad = math.radians(self.typical_deg)
-        return sorted(out, key=lambda one: abs(math.log(one[0].fov_rad / typical_rad)))
-
-
-FIELD_SEARCH = FieldSearch()
+    out = []
+    narrowest, tangent = (
+        math.tan(math.radians(deg) / 2) for deg in (NARROWEST_DEG, WIDEST_DEG)
+    )
+    # Square of the half diagonal, in units of half the width
+    diagonal2 = 1 + (height_px / width_px) ** 2
+    while tangent > narrowest:  # tangent of the half field at the lower end of a range
+        corner2 = diagonal2 * tangent**2
+        uncertainty = min(MAX_UNCERTAINTY, MAX_WARP * (1 + corner2) / corner2)
+        # A focal length f covers f (1 - u) to f (1 + u).
+        tangent *= 1 - uncertainty
+        camera = Camera.from_fov(width_px, height_px, 2 * math.atan(tangent))
+        out.append((camera, uncertainty + OVERLAP))
+        tangent /= 1 + uncertainty
+    typical_rad = math.radians(TYPICAL_DEG)
+    return sorted(out, key=lambda one: abs(math.log(one[0].fov_rad / typical_rad)))
 
 
 class KnownCamera(NamedTuple):
@@ -149,8 +125,8 @@ class KnownCamera(NamedTuple):
 class Solver:
     """Settings of the plate solver.
 
-    Either a field of view is known to 5 %, or a camera exactly or by calibration; with neither, FIELD_SEARCH
-    defines the fields that are tried.
+    Either a field of view is known to 5 %, or a camera exactly or by calibration; with neither,
+    `search_cameras` are tried.
 
     Attributes
     ----------
@@ -205,8 +181,8 @@ class Solver:
         if self.fov_deg:
             camera = Camera.from_fov(width_px, height_px, math.radians(self.fov_deg))
             return [(camera, self.fov_uncertainty)]
-        cameras = FIELD_SEARCH.cameras(width_px, height_px)
-        return [one for one in cameras if self.mean_stars(one[0]) >= FIELD_SEARCH.least_stars]
+        cameras = search_cameras(width_px, height_px)
+        return [one for one in cameras if self.mean_stars(one[0]) >= LEAST_STARS]
 
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
@@ -267,7 +243,7 @@ class Solver:
         narrowest = camera.zoomed(1 + uncertainty)
         field_sr = camera.width_px * camera.height_px / narrowest.focal_px**2
         bright = self.stars.v_mag <= star_catalog.limit_for_density(
-            self.stars, field_sr, FIELD_SEARCH.stars
+            self.stars, field_sr, STARS
         )
         bright &= self.within_reach(camera.zoomed(1 - uncertainty), vectors)
         searches = () if self.field_is_known else QUAD_SEARCHES
@@ -473,11 +449,8 @@ def solve_centroids(
             if attitude.solved:
                 break
         allowed = ACCEPT_LOG10_CHANCE - math.log10(solver.hypotheses)
-        return (
-            Attitude(NO_MATCH)
-            if log10_chance(attitude) > allowed and attitude.solved
-            else attitude
-        ), first
+        refused = attitude.solved and attitude.log10_chance > allowed
+        return (Attitude(NO_MATCH) if refused else attitude), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in made:  # try all fields of view quickly before trying any thoroughly
         trackers = solver.trackers(*size_px, date_utc)
@@ -502,19 +475,24 @@ def best_attitude(
     solutions: list[tuple[Attitude, StarTracker]] = []
     for attitude, tracker in attitudes(centroids, trackers, effort):
         clock.lap("identify")
-        if log10_chance(attitude) <= FIELD_SEARCH.decisive_log10_chance:
+        if attitude.log10_chance <= DECISIVE_LOG10_CHANCE:
             return attitude, tracker
         if attitude.solved:
             solutions.append((attitude, tracker))
     if not solutions:
         return attitude, tracker
-    best, best_tracker = min(solutions, key=lambda solution: log10_chance(solution[0]))
+    best, best_tracker = min(solutions, key=lambda solution: solution[0].log10_chance)
     # The same attitude from neighboring trackers, whose ranges overlap, is not a rival.
-    rivals = [log10_chance(other) for other, _ in solutions if not same_attitude(other, best)]
+    assert best.cam_from_ref is not None
+    to_best = best.cam_from_ref.inv()
+    rivals = [
+        other.log10_chance
+        for other, _ in solutions
+        if other.cam_from_ref
+        and (other.cam_from_ref * to_best).magnitude() >= SAME_ATTITUDE_RAD
+    ]
     threshold = ACCEPT_LOG10_CHANCE - math.log10(tries)  # Bonferroni correction
-    significant = log10_chance(best) <= min(
-        threshold, min(rivals, default=0.0) - FIELD_SEARCH.margin_dex
-    )
+    significant = best.log10_chance <= min(threshold, min(rivals, default=0.0) - MARGIN_DEX)
     return (best if significant else Attitude(NO_MATCH)), best_tracker
 
 
@@ -536,18 +514,3 @@ def attitudes(
             yield future.result(), tracker
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def log10_chance(attitude: Attitude) -> float:
-    """log10 of the probability that the match is due to chance; 0 without a match."""
-    return attitude.match.log10_chance if attitude.match else 0.0
-
-
-def same_attitude(first: Attitude, second: Attitude) -> bool:
-    """Return True if two solved attitudes differ by less than `same_attitude_rad`."""
-    assert first.cam_from_ref is not None
-    assert second.cam_from_ref is not None
-    return bool(
-        (first.cam_from_ref * second.cam_from_ref.inv()).magnitude()
-        < FIELD_SEARCH.same_attitude_rad
-    )

@@ -48,12 +48,13 @@ from estimator.attitude.dome_map import (
     Lever,
     common_images_px,
     common_shifts_m,
+    led_sigma_rad,
     project,
 )
 from estimator.attitude.nearfield import SOLVERS
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.star_search import WRONG_FOCAL
-from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY, led_sigma_rad
+from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized

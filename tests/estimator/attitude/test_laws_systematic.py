@@ -10,11 +10,10 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import rotation_fit, systematic
-from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.dome_map import LedMap, Lever, led_sigma_rad
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.vectors import normalized
-from estimator.trackers import dome_tracker
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn, units
 
 FOCAL_SIGMA = 2e-3
@@ -160,7 +159,7 @@ def test_without_survey_errors_the_covariance_equals_the_solver_s(
     assert_allclose(total - part, solver, rtol=0, atol=1e-7 * np.abs(total).max())
 
 
-@law(systematic.focal_error_px, systematic.with_focal_error, dome_tracker.focal_error_rad)
+@law(systematic.focal_error_px, systematic.with_focal_error, systematic.focal_error_rad)
 @given(rng=SEEDS)
 def test_a_focal_length_s_error_grows_from_the_principal_point(
     rng: np.random.Generator,
@@ -171,7 +170,7 @@ def test_a_focal_length_s_error_grows_from_the_principal_point(
     longer = replace(CAMERA, focal_px=CAMERA.focal_px * (1 + FOCAL_SIGMA))
     moved_px = np.linalg.norm(longer.pixels(rays) - xy_px, axis=1)
     assert_allclose(systematic.focal_error_px(CAMERA, xy_px), moved_px, rtol=1e-9, atol=1e-9)
-    per_axis = dome_tracker.focal_error_rad(rays, CAMERA)
+    per_axis = systematic.focal_error_rad(rays, CAMERA)
     assert_allclose(per_axis * CAMERA.focal_px * np.sqrt(2), moved_px, rtol=1e-9, atol=1e-9)
     view = systematic.geometry(rays, rays)
     noisy = np.hypot(sigma, systematic.focal_error_px(CAMERA, xy_px) / CAMERA.focal_px)
@@ -186,7 +185,7 @@ def test_a_focal_length_s_error_grows_from_the_principal_point(
     assert none is None
 
 
-@law(dome_tracker.led_sigma_rad, LedMap.radius_m, normalized)
+@law(led_sigma_rad, LedMap.radius_m, normalized)
 @given(rng=SEEDS)
 def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     rng: np.random.Generator,
@@ -201,11 +200,11 @@ def test_isotropic_led_errors_on_a_sphere_are_angles_from_the_camera(
     assert_allclose(normalized(leds.position_m), along, rtol=0, atol=1e-15)
     arm = Lever(np.array([0, 0, rng.uniform(0, 0.4)]), turn(rng))
     expected = np.full(COUNT, sigma_m / (1.2 - arm.camera_body_m[2]))
-    assert_allclose(dome_tracker.led_sigma_rad(leds, arm), expected, rtol=1e-12, atol=0)
+    assert_allclose(led_sigma_rad(leds, arm), expected, rtol=1e-12, atol=0)
     radial = 1e-4 * np.einsum("ni,nj->nij", along, along)
     each = sigma_m**2 * np.tile(np.eye(3), (COUNT, 1, 1)) + radial
     assert_allclose(
-        dome_tracker.led_sigma_rad(replace(leds, covariance_m2=each), arm),
+        led_sigma_rad(replace(leds, covariance_m2=each), arm),
         expected,
         rtol=1e-9,
         atol=0,

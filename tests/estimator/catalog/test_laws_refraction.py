@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
+from scipy.spatial.transform import Rotation
 
 from estimator.catalog import refraction
 from estimator.catalog.refraction import SiteAir
+from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.core.types import Attitude, Centroids
 from tests.helpers.laws import SEEDS, law, units
 
 ARCSEC = erfa.DAS2R
@@ -50,6 +53,35 @@ def test_lowering_undoes_the_raising_by_refraction(
     )
     none = SiteAir(50.0, 8.0, "2012-06-24T23:00", 0.0)
     np.testing.assert_allclose(none.seen(directions, 0.0), directions, rtol=0, atol=1e-15)
+
+
+@law(refraction.solve_through_air)
+@given(rng=SEEDS, t_s=some.sampled_from([0.0, 0.5, 60.0, 3600.0]))
+def test_lights_are_moved_to_where_the_air_of_the_epoch_would_show_them(
+    rng: np.random.Generator, t_s: float
+) -> None:
+    camera = Camera(640, 480, 900.0, (319.5, 239.5))
+    air = SiteAir(50.0, 8.0, "2012-06-24T23:00")
+    zenith = air.zenith(t_s)
+    up = Rotation.align_vectors([[0.0, 0.0, 1.0]], [zenith])[0]
+    cam_from_ref = Rotation.from_rotvec([rng.uniform(0, 1), 0.0, 0.0]) * up
+    lights = Centroids(rng.uniform(0, 479, (9, 2)), np.full(9, 0.1), np.ones(9))
+    given_px = []
+
+    def solve(centroids: Centroids) -> Attitude:
+        given_px.append(centroids.xy_px)
+        return Attitude("solved", cam_from_ref)
+
+    refraction.solve_through_air(solve, camera, air, t_s, lights)
+    assert given_px[0] is lights.xy_px
+    assert len(given_px) == (3 if t_s > 1 else 1)
+    seen = cam_from_ref.inv().apply(camera.rays(lights.xy_px))
+    moved = cam_from_ref.inv().apply(camera.rays(given_px[-1]))
+    if t_s > 1:
+        without = [air.without_air(seen, t_s), air.without_air(moved, 0.0)]
+        np.testing.assert_allclose(*without, rtol=0, atol=1e-9)
+    refused = refraction.solve_through_air(lambda _: Attitude("no"), camera, air, t_s, lights)
+    assert refused.status == "no"
 
 
 @law(refraction.refraction_constants)

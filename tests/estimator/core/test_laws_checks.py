@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,7 @@ def test_an_array_of_any_type_or_layout_gives_the_plain_array_s_result(
 
 @law(
     checks.number,
+    checks.store_numbers,
     checks.of_type,
     checks.each_of_type,
     checks.pixel_step,
@@ -116,6 +118,12 @@ def test_any_value_is_converted_or_refused_in_one_line(thing: Any) -> None:
     assert number is None or (type(number) is float and 0 <= number <= 5)
     whole = answered(lambda: checks.number("x", thing, 0, 5, "0 to 5", True), ImageError)
     assert whole is None or (type(whole) is int and 0 <= whole <= 5)
+    owner = SimpleNamespace(x=thing, y=None)
+    allowed = checks.Allowed(0, 5, "0 to 5", True)
+    may_lack = {"x": allowed, "y": allowed._replace(optional=True)}
+    answered(lambda: checks.store_numbers(owner, "", may_lack), ImageError)
+    assert owner.y is None
+    assert whole is None or (type(owner.x) is int and owner.x == whole)
     step = answered(lambda: checks.pixel_step("x", thing), ImageError)
     assert step is None or (
         len(step) == 2 and np.isfinite(step).all() and {type(one) for one in step} == {float}

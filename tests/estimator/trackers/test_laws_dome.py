@@ -414,12 +414,13 @@ def test_a_dome_index_covers_the_whole_dome(rng: np.random.Generator, count: int
     np.testing.assert_allclose(scaled.angle_rad, 1.5 * known.angle_rad, rtol=1e-12, atol=0)
 
 
-@law(led_index.corner_rays, led_index.inner_field, led_index.cap_height)
+@law(Camera.corners_px, led_index.inner_field, led_index.cap_height)
 @given(rng=SEEDS, factor=some.floats(0.3, 5), margin_rad=some.floats(0, 3))
 def test_the_inner_field_is_smaller_than_the_field(
     rng: np.random.Generator, factor: float, margin_rad: float
 ) -> None:
-    corners = led_index.corner_rays(CAMERA.zoomed(factor))
+    seen = CAMERA.zoomed(factor)
+    corners = seen.rays(seen.corners_px)
     (left, right, top, bottom), half = led_index.inner_field(corners)
     assert 0 < right - left < 2 * half[0]
     assert 0 < bottom - top < 2 * half[1]

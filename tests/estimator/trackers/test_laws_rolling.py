@@ -203,6 +203,7 @@ def test_leds_of_a_rolling_shutter_frame_are_solved_at_the_middle_row_s_time() -
 
 @law(
     rolling_shutter.solve_rolling,
+    rolling_shutter.solve_lights,
     rolling_shutter.candidates,
     rolling_shutter.with_streak_rate,
     rolling_shutter.Lights.sight,
@@ -241,7 +242,7 @@ def test_rolling_shutter_candidates_include_the_true_rate_and_refusals_stay(
         )
     )
     assert_allclose(both[0][0].rate_rad_s, -both[1][0].rate_rad_s, rtol=0, atol=0)
-    refused = rolling_shutter.solve_rolling(
+    refused = rolling_shutter.solve_lights(
         WIDE, lights, found, lambda _: Attitude("no"), None, EXPOSURE_S
     )
     assert refused.status == "no"

@@ -28,6 +28,7 @@ from estimator.identification.published.pyramid import pyramid
 from estimator.identification.published.saa import AssumptionPool, saa
 from estimator.identification.registry import IDENTIFIERS, STEP, candidates
 from estimator.identification.solver_options import ACCEPTANCES, Options
+from estimator.identification.star_detections import flat_centroids
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import refinement
 from estimator.trackers.pipeline import Settings
@@ -308,6 +309,8 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
 
 @law(
     FieldMatcher.in_field,
+    Attitude.log10_chance,
+    flat_centroids,
     StarTracker.solve_centroids,
     StarTracker.solve_matches,
     refinement.solved_attitude,
@@ -329,7 +332,11 @@ def test_an_attitude_is_correct_or_none(
     assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
     xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
     mixed = Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
+    flat = flat_centroids(mixed, np.full(len(xy), 0.2))
+    assert flat.spread_px2.shape == (0, 2, 2)
+    assert (flat.sigma_px > flat.own_px).all()
     solution = eye.solve_centroids(mixed)
+    assert (solution.log10_chance < 0) == solution.solved
     assert (
         solution.solved
         == (solution.status == "solved")

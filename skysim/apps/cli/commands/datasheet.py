@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from skysim.apps.cli.options import Json, OpenReport, Overrides, SceneArg, Seed, load
+from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
 from skysim.results.report import page_path, print_table, print_wrapped
-from skysim.results.report_blocks import Column, Table
+from skysim.results.report_blocks import Column, Table, text_column
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames
@@ -86,36 +86,24 @@ def datasheet(
     Stopped or killed, it goes on where it was when it is called again.
     """
     from skysim.core import files
-    from skysim.core.yaml_reader import parse_overrides
-    from skysim.experiments.datasheet import cells, datasheet_report, model_fit
-    from skysim.experiments.datasheet.scene_changes import parse_end_of_life
+    from skysim.experiments.datasheet import cells, datasheet_report, scene_changes
     from skysim.experiments.datasheet.statement import state
 
-    if fmu and model is None:
-        raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
-    if fmu:
-        model_fit.require_fmu_builder()
-    life = parse_end_of_life(end_of_life) if end_of_life else None
-    rates_deg_s = parse_rates(rates) if rates else []
-    if markdown:
-        page_path(markdown)
-    if model:
-        files.make_folder(model)
+    require_outputs(markdown, model, fmu)
     loaded = load(scene, None, seed, set_)
-    overrides = parse_overrides(set_) | ({} if seed is None else {"seed": str(seed)})
     folder = out or Path("out") / f"{loaded.name}_datasheet"
     title = f"datasheet of {loaded.name}"
     with ExitStack() as stack:
         sheet = cells.measure(
             scene,
             loaded,
-            overrides,
+            LOADED[-1][1],
             folder,
             quick=quick,
             fields=fields,
             least=cells.MODEL_FIELDS if model else cells.MIN_FIELDS,
-            rates_deg_s=rates_deg_s,
-            end_of_life=life,
+            rates_deg_s=parse_rates(rates) if rates else [],
+            end_of_life=scene_changes.parse_end_of_life(end_of_life) if end_of_life else None,
             workers=workers,
             watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )
@@ -123,21 +111,35 @@ def datasheet(
     chosen = {"rates": rates, "end-of-life": end_of_life}
     options = [f"--{name}={text}" for name, text in chosen.items() if text]
     report = datasheet_report.datasheet_report(statement, ["--quick"] * quick + options)
-    paths = datasheet_report.write_all(folder, statement, report)
+    page = datasheet_report.write_all(folder, statement, report)["report"]
     if markdown:
         files.write_text(markdown, report.markdown())
     if json:
         print_json(datasheet_report.numbers(statement))
     else:
         report.print()
-        print(f"report: {paths['report']}")
+        print(f"report: {page}")
     if open_:
-        typer.launch(str(paths["report"]))
+        typer.launch(str(page))
     # What was measured is written; an error says what is missing.
     if statement.refusal:
         raise statement.refusal
+    write_model(model, sheet, fmu, json)
+
+
+def require_outputs(markdown: Path | None, model: Path | None, fmu: bool) -> None:
+    """Make the folders of the page and of the model. Raises InputError for what could not be written in the end."""
+    from skysim.core import files
+    from skysim.experiments.datasheet import model_fit
+
+    if fmu:
+        if model is None:
+            raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
+        model_fit.require_fmu_builder()
+    if markdown:
+        page_path(markdown)
     if model:
-        write_model(model, sheet, fmu, json)
+        files.make_folder(model)
 
 
 def parse_rates(text: str) -> list[float]:
@@ -151,10 +153,12 @@ def parse_rates(text: str) -> list[float]:
     return rates
 
 
-def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> None:
+def write_model(folder: Path | None, sheet: MeasuredFrames, fmu: bool, json: bool) -> None:
     """Write the fast model of the errors; print its agreement with the simulation and its files, unless `json`."""
     from skysim.experiments.datasheet import model_fit
 
+    if folder is None:
+        return
     agreements = model_fit.agreements(sheet)
     agreement = [one._asdict() for one in agreements]
     written = model_fit.write_model(
@@ -170,17 +174,7 @@ def write_model(folder: Path, sheet: MeasuredFrames, fmu: bool, json: bool) -> N
 
 def print_agreements(agreements: list[Agreement]) -> None:
     """Print how well the model, fitted to each half of the fields, agrees with the other half."""
-    rows = [
-        [
-            one.fitted,
-            one.rate_deg_s,
-            one.frames,
-            *one.p_values,
-            one.correlation,
-            one.expected_correlation,
-        ]
-        for one in agreements
-    ]
+    rows = [[*one[:3], *one.p_values, *one[4:]] for one in agreements]
     heads = {
         "rate °/s": "g",
         "frames": "d",
@@ -191,7 +185,7 @@ def print_agreements(agreements: list[Agreement]) -> None:
         "of the model": ".3f",
     }
     columns = [Column(head, format=form) for head, form in heads.items()]
-    table = Table([Column("fitted to", kind="text"), *columns], rows)
+    table = Table([text_column("fitted to"), *columns], rows)
     p_values = [p for one in agreements for p in one.p_values]
     if len(p_values) * min(p_values) < 0.05:
         print_wrapped(

@@ -28,101 +28,115 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
+Images = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="IMAGES",
+        help="Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:"
+        " x_px, y_px, flux).",
+    ),
+]
+Fov = Annotated[
+    float | None,
+    typer.Option(
+        help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."
+    ),
+]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration."
+    ),
+]
+Dome = Annotated[
+    str | None,
+    typer.Option(
+        help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."
+    ),
+]
+MapFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."
+    ),
+]
+Live = Annotated[
+    str | None,
+    typer.Option(
+        help="Also solve a frame of a live camera: its index, a video file or an address."
+    ),
+]
+Time = Annotated[
+    str | None,
+    typer.Option(
+        help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."
+    ),
+]
+Catalog = Annotated[
+    str | None,
+    typer.Option(
+        help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."
+    ),
+]
+Near = Annotated[
+    str | None,
+    typer.Option(
+        metavar="RA,DEC,DEG",
+        help="Circle of the sky in which the image center is sought, in degrees.",
+    ),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(metavar="WxH", help="Size of the picture of a list of lights, in pixels."),
+]
+WcsTo = Annotated[
+    Path | None,
+    typer.Option(help="Also write the FITS header (TAN-SIP) of one image here."),
+]
+TableTo = Annotated[
+    Path | None,
+    typer.Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
+]
+AnnotateTo = Annotated[
+    Path | None,
+    typer.Option(help="File of the annotated image of one image, in place of OUT's."),
+]
+Sequence = Annotated[
+    bool,
+    typer.Option(
+        help="The images are one camera's in the order of time: also print rates and gaps."
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."
+    ),
+]
+Folder = Annotated[Path, typer.Option(help="Folder for the annotated images.")]
+
+
 def solve(
-    images: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="IMAGES",
-            help="Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:"
-            " x_px, y_px, flux).",
-        ),
-    ] = None,
-    fov: Annotated[
-        float | None,
-        typer.Option(
-            help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            help="Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration."
-        ),
-    ] = None,
-    dome: Annotated[
-        str | None,
-        typer.Option(
-            help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."
-        ),
-    ] = None,
-    map_: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."
-        ),
-    ] = None,
-    live: Annotated[
-        str | None,
-        typer.Option(
-            help="Also solve a frame of a live camera: its index, a video file or an address."
-        ),
-    ] = None,
-    time: Annotated[
-        str | None,
-        typer.Option(
-            help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."
-        ),
-    ] = None,
-    catalog: Annotated[
-        str | None,
-        typer.Option(
-            help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."
-        ),
-    ] = None,
+    images: Images = None,
+    fov: Fov = None,
+    camera: CameraFile = None,
+    dome: Dome = None,
+    map_: MapFile = None,
+    live: Live = None,
+    time: Time = None,
+    catalog: Catalog = None,
     detector: Detector = None,
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
-    near: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RA,DEC,DEG",
-            help="Circle of the sky in which the image center is sought, in degrees.",
-        ),
-    ] = None,
-    size: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WxH", help="Size of the picture of a list of lights, in pixels."
-        ),
-    ] = None,
-    wcs: Annotated[
-        Path | None,
-        typer.Option(help="Also write the FITS header (TAN-SIP) of one image here."),
-    ] = None,
-    table: Annotated[
-        Path | None,
-        typer.Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
-    ] = None,
-    annotate: Annotated[
-        Path | None,
-        typer.Option(help="File of the annotated image of one image, in place of OUT's."),
-    ] = None,
-    sequence: Annotated[
-        bool,
-        typer.Option(
-            help="The images are one camera's in the order of time: also print rates and gaps."
-        ),
-    ] = False,
-    rate: Annotated[
-        float | None,
-        typer.Option(
-            help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the annotated images.")] = Path(
-        "out/solve"
-    ),
+    near: Near = None,
+    size: Size = None,
+    wcs: WcsTo = None,
+    table: TableTo = None,
+    annotate: AnnotateTo = None,
+    sequence: Sequence = False,
+    rate: Rate = None,
+    out: Folder = Path("out/solve"),
     json: Json = False,
 ) -> None:
     """Solve the attitude of images of the sky or of a dome's LEDs, lost in space; uncertain matches are rejected.
@@ -132,39 +146,18 @@ def solve(
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver
     from skysim.core import files
-    from skysim.core.images import stem_of
 
+    sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
     stages = selected_stages(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
-    settings: Solver | DomeSolver
-    if dome is None:
-        if map_ is not None:
-            raise InputError("--map", "has no effect without --dome", "with --dome SCENE")
-        settings = plate_solver.make_solver(
-            fov,
-            camera,
-            datetime_from_iso(time),
-            stages,
-            catalog,
-            size_px=numbers("size", size, "x", 2, int),
-            near_deg=numbers("near", near, ",", 3, float),
-        )
-    else:
-        sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
-        for name, value in (sky | {"camera": camera, "wcs": wcs}).items():
-            if value is not None:
-                raise InputError(f"--{name}", "has no effect with --dome", "without it")
-        settings = plate_solver.make_dome_solver(dome, map_, stages)
+    settings = solver_of(sky | {"camera": camera, "wcs": wcs}, dome, map_, stages)
     files.make_folder(out)
-    paths = pictures(images or [], live, out)
-    if sequence:  # a frame that is there as FITS and as PNG is one
-        first = {path.with_name(stem_of(path)): path for path in reversed(paths)}
-        paths = list(first.values())[::-1]
+    paths = pictures(images or [], live, out, sequence)
     chosen = plate_solver.Outputs(annotate, table, wcs)
     if any(chosen) and len(paths) != 1:
         raise InputError("", f"{len(paths)} images", "one with --annotate, --table or --wcs")
-    results, warnings, errors = solve_all(paths, settings, chosen, out, json)
+    results, messages, all_read = solve_all(paths, settings, chosen, out, json)
     if sequence:
         plate_solver.add_rates(results, rate or video_numbers(paths[0])[0])
     files.write_text(out / "solutions.json", files.to_json(results))
@@ -174,10 +167,34 @@ def solve(
         print_solutions(results, out)
         if sequence:
             print(plate_solver.sequence_summary(results))
-    for message in warnings + errors:
+    for message in messages:
         print_error(message)
-    if errors:
+    if not all_read:
         raise typer.Exit(2)
+
+
+def solver_of(
+    sky: dict[str, Any], dome: str | None, map_: Path | None, stages: dict[str, str]
+) -> Solver | DomeSolver:
+    """The solver of the images; `sky` has the options that have no effect with a dome, by name. Raises InputError."""
+    from skysim.apps import plate_solver
+
+    if dome is not None:
+        for name, value in sky.items():
+            if value is not None:
+                raise InputError(f"--{name}", "has no effect with --dome", "without it")
+        return plate_solver.make_dome_solver(dome, map_, stages)
+    if map_ is not None:
+        raise InputError("--map", "has no effect without --dome", "with --dome SCENE")
+    return plate_solver.make_solver(
+        sky["fov"],
+        sky["camera"],
+        datetime_from_iso(sky["time"]),
+        stages,
+        sky["catalog"],
+        size_px=numbers("size", sky["size"], "x", 2, int),
+        near_deg=numbers("near", sky["near"], ",", 3, float),
+    )
 
 
 def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) -> Any:
@@ -195,11 +212,11 @@ def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) 
     return values
 
 
-def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
+def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) -> list[Path]:
     """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
     from skysim.apps import plate_solver
     from skysim.core import files
-    from skysim.core.images import grab_frame
+    from skysim.core.images import grab_frame, stem_of
 
     paths = plate_solver.pictures_in(images)
     if live is not None:
@@ -207,6 +224,9 @@ def pictures(images: list[Path], live: str | None, out: Path) -> list[Path]:
         files.write_image(paths[-1], grab_frame(live))
     if not paths:
         raise InputError("", "no images", "files, folders, or --live CAMERA")
+    if sequence:  # a frame that is there as FITS and as PNG is one
+        first = {path.with_name(stem_of(path)): path for path in reversed(paths)}
+        paths = list(first.values())[::-1]
     return paths
 
 
@@ -216,8 +236,8 @@ def solve_all(
     chosen: Outputs,
     out: Path,
     quiet: bool,
-) -> tuple[list[dict[str, Any]], list[str], list[str]]:
-    """Solve the images. Returns their results, warnings, and the errors of those that could not be read."""
+) -> tuple[list[dict[str, Any]], list[str], bool]:
+    """Solve the images. Returns their results, warnings followed by errors, and whether all images could be read."""
     from skysim.apps import plate_solver
 
     results = []
@@ -239,7 +259,7 @@ def solve_all(
         if result.pop("bad_input"):
             errors.append(result["status"])
         results.append(result)
-    return results, warnings, errors
+    return results, warnings + errors, not errors
 
 
 def frames_of(

@@ -27,7 +27,7 @@ from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.results.report import print_blocks, print_table, print_wrapped
-from skysim.results.report_blocks import Column, Table
+from skysim.results.report_blocks import Column, Table, text_column
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
@@ -313,7 +313,7 @@ def print_plan(plan: dict[str, Any]) -> None:
     heads = ("LED place mm", "lever mm", "focal length px")
     columns = [
         Column("frames"),
-        Column("LEDs measured", kind="text"),
+        text_column("LEDs measured"),
         *(Column(head, format=".3g") for head in heads),
     ]
     keys = ("led_mm", "lever_mm", "focal_px")
@@ -337,7 +337,7 @@ def print_plan(plan: dict[str, Any]) -> None:
 
 def print_comparison(result: dict[str, Any]) -> None:
     columns = [
-        Column("what", kind="text"),
+        text_column("what"),
         Column("predicted", format=".3g"),
         Column("simulated", format=".3g"),
         Column("ratio"),
