@@ -71,7 +71,9 @@ def parse_end_of_life(text: str) -> EndOfLife:
     try:
         return EndOfLife.model_validate(tree)
     except ValidationError as error:
-        raise explain(error, EndOfLife, tree, [], {}).within("--end-of-life") from None
+        raise explain(error, EndOfLife, tree, [], {}).within(
+            "datasheet.end_of_life"
+        ) from None
 
 
 def added_dark_e_s(camera: CameraConfig, life: EndOfLife) -> float:
