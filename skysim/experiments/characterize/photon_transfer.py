@@ -162,6 +162,11 @@ class Level:
     greatest_dn: int
 
     @property
+    def halves_dn(self) -> NDArray[np.float32]:
+        """(2, H, W) means of the first and of the second frames of the pairs."""
+        return np.stack([self.first_dn, self.second_dn])
+
+    @property
     def mean_dn(self) -> Floats:
         """(H, W) mean of all frames."""
         return (self.first_dn.astype(np.float64) + self.second_dn) / 2
@@ -220,11 +225,16 @@ class LevelBuilder:
             total / np.float32(divisor)
             for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
         )
-        drift_dn2 = self.difference_dn2 / pairs
         return Level(
-            *(exposure_s, temperature_c, 2 * pairs),
-            *(first, second, squares),
-            *(drift_dn2, self.least_dn, self.greatest_dn),
+            exposure_s,
+            temperature_c,
+            2 * pairs,
+            first,
+            second,
+            squares,
+            self.difference_dn2 / pairs,
+            self.least_dn,
+            self.greatest_dn,
         )
 
 
