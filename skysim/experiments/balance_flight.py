@@ -243,20 +243,19 @@ def remedy(
 
 def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
     """(3,) largest rate about each body axis between two attitudes."""
-    rates = [
-        np.abs(
-            (one.lab_from_body[:-1].inv() * one.lab_from_body[1:]).as_rotvec()
-            / np.diff(one.t_s)[:, None]
-        )
-        for one in records
-    ]
-    return np.degrees(np.concatenate(rates).max(axis=0))
+    rates = [turn_rates(one.t_s, one.lab_from_body) for one in records]
+    return np.degrees(np.abs(np.concatenate(rates)).max(axis=0))
+
+
+def turn_rates(t_s: Floats, lab_from_body: Rotation) -> Floats:
+    """(N - 1, 3) mean rates about the body axes between N attitudes."""
+    turned = lab_from_body[:-1].inv() * lab_from_body[1:]
+    return np.asarray(turned.as_rotvec() / np.diff(t_s)[:, None])
 
 
 def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:
     """Largest angle between body z and lab z."""
-    cosines = np.concatenate([one.lab_from_body.as_matrix()[:, 2, 2] for one in records])
-    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
+    return max(float(multibody.tilt_deg(one.lab_from_body).max()) for one in records)
 
 
 YAWS_DEG = (0.0, 120.0, 240.0)
@@ -480,8 +479,6 @@ def measured_attitudes(
 
 def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> Floats:
     """(N, 3, 3) covariance s^2 w w^T of attitudes whose times have the error s, with the rate w from differences."""
-    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[
-        :, None
-    ]
+    turned = turn_rates(t_s, lab_from_body)
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
     return jitter_s**2 * rate[:, :, None] * rate[:, None, :]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
@@ -438,16 +439,22 @@ def coverage_statistics(so_far: Coverage) -> Record:
         if so_far.accuracy
         else np.full(len(measured), so_far.model.leds_sigma_m)
     )
-    sigma_mm = (1e3 * sigma_m).tolist()
-    columns = so_far.model.leds.id.tolist(), frames.tolist(), measured.tolist(), sigma_mm
-    keys = ("led", "frames", "measured", "sigma_mm")
+    led = so_far.model.leds.id
     return {
         "leds": len(frames),
         "measured": int(measured.sum()),
         "seen_once": int(np.sum(frames == 1)),
         "unseen": int(np.sum(frames == 0)),
-        "by_led": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
+        "by_led": rows_of_columns(
+            led=led, frames=frames, measured=measured, sigma_mm=1e3 * sigma_m
+        ),
     }
+
+
+def rows_of_columns(**columns: NDArray[Any]) -> list[Record]:
+    """Rows as numbers from columns by name."""
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
@@ -462,14 +469,11 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
     }
 
 
-def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[dict[str, float | int]]:
+def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
     up = lab_from_body.apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
-    columns = (
-        *euler_deg(lab_from_body).T.tolist(),
-        tilt_deg.tolist(),
-        shown.sum(axis=1).tolist(),
+    roll, pitch, yaw = euler_deg(lab_from_body).T
+    return rows_of_columns(
+        roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, tilt_deg=tilt_deg, leds=shown.sum(axis=1)
     )
-    keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
-    return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]
