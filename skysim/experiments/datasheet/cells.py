@@ -316,8 +316,8 @@ class Designer:
     def rates(self) -> Iterator[DatasheetCell]:
         """Pairs of frames at each rate, across the boresight and about it."""
         for experiment, streaks_px in (("rate", STREAKS_PX), ("boresight", BORESIGHT_PX)):
-            rates = self.chosen_rates_deg_s or self.rates_deg_s(streaks_px, experiment)
-            for rate in rates:
+            usual = self.rates_deg_s(streaks_px, experiment)
+            for rate in self.chosen_rates_deg_s or usual:
                 yield from self.at_rate(experiment, rate)
 
     def at_rate(self, experiment: str, rate_deg_s: float) -> Iterator[DatasheetCell]:

@@ -190,9 +190,7 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
     """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
     out = np.full(run.seen.shape, np.nan)
     survey = run.survey
-    camera_m = survey.body_from_lab.inv().apply(
-        np.tile(survey.lever.camera_body_m, (len(out), 1))
-    )
+    camera_m = survey.body_from_lab.inv().apply(survey.lever.camera_body_m)
     for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
         squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
         out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2

@@ -206,15 +206,17 @@ class News(NamedTuple):
 
 @dataclass
 class WatchedFolder:
-    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name."""
+    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name.
+
+    A file is read when a look finds it as the look before did. `_seen` has its stamp, and whether it was read.
+    """
 
     folder: Path
     camera: Camera
     settings: Settings
     _lights: dict[str, Centroids] = field(default_factory=dict)
     _attitudes: dict[str, Rotation] = field(default_factory=dict)
-    _seen: dict[str, Stamp] = field(default_factory=dict)
-    _done: dict[str, Stamp] = field(default_factory=dict)
+    _seen: dict[str, tuple[Stamp, bool]] = field(default_factory=dict)
 
     @property
     def pictures(self) -> list[SurveyImage]:
@@ -244,11 +246,11 @@ class WatchedFolder:
         }
         for path in [*paths, self.folder / ATTITUDES]:
             stamp = stamp_of(path)
-            before = self._seen.get(path.name)
-            if stamp is None:
+            before, was_read = self._seen.get(path.name, (None, False))
+            if stamp is None or (stamp == before and was_read):
                 continue
-            self._seen[path.name] = stamp
-            if stamp != before or stamp == self._done.get(path.name):
+            self._seen[path.name] = (stamp, stamp == before)
+            if stamp != before:
                 continue
             try:
                 if path.name == ATTITUDES:
@@ -260,7 +262,6 @@ class WatchedFolder:
                 news.complaints.append(error)
             else:
                 news.read.append(path.name)
-            self._done[path.name] = stamp
         return news
 
 
