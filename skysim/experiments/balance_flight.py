@@ -25,7 +25,6 @@ from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
 from skysim.simulation.flight import Flight, Progress, open_flight
 
@@ -295,7 +294,7 @@ def check_scene(scene: Scene) -> None:
         raise InputError(
             "vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing"
         )
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         raise InputError(
             "light.kind", "stars: balancing needs attitudes relative to the lab", "dome"
         )

@@ -52,7 +52,6 @@ from skysim.results.report import Report
 from skysim.results.report_blocks import Column, Figure, Section, Table, Verdict
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.flight import Progress, open_flight
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
@@ -110,14 +109,14 @@ class Calibration(NamedTuple):
 def assumed(lab: Lab) -> Assumed:
     """What the scene's tracker assumes. Raises InputError for a scene without LEDs."""
     scene = lab.scene
-    if not isinstance(scene.light, DomeConfig):
+    if scene.dome is None:
         raise InputError(
             "light.kind", scene.light.kind, "dome, for a calibration by its LEDs"
         )
     return Assumed(
         scene,
         onboard_model.assumed_camera(scene),
-        onboard_model.assumed_dome(scene, scene.light, lab.camera.sources),
+        onboard_model.assumed_dome(scene, scene.dome, lab.camera.sources),
         onboard_model.assumed_lever(scene, lab.camera.mount),
     )
 

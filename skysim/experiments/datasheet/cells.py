@@ -40,7 +40,6 @@ from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan, res
 from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 
 MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 MODEL_FIELDS = 2 * MIN_FIELDS  # for an error model: each half of them tests that of the other
@@ -132,7 +131,7 @@ class Draw(NamedTuple):
 
 def check_scene(scene: Scene) -> None:
     """Raise InputError for a scene whose tracker gives no attitude for a single frame."""
-    if isinstance(scene.light, CollimatedDisplayConfig):
+    if scene.light.kind == "collimated_display":
         raise InputError("light.kind", "collimated_display has one field only", "stars, dome")
     if scene.tracker.decoder:
         raise InputError(
@@ -211,7 +210,7 @@ class Designer:
         self.seeds = unit_seeds(scene)
         self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
-        self.under_stars = isinstance(scene.light, StarsConfig)
+        self.under_stars = scene.stars is not None
         self.noise = 0
 
     @property
@@ -529,7 +528,7 @@ def planned(
     """Write the study file of the cells and plan its trials. Raises InputError for settings that are not allowed."""
     scene = designer.scene
     settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
-    tree = {
+    tree: Record = {
         "schema": 1,
         "title": f"Datasheet of {scene.title}",
         "scene": scene_name,

@@ -247,9 +247,13 @@ def coverage_before(
 
 
 class NextStops(NamedTuple):
-    """Attitudes to hold next, and the predicted accuracy with them; None if they do not determine the unknowns."""
+    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them.
+
+    It is None if they do not determine the unknowns.
+    """
 
     lab_from_body: Rotation
+    shown: Bools
     accuracy: SurveyAccuracy | None
 
 
@@ -262,8 +266,9 @@ def next_stops(
         scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
     )
     attitudes = Rotation.concatenate([so_far.held, further.inv()])
-    seen = np.vstack([so_far.seen, model.visible(further.inv(), margin_px)])
-    return NextStops(further, predicted(model, attitudes, seen))
+    shown = model.visible(further.inv(), margin_px)
+    seen = np.vstack([so_far.seen, shown])
+    return NextStops(further, shown, predicted(model, attitudes, seen))
 
 
 def predicted(

@@ -200,9 +200,9 @@ def design_of(lab: Lab) -> Sources:
 
 def require_dome(scene: Scene) -> DomeConfig:
     """The dome of a scene. Raises InputError if its light is another."""
-    if not isinstance(scene.light, DomeConfig):
+    if scene.dome is None:
         raise InputError("light.kind", f"a survey needs LEDs, not {scene.light.kind}", "dome")
-    return scene.light
+    return scene.dome
 
 
 def survey_model(
