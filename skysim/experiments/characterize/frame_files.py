@@ -30,6 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
     LevelBuilder,
+    exposures_s,
     median_and_spread,
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
@@ -388,7 +389,7 @@ def check_dark(darks: Stack, level: Level) -> None:
 def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
     """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
     signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
-    times = np.array([one.exposure_s for one in flats.levels])
+    times = exposures_s(flats.levels)
     top = signals.max()
     below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():

@@ -202,8 +202,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
     signal there, c x of the fit.
     """
     transfer = found.transfer
-    is_full = photon_transfer.saturated(flats)
-    full = list(compress(flats, is_full))
+    full = list(compress(flats, photon_transfer.saturated(flats)))
     brightest = max(flats, key=lambda one: one.moments.mean_dn)
     if full:
         level_dn = float(by_level(full, "mean_dn").mean())
@@ -225,8 +224,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 
     well = propagate(lambda p: signal(p) / p[GAIN], values, covariance)
     missing = propagate(lambda p: p[CURVATURE] * signal(p), values, covariance)
-    found.estimates["full_well_e"] = Estimate.normal(*well)
-    found.estimates["nonlinearity"] = Estimate.normal(*missing)
+    found.estimates.update({"full_well_e": well, "nonlinearity": missing})
 
 
 def dark_parameters(
@@ -299,10 +297,10 @@ def unresolved(
 ) -> None:
     """Add the mean dark current alone, if its scatter over the pixels is below the noise; remark what it needs."""
     transfer = found.transfer
-    value, sigma = propagate(
+    dark = propagate(
         lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
     )
-    found.estimates["dark_e_s"] = Estimate.normal(value, sigma)
+    found.estimates["dark_e_s"] = dark
     mean = float(np.median(rates))
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
@@ -310,10 +308,10 @@ def unresolved(
         return
     noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
     needed = "much longer exposures"
-    if value > 3 * sigma:
-        needed = f"{longest_s * noise_e_s / value:.2g} s or more"
+    if dark.value > 3 * dark.sigma:
+        needed = f"{longest_s * noise_e_s / dark.value:.2g} s or more"
     found.remarks.append(
-        f"DSNU: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
+        f"DSNU: the scatter of the dark current, {dark.value:.2g} e-/s, is below the noise of"
         f" {longest_s:g} s; allowed: darks of {needed}"
     )
 
