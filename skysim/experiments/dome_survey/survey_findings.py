@@ -81,12 +81,10 @@ class SurveyRun:
     @property
     def inliers(self) -> list[Correspondences]:
         """The correspondences without those that the adjustment rejected."""
-        keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
-        for frame, row in self.survey.outliers.tolist():
-            keep[frame][row] = False
+        frame, row = self.survey.outliers.T
         return [
-            Correspondences(m.light[k], m.led[k])
-            for m, k in zip(self.matches, keep, strict=True)
+            Correspondences(*(np.delete(part, row[frame == k]) for part in match))
+            for k, match in enumerate(self.matches)
         ]
 
     @property

@@ -129,13 +129,12 @@ def write_attitudes(
 def write_solved(path: Path, rows: Sequence[Record]) -> None:
     """Write the attitudes of `survey_findings.attitude_rows` that are solved, with the upper half of the covariance."""
     solved = [row for row in rows if row["status"] == "solved"]
-    quaternions = np.array([row["cam_from_lab_xyzw"] for row in solved])
-    covariances = np.array([row["covariance_rad2"] for row in solved])
     more: dict[str, list[float]] = {"leds": [row["matches"] for row in solved]}
     for n, axis in enumerate("xyzw"):
-        more[f"cam_from_lab_{axis}"] = quaternions[:, n].tolist()
+        more[f"cam_from_lab_{axis}"] = [row["cam_from_lab_xyzw"][n] for row in solved]
     for i, j in zip(*np.triu_indices(3), strict=True):
-        more[f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"] = covariances[:, i, j].tolist()
+        name = f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"
+        more[name] = [row["covariance_rad2"][i][j] for row in solved]
     names = [row["file"] for row in solved]
     write_attitudes(path, names, survey_frames.from_rows(solved), more)
 

@@ -96,17 +96,14 @@ class HeldAttitudes(NamedTuple):
         for _ in range(DRAWS):
             focal, *lever = rng.standard_normal(4)
             own_m = rng.standard_normal(model.leds.position_m.shape) * model.leds_sigma_m
+            leds_m = model.leds.position_m + own_m
+            lever_m = model.lever.camera_body_m + np.array(lever) * model.lever_sigma_m
+            zoom = 1 + focal * model.focal_sigma_px / model.camera.focal_px
             other = replace(
                 model,
-                camera=model.camera.zoomed(
-                    1 + focal * model.focal_sigma_px / model.camera.focal_px
-                ),
-                leds=replace(model.leds, position_m=model.leds.position_m + own_m),
-                lever=replace(
-                    model.lever,
-                    camera_body_m=model.lever.camera_body_m
-                    + np.array(lever) * model.lever_sigma_m,
-                ),
+                camera=model.camera.zoomed(zoom),
+                leds=replace(model.leds, position_m=leds_m),
+                lever=replace(model.lever, camera_body_m=lever_m),
             )
             shown = other.visible(held, self.margin_px)
             found.append(int(survey_plan.measurable(other, held, shown).sum()))
