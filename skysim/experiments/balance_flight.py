@@ -124,16 +124,14 @@ def draw_assumptions(
     moment_kg_m = at_zero.mass.mass_kg * uncertainty.offset_sigma_m
     torque_nm = LAB_TORQUE_SHARE * moment_kg_m * at_zero.gravity_m_s2
     drag = torque_nm / DRAG_RATE_RAD_S ** np.array([1, 2])
-    sigma = np.concatenate(
-        [
-            inertia_sigma,
-            np.full(3, moment_kg_m),
-            np.full(3, torque_nm),
-            drag,
-            np.full(3, uncertainty.mount_sigma_rad),
-            np.full(count, uncertainty.wheel_sigma),
-        ]
-    )
+    rest = [
+        moment_kg_m,
+        torque_nm,
+        *drag,
+        uncertainty.mount_sigma_rad,
+        uncertainty.wheel_sigma,
+    ]
+    sigma = np.append(inertia_sigma, np.repeat(rest, [3, 3, 1, 1, 3, count]))
     values = np.zeros(PARAMETERS + count)
     values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
     wheels = at_zero.wheels.inertia_kg_m2

@@ -280,8 +280,8 @@ def column_offset(base: Floats, usable: Bools, gain_e_dn: float) -> Estimate:
     variance = gain_e_dn**2 * product.mean()
     sigma = gain_e_dn**2 * product.std() / np.sqrt(columns)
     if variance > 3 * sigma:
-        return Estimate.lognormal(math.sqrt(variance), float(sigma / (2 * np.sqrt(variance))))
-    return Estimate.root(float(variance), float(sigma))
+        return Estimate.lognormal(math.sqrt(variance), sigma / (2 * math.sqrt(variance)))
+    return Estimate.root(variance, sigma)
 
 
 def prnu(
@@ -307,7 +307,7 @@ def prnu(
     trend = smooth(rate.mean(axis=0), usable)[usable]
     a, b = rate[:, usable] / trend - 1
     product = (a - a.mean()) * (b - b.mean())
-    return Estimate.root(float(product.mean()), float(product.std() / np.sqrt(product.size)))
+    return Estimate.root(product.mean(), product.std() / math.sqrt(product.size))
 
 
 def smooth(image: Floats, usable: Bools) -> Floats:

@@ -225,8 +225,8 @@ def image_size(
     sigma2, corner2 = np.sqrt(np.diag(normal) * scatter)
     used = stars.take(kept)
     return ImageSize(
-        Estimate.root(float(found[0]), float(sigma2)),
-        Estimate.root(float(found[1]), float(corner2)),
+        Estimate.root(found[0], sigma2),
+        Estimate.root(found[1], corner2),
         used,
         len(rho2) - int(kept.sum()),
     )

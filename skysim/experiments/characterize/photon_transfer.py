@@ -74,7 +74,8 @@ class Estimate(NamedTuple):
         low, high = (
             math.sqrt(max(variance + sign * SIGMAS * sigma, 0.0)) for sign in (-1, 1)
         )
-        return cls(value, sigma / (2 * value) if value else high / SIGMAS, low, high)
+        error = float(sigma) / (2 * value) if value else high / SIGMAS
+        return cls(value, error, low, high)
 
 
 DIGITS = 5  # significant digits of an interval, or so many that its width has two
