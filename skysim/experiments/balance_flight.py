@@ -25,7 +25,6 @@ from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.motion import MotionConfig
 from skysim.simulation.flight import Flight, Progress, open_flight
 
@@ -125,16 +124,14 @@ def draw_assumptions(
     moment_kg_m = at_zero.mass.mass_kg * uncertainty.offset_sigma_m
     torque_nm = LAB_TORQUE_SHARE * moment_kg_m * at_zero.gravity_m_s2
     drag = torque_nm / DRAG_RATE_RAD_S ** np.array([1, 2])
-    sigma = np.concatenate(
-        [
-            inertia_sigma,
-            np.full(3, moment_kg_m),
-            np.full(3, torque_nm),
-            drag,
-            np.full(3, uncertainty.mount_sigma_rad),
-            np.full(count, uncertainty.wheel_sigma),
-        ]
-    )
+    rest = [
+        moment_kg_m,
+        torque_nm,
+        *drag,
+        uncertainty.mount_sigma_rad,
+        uncertainty.wheel_sigma,
+    ]
+    sigma = np.append(inertia_sigma, np.repeat(rest, [3, 3, 1, 1, 3, count]))
     values = np.zeros(PARAMETERS + count)
     values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
     wheels = at_zero.wheels.inertia_kg_m2
@@ -243,20 +240,19 @@ def remedy(
 
 def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
     """(3,) largest rate about each body axis between two attitudes."""
-    rates = [
-        np.abs(
-            (one.lab_from_body[:-1].inv() * one.lab_from_body[1:]).as_rotvec()
-            / np.diff(one.t_s)[:, None]
-        )
-        for one in records
-    ]
-    return np.degrees(np.concatenate(rates).max(axis=0))
+    rates = [turn_rates(one.t_s, one.lab_from_body) for one in records]
+    return np.degrees(np.abs(np.concatenate(rates)).max(axis=0))
+
+
+def turn_rates(t_s: Floats, lab_from_body: Rotation) -> Floats:
+    """(N - 1, 3) mean rates about the body axes between N attitudes."""
+    turned = lab_from_body[:-1].inv() * lab_from_body[1:]
+    return np.asarray(turned.as_rotvec() / np.diff(t_s)[:, None])
 
 
 def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:
     """Largest angle between body z and lab z."""
-    cosines = np.concatenate([one.lab_from_body.as_matrix()[:, 2, 2] for one in records])
-    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
+    return max(float(multibody.tilt_deg(one.lab_from_body).max()) for one in records)
 
 
 YAWS_DEG = (0.0, 120.0, 240.0)
@@ -296,7 +292,7 @@ def check_scene(scene: Scene) -> None:
         raise InputError(
             "vehicle.mount", "a free vehicle has no bearing to be balanced on", "air_bearing"
         )
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         raise InputError(
             "light.kind", "stars: balancing needs attitudes relative to the lab", "dome"
         )
@@ -480,8 +476,6 @@ def measured_attitudes(
 
 def timing_covariance(t_s: Floats, lab_from_body: Rotation, jitter_s: float) -> Floats:
     """(N, 3, 3) covariance s^2 w w^T of attitudes whose times have the error s, with the rate w from differences."""
-    turned = (lab_from_body[:-1].inv() * lab_from_body[1:]).as_rotvec() / np.diff(t_s)[
-        :, None
-    ]
+    turned = turn_rates(t_s, lab_from_body)
     rate = np.vstack([turned[:1], (turned[1:] + turned[:-1]) / 2, turned[-1:]])
     return jitter_s**2 * rate[:, :, None] * rate[:, None, :]

@@ -172,7 +172,7 @@ def balance(
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
-            iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
+            iteration = iteration._replace(next_m=position_m)
         yield iteration
         if iteration.torque_bound_nm <= plan.torque_bar_nm:
             return

@@ -145,7 +145,7 @@ def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
     uncertain = statistics.get("uncertain", [])
     blocks = [
         verdict(statistics),
-        *([Items(uncertain, "Less certain than required", "bad")] if uncertain else []),
+        Items(uncertain, "Less certain than required", "bad"),
         Facts(
             [("every number of this page", [Cell("balance.json", link="balance.json")])],
             on_terminal=False,
@@ -192,21 +192,29 @@ def verdict(statistics: Record) -> Verdict:
 
 def flight_table(flights: Sequence[Record]) -> Table:
     """One row per flight."""
-    columns = [Column("flight"), Column("frames solved"), Column("greatest tilt", "°", ".1f")]
-    columns += [
+    columns = [
+        Column("flight"),
+        Column("frames solved"),
+        Column("greatest tilt", "°", ".1f"),
         Column("trim masses", "mm"),
         Column("center of mass", "µm"),
         Column("of the simulated vehicle", "µm"),
+        Column("gravity torque", "N m", ".2g"),
+        Column("at most", "N m", ".2g"),
     ]
-    columns += [Column("gravity torque", "N m", ".2g"), Column("at most", "N m", ".2g")]
     rows = []
     for one in flights:
-        trims = ", ".join(f"{place:.3f}" for place in one["trim_mm"])
-        truth = ", ".join(f"{value:.3g}" for value in one["true_offset_um"])
-        flown = [one["flight"], f"{one['solved']} / {one['frames']}", one["tilt_deg"]]
-        rows.append(
-            [*flown, trims, offset_text(one), truth, one["torque_nm"], one["torque_bound_nm"]]
-        )
+        row = [
+            one["flight"],
+            f"{one['solved']} / {one['frames']}",
+            one["tilt_deg"],
+            ", ".join(f"{place:.3f}" for place in one["trim_mm"]),
+            offset_text(one),
+            ", ".join(f"{value:.3g}" for value in one["true_offset_um"]),
+            one["torque_nm"],
+            one["torque_bound_nm"],
+        ]
+        rows.append(row)
     return Table(columns, rows)
 
 

@@ -16,7 +16,7 @@ LEDs are named by the predicted image of the assumed dome at the IMU's attitude,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -52,7 +52,6 @@ from skysim.results.report import Report
 from skysim.results.report_blocks import Column, Figure, Section, Table, Verdict
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.flight import Progress, open_flight
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking import onboard_model
@@ -110,14 +109,14 @@ class Calibration(NamedTuple):
 def assumed(lab: Lab) -> Assumed:
     """What the scene's tracker assumes. Raises InputError for a scene without LEDs."""
     scene = lab.scene
-    if not isinstance(scene.light, DomeConfig):
+    if scene.dome is None:
         raise InputError(
             "light.kind", scene.light.kind, "dome, for a calibration by its LEDs"
         )
     return Assumed(
         scene,
         onboard_model.assumed_camera(scene),
-        onboard_model.assumed_dome(scene, scene.light, lab.camera.sources),
+        onboard_model.assumed_dome(scene, scene.dome, lab.camera.sources),
         onboard_model.assumed_lever(scene, lab.camera.mount),
     )
 
@@ -271,15 +270,10 @@ def calibrated(
     body_m = np.array(
         [body_positions(one.xy_px, camera, known.leds, known.lever) for one in common]
     )
-    lab_m = np.array(
-        [
-            one.body_from_lab.inv().apply(led_m)
-            for one, led_m in zip(common, body_m, strict=True)
-        ]
-    )
+    imu = Rotation.concatenate([one.body_from_lab.inv() for one in common])
+    lab_m = np.array([at.apply(led_m) for at, led_m in zip(imu, body_m, strict=True)])
     stop = np.array([one.stop for one in common])
     first = np.unique(stop, return_index=True)[1]
-    imu = Rotation.concatenate([common[n].body_from_lab.inv() for n in first])
     brightness = np.array([one.brightness for one in common])
     brightest = np.argsort(-brightness[0])[:QUEST_LEDS]
     at_home = unit(lab_m[0, brightest])
@@ -298,7 +292,7 @@ def calibrated(
         body_m,
         lab_m,
         pair_angles_rad(body_m),
-        euler_deg(imu),
+        euler_deg(imu[first]),
         np.array(algorithm_deg),
     )
 
@@ -429,23 +423,19 @@ def calibration_report(
         f" position, {epsilon['separation_arcsec']:.3g}″ of an angle"
     )
     figures = [
-        Figure(png(partial(draw, found), (width_in, height_in)), caption)
-        for draw, width_in, height_in, caption in (
-            (draw_magnitudes, 7.4, 4.2, "Magnitudes by LED, a color for each stop."),
-            (draw_angles, 7.4, 3.2, "Angles of all pairs about the bearing."),
-            (draw_places, 6.0, 4.6, "LEDs in the lab by the IMU, a color for each stop."),
+        Figure(png(partial(draw, found), size_in), caption)
+        for draw, size_in, caption in (
+            (draw_magnitudes, (7.4, 4.2), "Magnitudes by LED, a color for each stop."),
+            (draw_angles, (7.4, 3.2), "Angles of all pairs about the bearing."),
+            (draw_places, (6.0, 4.6), "LEDs in the lab by the IMU, a color for each stop."),
         )
     ]
     magnitude = Column("magnitude", "", ".2f")
     angle = Column("angle", "″", ".1f")
-    by_led = spread_table(
-        [one["led"] for one in numbers["leds"]], "LED", magnitude, numbers["leds"]
-    )
-    ranks = range(1, len(numbers["ranks"]) + 1)
-    by_rank = spread_table(ranks, "rank in the image", magnitude, numbers["ranks"])
-    pairs = spread_table(range(1, len(numbers["pairs"]) + 1), "pair", angle, numbers["pairs"])
-    counts = [one["pairs"] for one in numbers["angles"]]
-    distinct = spread_table(counts, "pairs of one angle", angle, numbers["angles"])
+    by_led = spread_table("led", "LED", magnitude, numbers["leds"])
+    by_rank = spread_table("", "rank in the image", magnitude, numbers["ranks"])
+    pairs = spread_table("", "pair", angle, numbers["pairs"])
+    distinct = spread_table("pairs", "pairs of one angle", angle, numbers["angles"])
     angles = [
         f"{name} {kind}" for kind in ("IMU", "camera") for name in ("roll", "pitch", "yaw")
     ]
@@ -469,15 +459,19 @@ def calibration_report(
     return Report(title, [Verdict(text), *figures, *sections], command)
 
 
-def spread_table(keys: Iterable[int], name: str, value: Column, rows: list[Record]) -> Table:
-    """Mean and deviation of the rows of `statistics`, over all frames, and the mean at each stop."""
+def spread_table(key: str, name: str, value: Column, rows: list[Record]) -> Table:
+    """Mean and deviation of the rows of `statistics`, over all frames, and the mean at each stop.
+
+    The first column has the row's value of `key`, or its number.
+    """
     stops = max((len(one["stops"]) for one in rows), default=0)
     columns = [Column(name), value, value._replace(title="deviation", format=".2f")]
     columns += [value._replace(title=f"stop {n + 1}") for n in range(stops)]
     cells = [
-        [one["mean"], one["sd"], *(stop["mean"] for stop in one["stops"])] for one in rows
+        [one.get(key, n), one["mean"], one["sd"], *(stop["mean"] for stop in one["stops"])]
+        for n, one in enumerate(rows, 1)
     ]
-    return Table(columns, [[key, *line] for key, line in zip(keys, cells, strict=True)])
+    return Table(columns, cells)
 
 
 def write_results(
@@ -517,9 +511,9 @@ def catalog_map(known: Assumed, found: Calibration) -> DomeMap:
     )
 
 
-def by_stop(found: Calibration, values: Floats) -> Iterable[tuple[int, Floats]]:
-    """The values of each stop's frames; stops count from 0 as in the tables."""
-    return enumerate(values[found.stop == n] for n in np.unique(found.stop))
+def by_stop(found: Calibration, values: Floats) -> list[Floats]:
+    """The values of each stop's frames."""
+    return [values[found.stop == n] for n in np.unique(found.stop)]
 
 
 def draw_magnitudes(found: Calibration, fig: Any) -> None:
@@ -527,10 +521,9 @@ def draw_magnitudes(found: Calibration, fig: Any) -> None:
     order = np.argsort(-found.magnitude.mean(axis=0), kind="stable")
     axes = fig.subplots(-(-len(order) // 3), 3, squeeze=False).ravel()
     for one, led in zip(axes, order, strict=False):
-        values = [part for _, part in by_stop(found, found.magnitude[:, led])]
-        one.hist(
-            values, 20, stacked=True, color=[INK[n % len(INK)] for n in range(len(values))]
-        )
+        values = by_stop(found, found.magnitude[:, led])
+        colors = [INK[n % len(INK)] for n in range(len(values))]
+        one.hist(values, 20, stacked=True, color=colors)
         one.set_title(f"LED {found.led[led]}", fontsize=8)
     for one in axes[len(order) :]:
         one.set_axis_off()
@@ -546,7 +539,7 @@ def draw_angles(found: Calibration, fig: Any) -> None:
 def draw_places(found: Calibration, fig: Any) -> None:
     """X and Y of the LEDs in the lab (Fig. 79); a bump of the IMU moves a stop's pattern."""
     axes = fig.subplots()
-    for n, lab_m in by_stop(found, found.lab_m):
+    for n, lab_m in enumerate(by_stop(found, found.lab_m)):
         x_mm, y_mm, _ = 1e3 * lab_m.mean(axis=0).T
         axes.plot(x_mm, y_mm, "o", color=INK[n % len(INK)], label=f"stop {n + 1}", alpha=0.8)
     axes.set(xlabel="X (mm)", ylabel="Y (mm)", aspect="equal")

@@ -105,14 +105,12 @@ def compare_frames(
     for shot in flight.shots(cameras=[0], solves=False, progress=progress):
         rows = {}
         for name in order:
-            if shot.frame.index == 0 and not isinstance(
-                estimators[name], factory.UserTracker
-            ):
-                factory.solve_frame(
-                    estimators[name], shot.frame
-                )  # so that it is compiled before it is timed
+            tracker = estimators[name]
+            if shot.frame.index == 0 and not isinstance(tracker, factory.UserTracker):
+                # So that it is compiled before it is timed.
+                factory.solve_frame(tracker, shot.frame)
             report = shot.report if name == closed_loop_tracker else None
-            report = report or factory.solve_frame(estimators[name], shot.frame)
+            report = report or factory.solve_frame(tracker, shot.frame)
             rows[name] = scoring.row(lab.camera, shot.frame, shot.truth, report)
         yield shot.frame, shot.truth, rows
         order.append(order.pop(0))
@@ -163,13 +161,9 @@ def write_scores(
             folder / f"solutions.{name}.ecsv",
             scoring.table(tracker_rows, scoring.angle_names(scene)),
         )
-    score_rows = as_dicts(scores)
-    columns = {
-        name: [row[name] for row in score_rows]
-        for name in score_rows[0]
-        if name != "refusals"
-    }
-    files.write_table(folder / "scoreboard.ecsv", Table(columns))
+    board = Table(as_dicts(scores))
+    del board["refusals"]
+    files.write_table(folder / "scoreboard.ecsv", board)
     return scores
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from skysim.core.types import Record
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.frame_files import read_stack
-from skysim.experiments.characterize.night_sky import LENS, ImageSize, Night, lens_estimates
+from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     CURVATURE,
@@ -57,21 +58,12 @@ def characterize_report(
     night: Night | None,
 ) -> Report:
     """The report of a characterized camera from the numbers of `characterize.json`."""
-    figures = [
-        Figure(
-            png(lambda fig: draw_transfer(fig.subplots(1, 2), found), SIZE_IN), TRANSFER_TEXT
-        )
-    ]
-    if dark := found.dark:
-        figures.append(
-            Figure(png(lambda fig: draw_dark(fig.subplots(), dark), SIZE_IN), DARK_TEXT)
-        )
+    drawn = [(partial(draw_transfer, found), TRANSFER_TEXT)]
+    if found.dark:
+        drawn.append((partial(draw_dark, found.dark), DARK_TEXT))
     if night:
-        figures.append(
-            Figure(
-                png(lambda fig: draw_size(fig.subplots(), config, night), SIZE_IN), SIZE_TEXT
-            )
-        )
+        drawn.append((partial(draw_size, config, night), SIZE_TEXT))
+    figures = [Figure(png(draw, SIZE_IN), text) for draw, text in drawn]
     values = value_table(statistics)
     blocks = [
         verdict(statistics, len(values.rows)),
@@ -93,7 +85,6 @@ def verdict(statistics: Record, values: int) -> Verdict:
 def facts(statistics: Record) -> Facts:
     """The preset, and the conditions of the values."""
     celsius = statistics["temperature_c"]
-    night = statistics["night"]
     rows = [
         ("for camera.preset", [statistics["preset"]]),
         (
@@ -107,10 +98,9 @@ def facts(statistics: Record) -> Facts:
         ("flicker of the lamp", [f"{100 * statistics['flicker']:.2g} %"]),
         ("drift between flats", [f"{100 * statistics['drift']:.2g} %"]),
     ]
-    if night:
-        residuals = (
-            "" if night["rms_px"] is None else f", residuals {night['rms_px']:.2g} px rms"
-        )
+    if night := statistics["night"]:
+        rms_px = night["rms_px"]
+        residuals = "" if rms_px is None else f", residuals {rms_px:.2g} px rms"
         stars = f"{night['stars']} star images in {night['frames']} frames"
         rows.append(
             ("night", [f"{stars}, of which {night['identified']} were identified{residuals}"])
@@ -122,11 +112,9 @@ def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
     columns = [text_column("what"), Column("measured"), Column("95 %")]
     columns += [Column("file", format=".5g"), text_column("unit")]
-    values = statistics["values"] + (
-        statistics["night"]["values"] if statistics["night"] else []
-    )
+    night = statistics["night"]
     rows = []
-    for row in values:
+    for row in statistics["values"] + (night["values"] if night else []):
         low, high = row["low"], row["high"]
         value = Cell(f"{row['value']:.{interval_digits(low, high)}g}", key=row["value"])
         rows.append([row["what"], value, interval_text(low, high), row["file"], row["unit"]])
@@ -148,10 +136,10 @@ SIZE_TEXT = (
 )
 
 
-def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
+def draw_transfer(found: MeasuredSensor, fig: Any) -> None:
     """Variance against mean, and the linearity."""
     transfer = found.transfer
-    (curve, line) = axes
+    curve, line = fig.subplots(1, 2)
     black = transfer.values[BLACK]
     curvature = transfer.values[CURVATURE]
     fitted = transfer.points
@@ -189,8 +177,9 @@ def draw_transfer(axes: Any, found: MeasuredSensor) -> None:
     )
 
 
-def draw_dark(axes: Any, dark: DarkCurrent) -> None:
+def draw_dark(dark: DarkCurrent, fig: Any) -> None:
     """Density of the dark rates of all pixels, hot ones included: measured and expected."""
+    axes = fig.subplots()
     width = np.diff(dark.edges)
     measured = dark.counts[1:-1] / width
     expected = dark.expected[1:-1] / width
@@ -203,9 +192,10 @@ def draw_dark(axes: Any, dark: DarkCurrent) -> None:
     axes.legend()
 
 
-def draw_size(axes: Any, config: CameraConfig, night: Night) -> None:
+def draw_size(config: CameraConfig, night: Night, fig: Any) -> None:
     """Standard deviation of the images against the distance from the principal point."""
-    size: ImageSize = night.size
+    axes = fig.subplots()
+    size = night.size
     center_px = night.lens.camera.center_px if night.lens else config.center_px
     rho = np.linalg.norm(size.used.xy_px - np.array(center_px), axis=1) / config.corner_px
     sigma_px = np.sqrt(size.used.variance_px2)
@@ -260,9 +250,9 @@ def measured(sensor: MeasuredSensor) -> Stated:
         f"detector.{key}": stated(one._replace(value=max(one.value, 0.0)))
         for key, one in sensor.estimates.items()
     }
-    if sensor.dark_temperature_c is not None:
-        celsius = rounded(sensor.dark_temperature_c)
-        found["detector.dark_temperature_c"] = (celsius, "[M] of the darks")
+    celsius = sensor.dark_temperature_c
+    if celsius is not None:
+        found["detector.dark_temperature_c"] = (rounded(celsius), "[M] of the darks")
     else:
         why = "the darks' temperature is unknown: dark_e_s is at it"
         found["detector.temperature_c"] = (None, why)
@@ -319,21 +309,17 @@ def lines(camera: Record, found: Stated) -> Iterator[SheetLine]:
     for key, (value, _) in found.items():
         section, _, last = key.rpartition(".")
         (tree.setdefault(section, {}) if section else tree)[last] = value
-    yield from section_lines(tree, "", {key: source for key, (_, source) in found.items()})
+    yield from section_lines(tree, "", found)
 
 
-def section_lines(
-    section: Record, prefix: str, sources: Mapping[str, str]
-) -> Iterator[SheetLine]:
+def section_lines(section: Record, prefix: str, found: Stated) -> Iterator[SheetLine]:
     """The lines of a section: its values, then its subsections."""
-    for key, value in section.items():
-        if not isinstance(value, dict):
-            yield SheetLine(
-                prefix + key, value, sources.get(prefix + key, "of the camera's file")
-            )
-    for key, value in section.items():
+    for key, value in sorted(section.items(), key=lambda item: isinstance(item[1], dict)):
         if isinstance(value, dict):
-            yield from section_lines(value, f"{prefix}{key}.", sources)
+            yield from section_lines(value, f"{prefix}{key}.", found)
+        else:
+            _, source = found.get(prefix + key, (value, "of the camera's file"))
+            yield SheetLine(prefix + key, value, source)
 
 
 UNITS = {

@@ -247,18 +247,13 @@ def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
 ORDER = 4  # total order of the polynomial that models the light over the chip
 SAMPLE = 8  # rows and columns of a block, for the fit of the polynomial
 
-# (H, W) signal at exposure 0 in DN, (H, W) rate in DN/s, (L,) weights of the levels in the rate.
+# (2, H, W) signal at exposure 0 in DN and rate in DN/s, of the two halves of the frames; (L,) weights of the levels in
+# the rate.
 Planes = tuple[Floats, Floats, Floats]
 
 
-def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes:
-    """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature.
-
-    Parameters
-    ----------
-    half
-        first_dn or second_dn
-    """
+def dark_planes(darks: Sequence[Level], transfer: Transfer) -> Planes:
+    """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature."""
     times = exposures_s(darks)
     every = np.ones(darks[0].first_dn.shape, bool)
     weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
@@ -267,66 +262,52 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer, half: str) -> Planes
     spread = weight @ (times - middle) ** 2
     slopes = weight * (times - middle) / spread
     at_zero = weight - slopes * middle
-    base = np.zeros(darks[0].first_dn.shape)
-    rate = np.zeros(darks[0].first_dn.shape)
+    base = np.zeros((2, *every.shape))
+    rate = np.zeros((2, *every.shape))
     for one, by_slope, by_zero in zip(darks, slopes, at_zero, strict=True):
-        frame = transfer.linear_dn(getattr(one, half) - transfer.values[BLACK])
+        frame = transfer.linear_dn(one.halves_dn - transfer.values[BLACK])
         base += by_zero * frame
         rate += by_slope * frame
     return base, rate, slopes
 
 
-def column_offset(first: Floats, second: Floats, usable: Bools, gain_e_dn: float) -> Estimate:
-    """Standard deviation of the columns' black levels, in electrons, from the two dark frames at exposure 0."""
-    count = np.maximum(usable.sum(axis=0), 1)
-    means = [np.where(usable, one, 0.0).sum(axis=0) / count for one in (first, second)]
-    a, b = (one - one.mean() for one in means)
+def column_offset(base: Floats, usable: Bools, gain_e_dn: float) -> Estimate:
+    """Standard deviation of the columns' black levels, in electrons, from the (2, H, W) darks at exposure 0."""
+    means = np.where(usable, base, 0.0).sum(axis=1) / np.maximum(usable.sum(axis=0), 1)
+    a, b = means - means.mean(axis=1, keepdims=True)
     columns = len(a)
     product = a * b * columns / (columns - 1)
     variance = gain_e_dn**2 * product.mean()
     sigma = gain_e_dn**2 * product.std() / np.sqrt(columns)
     if variance > 3 * sigma:
-        return Estimate.lognormal(math.sqrt(variance), float(sigma / (2 * np.sqrt(variance))))
-    return Estimate.root(float(variance), float(sigma))
+        return Estimate.lognormal(math.sqrt(variance), sigma / (2 * math.sqrt(variance)))
+    return Estimate.root(variance, sigma)
 
 
 def prnu(
-    flats: Sequence[Level],
-    transfer: Transfer,
-    first: Planes,
-    second: Planes,
-    dark_ratio: float,
-    usable: Bools,
+    flats: Sequence[Level], transfer: Transfer, dark: Planes, dark_ratio: float, usable: Bools
 ) -> Estimate:
     """Relative standard deviation of the sensitivity, from the rate of every pixel in the light.
+
+    The rate, in DN/s without black level and dark, is by weighted least squares through 0.
 
     Parameters
     ----------
     dark_ratio
         Ratio of the dark currents at the temperatures of the flats and of the darks
     """
-    first_rate = light_rate(flats, transfer, "first_dn", first, dark_ratio)
-    second_rate = light_rate(flats, transfer, "second_dn", second, dark_ratio)
-    trend = smooth((first_rate + second_rate) / 2, usable)[usable]
-    a = first_rate[usable] / trend - 1
-    b = second_rate[usable] / trend - 1
-    product = (a - a.mean()) * (b - b.mean())
-    return Estimate.root(float(product.mean()), float(product.std() / np.sqrt(product.size)))
-
-
-def light_rate(
-    flats: Sequence[Level], transfer: Transfer, half: str, dark: Planes, dark_ratio: float
-) -> Floats:
-    """Rate of every pixel in the light, DN/s, by weighted least squares through 0, without black level and dark."""
-    base, rate, _ = dark
+    base, dark_rate, _ = dark
     times = exposures_s(flats)
     weight = np.array([one.count / one.variance_dn2.mean(dtype=np.float64) for one in flats])
     weight = weight * times / np.sum(weight * times**2)
-    total = np.zeros(base.shape)
+    rate = np.zeros(base.shape)
     for one, by in zip(flats, weight, strict=True):
-        signal = transfer.linear_dn(getattr(one, half) - transfer.values[BLACK] - base)
-        total += by * (signal - dark_ratio * one.exposure_s * rate)
-    return total
+        signal = transfer.linear_dn(one.halves_dn - transfer.values[BLACK] - base)
+        rate += by * (signal - dark_ratio * one.exposure_s * dark_rate)
+    trend = smooth(rate.mean(axis=0), usable)[usable]
+    a, b = rate[:, usable] / trend - 1
+    product = (a - a.mean()) * (b - b.mean())
+    return Estimate.root(product.mean(), product.std() / math.sqrt(product.size))
 
 
 def smooth(image: Floats, usable: Bools) -> Floats:

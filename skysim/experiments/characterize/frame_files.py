@@ -30,6 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
     LevelBuilder,
+    exposures_s,
     median_and_spread,
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
@@ -71,17 +72,12 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
     """The frames of a folder. Raises InputError for a frame that cannot be used."""
     tables: dict[Path, dict[str, Setting]] = {}
     for path in image_files(folder):
-        parent = path.parent
-        if parent not in tables:
-            tables[parent] = (
-                read_settings(parent / TABLE) if (parent / TABLE).exists() else {}
-            )
+        table = path.parent / TABLE
+        if table not in tables:
+            tables[table] = read_settings(table) if table.exists() else {}
         picture = images.read_picture(path)
-        yield (
-            path,
-            setting_of(path, folder, picture, tables[parent]),
-            raw_numbers(path, picture),
-        )
+        setting = frame_setting(path, folder, picture, tables[table])
+        yield path, setting, raw_numbers(path, picture)
 
 
 def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
@@ -100,7 +96,7 @@ def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
     return pixels.astype(np.uint16)
 
 
-def setting_of(
+def frame_setting(
     path: Path, root: Path, picture: images.ViewedImage, table: dict[str, Setting]
 ) -> Setting:
     """Exposure and temperature of a frame. Raises InputError without an exposure."""
@@ -112,19 +108,11 @@ def setting_of(
     ]
     exposure_s = picture.exposure_s
     temperature_c = picture.temperature_c
-    if exposure_s is None:
-        exposure_s = next(
-            (
-                float(hit[1]) * UNITS_S[hit[2]]
-                for name in names
-                if (hit := EXPOSURE.search(name))
-            ),
-            None,
-        )
-    if temperature_c is None:
-        temperature_c = next(
-            (float(hit[1]) for name in names if (hit := TEMPERATURE.search(name))), None
-        )
+    for name in names:
+        if exposure_s is None and (hit := EXPOSURE.search(name)):
+            exposure_s = float(hit[1]) * UNITS_S[hit[2]]
+        if temperature_c is None and (hit := TEMPERATURE.search(name)):
+            temperature_c = float(hit[1])
     if exposure_s is None or exposure_s < 0:
         raise InputError(
             path,
@@ -177,10 +165,8 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
         builders.setdefault(setting, LevelBuilder()).add(numbers)
         stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
     check_settings(stack, builders)
-    for setting in sorted(
-        builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0)
-    ):
-        stack.levels.append(builders[setting].level(*setting))
+    order = sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
+    stack.levels += [builders[setting].level(*setting) for setting in order]
     return stack
 
 
@@ -327,15 +313,15 @@ POLYPLETS = 110
 
 def check_darks(darks: Stack) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
-    for setting, medians in darks.medians.items():
-        level = level_of(darks, setting)
+    for level in darks.levels:
+        medians = darks.medians[setting_of(level)]
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
         middle = float(np.median([median for median, _ in medians]))
         worst, path = max(medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
                 path,
-                f"not dark: median {worst:g} DN, the other frames of {describe(setting)} {middle:g} DN",
+                f"not dark: median {worst:g} DN, the other frames of {describe(setting_of(level))} {middle:g} DN",
                 "darks with the lens capped",
             )
     for level in darks.levels:
@@ -350,17 +336,15 @@ def check_darks(darks: Stack) -> None:
         )
 
 
-def level_of(stack: Stack, setting: Setting) -> Level:
-    """The level of a setting."""
-    return next(
-        one for one in stack.levels if Setting(one.exposure_s, one.temperature_c) == setting
-    )
+def setting_of(level: Level) -> Setting:
+    """The setting of a level."""
+    return Setting(level.exposure_s, level.temperature_c)
 
 
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
     folder = darks.folder
-    which = f"the darks of {describe(Setting(level.exposure_s, level.temperature_c))}"
+    which = f"the darks of {describe(setting_of(level))}"
     mean = level.mean_dn
     noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
     zeros = float(np.mean(mean < 1))
@@ -405,7 +389,7 @@ def check_dark(darks: Stack, level: Level) -> None:
 def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
     """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
     signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
-    times = np.array([one.exposure_s for one in flats.levels])
+    times = exposures_s(flats.levels)
     top = signals.max()
     below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
@@ -424,7 +408,7 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
             f" {0.6 * longest:.2g} s",
         )
     for one, signal in zip(flats.levels, signals, strict=True):
-        which = f"the flats of {describe(Setting(one.exposure_s, one.temperature_c))}"
+        which = f"the flats of {describe(setting_of(one))}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
                 flats.folder,

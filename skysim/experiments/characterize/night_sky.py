@@ -105,10 +105,8 @@ def integrals(center: Floats, ln_sigma: Floats) -> tuple[Floats, Floats, Floats]
 
 def model(p: Floats) -> tuple[Floats, Floats]:
     """(N, M) pixels, and (N, M, 6) their slopes, of images with the parameters p (N, 6)."""
-    (gx, dx, wx), (gy, dy, wy) = (
-        integrals(p[:, X], p[:, LN_SX]),
-        integrals(p[:, Y], p[:, LN_SY]),
-    )
+    gx, dx, wx = integrals(p[:, X], p[:, LN_SX])
+    gy, dy, wy = integrals(p[:, Y], p[:, LN_SY])
 
     def plane(by_y: Floats, by_x: Floats) -> Floats:
         return (by_y[:, :, None] * by_x[:, None, :]).reshape(len(p), -1)
@@ -227,8 +225,8 @@ def image_size(
     sigma2, corner2 = np.sqrt(np.diag(normal) * scatter)
     used = stars.take(kept)
     return ImageSize(
-        Estimate.root(float(found[0]), float(sigma2)),
-        Estimate.root(float(found[1]), float(corner2)),
+        Estimate.root(found[0], sigma2),
+        Estimate.root(found[1], corner2),
         used,
         len(rho2) - int(kept.sum()),
     )
@@ -273,7 +271,12 @@ def measure_night(
 ) -> Night:
     """The lens from frames of the sky. Raises InputError for frames that cannot be used."""
     paths = image_files(folder)
-    frames = [read_frame(path, config, transfer, saturation_dn) for path in paths]
+    settings = Settings(
+        gain_e_dn=float(1 / transfer.values[GAIN]),
+        saturation=saturation_dn,
+        centroid_sigma_px=0.02,
+    )
+    frames = [read_frame(path, config, transfer, settings) for path in paths]
     stars = all_stars(frames)
     if len(stars.chi2) < LEAST_STARS:
         raise InputError(
@@ -283,10 +286,10 @@ def measure_night(
             f"{LEAST_STARS} or more: more frames, or longer exposures",
         )
     check_trails(frames)
-    lens, remarks = find_lens(config, frames, transfer, saturation_dn)
+    lens, remarks = find_lens(config, frames, settings)
     if lens is None and not all(one.row_order_known for one in frames):
-        frames = [read_frame(path, config, transfer, saturation_dn, True) for path in paths]
-        lens, found = find_lens(config, frames, transfer, saturation_dn)
+        frames = [read_frame(path, config, transfer, settings, True) for path in paths]
+        lens, found = find_lens(config, frames, settings)
         if lens:
             stars = all_stars(frames)
             remarks = [f"rows: {images.ASSUMED_TOP_DOWN}", *found]
@@ -314,7 +317,7 @@ def read_frame(
     path: Path,
     config: CameraConfig,
     transfer: Transfer,
-    saturation_dn: float,
+    settings: Settings,
     as_stored: bool = False,
 ) -> NightFrame:
     """Detect and fit the stars of a frame. Raises InputError for a frame of another camera.
@@ -328,30 +331,18 @@ def read_frame(
     images.check_size(path, numbers, (config.height_px, config.width_px))
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
     try:
-        centroids = detect_and_centroid(
-            numbers, calibration(config), settings_of(transfer, saturation_dn), Clock()
-        )
+        centroids = detect_and_centroid(numbers, calibration(config), settings, Clock())
     except ImageError as error:
         raise InputError(path, error) from None
     signal = transfer.linear_dn(numbers - transfer.values[BLACK])
-    chosen = measurable(numbers, centroids, transfer, saturation_dn)
-    gain = float(transfer.values[GAIN])
-    read = float(transfer.values[READ])
+    chosen = measurable(numbers, centroids, transfer, settings.saturation)
+    gain, _, read = transfer.values[: READ + 1].tolist()
     return NightFrame(
         path,
         centroids,
         fit_images(signal, chosen, gain, read),
         picture.date_utc,
         picture.row_order_known,
-    )
-
-
-def settings_of(transfer: Transfer, saturation_dn: float) -> Settings:
-    """Settings of the tracker for this camera."""
-    return Settings(
-        gain_e_dn=float(1 / transfer.values[GAIN]),
-        saturation=saturation_dn,
-        centroid_sigma_px=0.02,
     )
 
 
@@ -368,10 +359,9 @@ def measurable(
     x, y = np.rint(xy).astype(int).T
     background = float(np.median(numbers))
     peak = numbers[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
-    dark_e2 = (background - transfer.values[BLACK]) / transfer.values[GAIN] + transfer.values[
-        READ
-    ] / transfer.values[GAIN] ** 2
-    flux_e = centroids.flux / transfer.values[GAIN]
+    gain, _, read, black = transfer.values[: BLACK + 1]
+    dark_e2 = (background - black) / gain + read / gain**2
+    flux_e = centroids.flux / gain
     snr = flux_e / np.sqrt(np.maximum(flux_e + 12 * max(dark_e2, 0.0), 1.0))
     kept = (
         inside
@@ -422,7 +412,7 @@ def check_trails(frames: list[NightFrame]) -> None:
 
 
 def find_lens(
-    config: CameraConfig, frames: list[NightFrame], transfer: Transfer, saturation_dn: float
+    config: CameraConfig, frames: list[NightFrame], settings: Settings
 ) -> tuple[Calibration | None, list[str]]:
     """The lens from identified stars, starting at the focal length in the camera's file; or why it is unknown."""
     if len(frames) < LEAST_FRAMES:
@@ -431,7 +421,6 @@ def find_lens(
             f"focal length, distortion: {len(frames)} frames of the night; allowed: {lacking} more elsewhere"
         ]
     camera = calibration(config)
-    settings = settings_of(transfer, saturation_dn)
     stars = onboard_catalog("characterize.night", CATALOG)
     narrow_sr = (
         config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2

@@ -74,7 +74,8 @@ class Estimate(NamedTuple):
         low, high = (
             math.sqrt(max(variance + sign * SIGMAS * sigma, 0.0)) for sign in (-1, 1)
         )
-        return cls(value, sigma / (2 * value) if value else high / SIGMAS, low, high)
+        error = float(sigma) / (2 * value) if value else high / SIGMAS
+        return cls(value, error, low, high)
 
 
 DIGITS = 5  # significant digits of an interval, or so many that its width has two
@@ -105,10 +106,11 @@ def slopes(function: Callable[[Floats], Any], at: Floats, step: Floats) -> Float
 
 def propagate(
     function: Callable[[Floats], float], at: Floats, covariance: Floats
-) -> tuple[float, float]:
-    """Value and standard error of a function of parameters, by central differences."""
+) -> Estimate:
+    """The normal estimate of a function of parameters, by central differences."""
     slope = slopes(function, at, STEP * np.sqrt(np.diag(covariance)))
-    return float(function(at)), math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+    sigma = math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+    return Estimate.normal(function(at), sigma)
 
 
 def median_and_spread(values: Floats) -> tuple[float, float]:
@@ -162,9 +164,14 @@ class Level:
     greatest_dn: int
 
     @property
+    def halves_dn(self) -> NDArray[np.float32]:
+        """(2, H, W) means of the first and of the second frames of the pairs."""
+        return np.stack([self.first_dn, self.second_dn])
+
+    @property
     def mean_dn(self) -> Floats:
         """(H, W) mean of all frames."""
-        return (self.first_dn.astype(np.float64) + self.second_dn) / 2
+        return np.asarray(self.halves_dn.mean(axis=0, dtype=np.float64))
 
     def moments(self, used: Bools) -> Moments:
         """Mean and variance over the used pixels.
@@ -172,12 +179,8 @@ class Level:
         Standard errors are empirical, from the scatter of the pixels' variances, since hot pixels have more noise.
         """
         variance = self.variance_dn2[used].astype(np.float64)
-        mean = (
-            self.first_dn[used].mean(dtype=np.float64)
-            + self.second_dn[used].mean(dtype=np.float64)
-        ) / 2
         return Moments(
-            float(mean),
+            float(self.halves_dn[:, used].mean(dtype=np.float64)),
             math.sqrt(variance.mean() / self.count / variance.size),
             float(variance.mean()),
             float(variance.std() / np.sqrt(variance.size)),
@@ -220,11 +223,16 @@ class LevelBuilder:
             total / np.float32(divisor)
             for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
         )
-        drift_dn2 = self.difference_dn2 / pairs
         return Level(
-            *(exposure_s, temperature_c, 2 * pairs),
-            *(first, second, squares),
-            *(drift_dn2, self.least_dn, self.greatest_dn),
+            exposure_s,
+            temperature_c,
+            2 * pairs,
+            first,
+            second,
+            squares,
+            self.difference_dn2 / pairs,
+            self.least_dn,
+            self.greatest_dn,
         )
 
 
@@ -301,17 +309,13 @@ class Transfer(NamedTuple):
 
     @property
     def gain_e_dn(self) -> Estimate:
-        return Estimate.normal(
-            *propagate(lambda p: 1 / p[GAIN], self.values, self.covariance)
-        )
+        return propagate(lambda p: 1 / p[GAIN], self.values, self.covariance)
 
     @property
     def read_noise_e(self) -> Estimate:
         """Read noise of the sensor alone, without rounding."""
-        variance, sigma = propagate(
-            lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance
-        )
-        return Estimate.root(variance, sigma)
+        found = propagate(lambda p: p[READ] / p[GAIN] ** 2, self.values, self.covariance)
+        return Estimate.root(found.value, found.sigma)
 
     @property
     def offset_dn(self) -> Estimate:
@@ -419,8 +423,7 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
         mean[brightest] - mean[darkest], 1e-9
     )
     black = mean[darkest]
-    temperatures = 1 + max(one.dark for one in points)
-    rates = [0.0] * temperatures
+    rates = [0.0] * (1 + max(one.dark for one in points))
     for one in points:
         if not one.lit:
             rates[one.dark] = max(
@@ -432,17 +435,17 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
     )
 
 
-def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> list[bool]:
-    """Whether the signal of each flat is at most FIT_RANGE of the greatest."""
-    top = max(one.moments.mean_dn for one in points) - black_dn
-    return [one.moments.mean_dn - black_dn <= FIT_RANGE * top for one in points]
+def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> Bools:
+    """(L,) whether the signal of each flat is at most FIT_RANGE of the greatest."""
+    signal = by_level(points, "mean_dn") - black_dn
+    return signal <= FIT_RANGE * signal.max()
 
 
-def saturated(points: Sequence[TransferPoint]) -> list[bool]:
-    """Whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
+def saturated(points: Sequence[TransferPoint]) -> Bools:
+    """(L,) whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
     variance = by_level(points, "variance_dn2")
     brighter = exposures_s(points) > points[int(np.argmax(variance))].exposure_s
-    return [bool(one) for one in brighter & (variance < COLLAPSED * variance.max())]
+    return brighter & (variance < COLLAPSED * variance.max())
 
 
 def lamp_flicker(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -79,43 +80,23 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         key=lambda one: -math.inf if one is None else one,
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
-    dark_points = [
-        TransferPoint(
-            one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable)
-        )
-        for one in darks
-    ]
     flat_points = [
         TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats
     ]
-    black_dn = min(point.moments.mean_dn for point in dark_points)
-    below = photon_transfer.unsaturated(flat_points, black_dn)
-    fitted = [one for one, is_below in zip(flats, below, strict=True) if is_below]
-    lit = [one for one, is_below in zip(flat_points, below, strict=True) if is_below]
-    changes = [one.difference_dn2 for one in fitted]
-    transfer = photon_transfer.fit(
-        [*dark_points, *lit],
-        photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum())),
-    )
-    found = Findings(transfer, {}, [])
-    found.estimates["gain_e_dn"] = transfer.gain_e_dn
-    found.estimates["read_noise_e"] = transfer.read_noise_e
+    transfer, fitted = fitted_transfer(darks, flats, temperatures, flat_points, usable)
+    estimates = {"gain_e_dn": transfer.gain_e_dn, "read_noise_e": transfer.read_noise_e}
+    found = Findings(transfer, estimates, [])
     full_well(found, flat_points)
     chosen = best_temperature(temperatures, darks, transfer, own)
     at_it = [one for one in darks if one.temperature_c == temperatures[chosen]]
-    first, second = (
-        fixed_pattern.dark_planes(at_it, transfer, half) for half in ("first_dn", "second_dn")
-    )
+    planes = fixed_pattern.dark_planes(at_it, transfer)
     rates = transfer.values[FIRST_DARK:]
     # Of the dark currents of the same pixels at the two temperatures.
     ratio = 1.0 if own == chosen else float(max(rates[own], 0.0) / max(rates[chosen], 1e-12))
-    dark = dark_parameters(found, at_it, first, second, own, ratio)
+    dark = dark_parameters(found, at_it, planes, own, ratio)
     doubling(found, temperatures)
-    estimates = found.estimates
-    estimates["prnu"] = fixed_pattern.prnu(fitted, transfer, first, second, ratio, usable)
-    columns = fixed_pattern.column_offset(
-        first[0], second[0], usable, 1 / transfer.values[GAIN]
-    )
+    estimates["prnu"] = fixed_pattern.prnu(fitted, transfer, planes, ratio, usable)
+    columns = fixed_pattern.column_offset(planes[0], usable, 1 / transfer.values[GAIN])
     estimates["column_offset_e"] = columns
     # The columns are a sample: the mean of as many columns of another chip differs by their scatter.
     scatter_dn = columns.value * transfer.values[GAIN] / math.sqrt(usable.shape[1])
@@ -126,8 +107,6 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
             f"lamp: the flats scatter by {100 * transfer.drift:.2g} % about the law, more than the frames of a pair"
             " differ; drift and a nonlinearity of another law look alike; allowed: a steadier lamp, or more flats"
         )
-    error = linearity_error(flat_points, transfer)
-    saturation_dn = float(by_level(flat_points, "mean_dn").max())
     return MeasuredSensor(
         estimates,
         found.remarks,
@@ -135,9 +114,32 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
         dark,
         temperatures[own],
         flat_points,
-        error,
-        saturation_dn,
+        linearity_error(flat_points, transfer),
+        float(by_level(flat_points, "mean_dn").max()),
     )
+
+
+def fitted_transfer(
+    darks: Sequence[Level],
+    flats: Sequence[Level],
+    temperatures: Sequence[float | None],
+    flat_points: Sequence[TransferPoint],
+    usable: Bools,
+) -> tuple[Transfer, list[Level]]:
+    """The photon transfer of all darks and of the flats below saturation, and these flats."""
+    dark_points = [
+        TransferPoint(
+            one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable)
+        )
+        for one in darks
+    ]
+    black_dn = min(point.moments.mean_dn for point in dark_points)
+    below = photon_transfer.unsaturated(flat_points, black_dn)
+    fitted = list(compress(flats, below))
+    lit = list(compress(flat_points, below))
+    changes = [one.difference_dn2 for one in fitted]
+    flicker = photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum()))
+    return photon_transfer.fit([*dark_points, *lit], flicker), fitted
 
 
 def usable_pixels(darks: Sequence[Level]) -> Bools:
@@ -200,8 +202,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
     signal there, c x of the fit.
     """
     transfer = found.transfer
-    is_full = photon_transfer.saturated(flats)
-    full = [one for one, chosen in zip(flats, is_full, strict=True) if chosen]
+    full = list(compress(flats, photon_transfer.saturated(flats)))
     brightest = max(flats, key=lambda one: one.moments.mean_dn)
     if full:
         level_dn = float(by_level(full, "mean_dn").mean())
@@ -223,15 +224,13 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 
     well = propagate(lambda p: signal(p) / p[GAIN], values, covariance)
     missing = propagate(lambda p: p[CURVATURE] * signal(p), values, covariance)
-    found.estimates["full_well_e"] = Estimate.normal(*well)
-    found.estimates["nonlinearity"] = Estimate.normal(*missing)
+    found.estimates.update({"full_well_e": well, "nonlinearity": missing})
 
 
 def dark_parameters(
     found: Findings,
     darks: Sequence[Level],
-    first: Planes,
-    second: Planes,
+    planes: Planes,
     own: int,
     ratio: float,
 ) -> DarkCurrent | None:
@@ -245,15 +244,15 @@ def dark_parameters(
         Dark current at that temperature over the dark current of these darks
     """
     transfer = found.transfer
-    weights = first[2]
+    _, pixel_rates, weights = planes
     gain = transfer.values[GAIN]
     read = transfer.values[READ] + ROUNDING_DN2
-    steady = np.ones(first[0].shape, bool)
+    steady = np.ones(pixel_rates[0].shape, bool)
     for one in darks:
         steady &= steady_pixels(
             one, read + gain * np.maximum(one.mean_dn - transfer.values[BLACK], 0.0)
         )
-    rates = ((first[1] + second[1]) / 2)[steady]
+    rates = pixel_rates.mean(axis=0)[steady]
     counts = np.array([one.count for one in darks])
     times = exposures_s(darks)
     noise = RateNoise(
@@ -298,10 +297,10 @@ def unresolved(
 ) -> None:
     """Add the mean dark current alone, if its scatter over the pixels is below the noise; remark what it needs."""
     transfer = found.transfer
-    value, sigma = propagate(
+    dark = propagate(
         lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
     )
-    found.estimates["dark_e_s"] = Estimate.normal(value, sigma)
+    found.estimates["dark_e_s"] = dark
     mean = float(np.median(rates))
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
@@ -309,10 +308,10 @@ def unresolved(
         return
     noise_e_s = math.sqrt(noise.reading) / transfer.values[GAIN]
     needed = "much longer exposures"
-    if value > 3 * sigma:
-        needed = f"{longest_s * noise_e_s / value:.2g} s or more"
+    if dark.value > 3 * dark.sigma:
+        needed = f"{longest_s * noise_e_s / dark.value:.2g} s or more"
     found.remarks.append(
-        f"DSNU: the scatter of the dark current, {value:.2g} e-/s, is below the noise of"
+        f"DSNU: the scatter of the dark current, {dark.value:.2g} e-/s, is below the noise of"
         f" {longest_s:g} s; allowed: darks of {needed}"
     )
 

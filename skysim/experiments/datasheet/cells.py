@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,6 @@ from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan, res
 from skysim.experiments.study.study_file import dome_seeds
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 
 MIN_FIELDS = 10  # minimum number of fields in which all frames of the terms are solved
 MODEL_FIELDS = 2 * MIN_FIELDS  # for an error model: each half of them tests that of the other
@@ -131,7 +131,7 @@ class Draw(NamedTuple):
 
 def check_scene(scene: Scene) -> None:
     """Raise InputError for a scene whose tracker gives no attitude for a single frame."""
-    if isinstance(scene.light, CollimatedDisplayConfig):
+    if scene.light.kind == "collimated_display":
         raise InputError("light.kind", "collimated_display has one field only", "stars, dome")
     if scene.tracker.decoder:
         raise InputError(
@@ -210,7 +210,7 @@ class Designer:
         self.seeds = unit_seeds(scene)
         self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
-        self.under_stars = isinstance(scene.light, StarsConfig)
+        self.under_stars = scene.stars is not None
         self.noise = 0
 
     @property
@@ -315,8 +315,8 @@ class Designer:
     def rates(self) -> Iterator[DatasheetCell]:
         """Pairs of frames at each rate, across the boresight and about it."""
         for experiment, streaks_px in (("rate", STREAKS_PX), ("boresight", BORESIGHT_PX)):
-            rates = self.chosen_rates_deg_s or self.rates_deg_s(streaks_px, experiment)
-            for rate in rates:
+            usual = self.rates_deg_s(streaks_px, experiment)
+            for rate in self.chosen_rates_deg_s or usual:
                 yield from self.at_rate(experiment, rate)
 
     def at_rate(self, experiment: str, rate_deg_s: float) -> Iterator[DatasheetCell]:
@@ -324,12 +324,11 @@ class Designer:
         change = {"trial.rate_deg_s": rate_deg_s} | RATES[experiment]
         return self.pair(experiment, "rate_deg_s", rate_deg_s, change)
 
-    def faster(
-        self, experiment: str, cells: Sequence[DatasheetCell]
-    ) -> Iterator[DatasheetCell]:
-        """A pair at twice the greatest rate of an experiment, one of RATES."""
-        rates = [one.levels["rate_deg_s"] for one in cells if one.experiment == experiment]
-        return self.at_rate(experiment, 2 * max(rates))
+    def add_faster(self, cells: list[DatasheetCell], experiments: Iterable[str]) -> None:
+        """Add a pair at twice the greatest rate of each experiment, one of RATES."""
+        for name in experiments:
+            rates = [one.levels["rate_deg_s"] for one in cells if one.experiment == name]
+            cells += self.at_rate(name, 2 * max(rates))
 
     def sequences(self) -> Iterator[DatasheetCell]:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
@@ -418,9 +417,7 @@ class MeasuredFrames:
     def levels(self, experiment: str, name: str) -> list[Any]:
         """The levels of an experiment, in order."""
         return list(
-            dict.fromkeys(
-                cell.levels[name] for cell in self.cells if cell.experiment == experiment
-            )
+            dict.fromkeys(self.cells[row].levels[name] for row in self.rows(experiment))
         )
 
     def column(self, name: str, rows: list[int]) -> NDArray[Any]:
@@ -452,34 +449,6 @@ class MeasuredFrames:
         return np.where(self.right(rows), errors, np.nan)
 
 
-def study_tree(
-    scene_name: str,
-    scene: Scene,
-    overrides: Mapping[str, str],
-    size: Size,
-    cells: list[DatasheetCell],
-) -> Record:
-    """The study file of the cells."""
-    settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
-    return {
-        "schema": 1,
-        "title": f"Datasheet of {scene.title}",
-        "scene": scene_name,
-        "seed": scene.seed,
-        **({"set": settings} if settings else {}),
-        "trial": {"kind": "frames", **attitudes(scene)},
-        "factors": {"cell": {"levels": {cell.name: cell.settings for cell in cells}}},
-        "replicates": size.fields,
-        "responses": [
-            "identified",
-            "wrong",
-            "refused",
-            "cross_arcsec_rms",
-            "roll_arcsec_rms",
-        ],
-    }
-
-
 def attitudes(scene: Scene) -> Record:
     """Keys of the trial that bound the attitudes: under a dome, the tilt limit of the vehicle."""
     if scene.light.kind != "dome":
@@ -506,75 +475,85 @@ def measure(
 
     Parameters
     ----------
-    quick
-        Smaller experiments
-    fields
-        Number of fields; None for the usual one
+    quick, fields
+        Smaller experiments; number of fields, None for the usual one
     least
         Number of fields that must be solved: MIN_FIELDS, or MODEL_FIELDS for an error model
     rates_deg_s, end_of_life
-        See `Designer`; without rates they are doubled until MOST_FAIL of the fields fail
+        See `Designer`; without rates they double until MOST_FAIL of the fields fail
     watch
-        Called with the number of trials; returns the function that is called after every batch
+        Called with the number of trials; returns what is called after every batch
 
     Raises
     ------
     InputError
-        Before the first trial for a scene without attitudes of single frames, too few fields, and
-        a cell whose settings are not allowed; later for a cell whose trials fail.
+        Before the first trial for a scene without attitudes of single frames, too few fields, and a cell whose settings
+        are not allowed; later for a cell whose trials fail.
     """
     check_scene(scene)
-    size = QUICK if quick else FULL
-    size = replace(size, fields=size.fields if fields is None else fields)
+    usual = QUICK if quick else FULL
+    size = replace(usual, fields=usual.fields if fields is None else fields)
     purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
     require_fields(size.fields, size.fields, least, f"too few {purpose}")
     designer = Designer(scene, size, rates_deg_s, end_of_life)
     cells = list(designer.cells())
     path = make_folder(folder) / STUDY
-
-    def planned() -> Plan:
-        tree = study_tree(scene_name, scene, overrides, size, cells)
-        text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120)
-        write_text(path, text)
-        plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
-        for cell in cells:
-            try:
-                resolve_point(plan.spec, cell.settings)
-            except InputError as error:
-                raise error.within(cell.name) from None
-        return plan
-
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")
-    try:
-        with store.writing(folder / store.STORE) as kept:
-            # The rates that an earlier call has added.
-            for point in kept.points()[len(cells) :: 2]:
-                experiment = point.levels.get("cell", "").partition(" ")[0]
-                if experiment in RATES:
-                    cells += designer.faster(experiment, cells)
-            plan = planned()
-            runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
-            while True:
-                runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
-                sheet = MeasuredFrames(
-                    scene,
-                    scene_name,
-                    overrides,
-                    size,
-                    designer,
-                    cells,
-                    read(plan, kept),
-                    plan.spec,
-                )
-                solved = [] if rates_deg_s else sheet.solved_at_all_rates()
-                if not solved:
-                    return sheet
-                for experiment in solved:
-                    cells += designer.faster(experiment, cells)
-                plan = planned()
-                runner.begin_store(plan, kept)
-    finally:
-        engine.close()
+    with closing(engine), store.writing(folder / store.STORE) as kept:
+        # The rates that an earlier call has added.
+        points = kept.points()[len(cells) :: 2]
+        added = (point.levels.get("cell", "").partition(" ")[0] for point in points)
+        designer.add_faster(cells, (name for name in added if name in RATES))
+        plan = planned(path, scene_name, designer, overrides, cells)
+        runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)
+        while True:
+            runner.run(plan, kept, engine, watch(plan.trials) if watch else None)
+            run = read(plan, kept), plan.spec
+            sheet = MeasuredFrames(scene, scene_name, overrides, size, designer, cells, *run)
+            solved = [] if rates_deg_s else sheet.solved_at_all_rates()
+            if not solved:
+                return sheet
+            designer.add_faster(cells, solved)
+            plan = planned(path, scene_name, designer, overrides, cells)
+            runner.begin_store(plan, kept)
+
+
+def planned(
+    path: Path,
+    scene_name: str,
+    designer: Designer,
+    overrides: Mapping[str, str],
+    cells: list[DatasheetCell],
+) -> Plan:
+    """Write the study file of the cells and plan its trials. Raises InputError for settings that are not allowed."""
+    scene = designer.scene
+    settings = {key: parse_yaml(text)[1] for key, text in overrides.items() if key != "seed"}
+    tree: Record = {
+        "schema": 1,
+        "title": f"Datasheet of {scene.title}",
+        "scene": scene_name,
+        "seed": scene.seed,
+        **({"set": settings} if settings else {}),
+        "trial": {"kind": "frames", **attitudes(scene)},
+        "factors": {"cell": {"levels": {cell.name: cell.settings for cell in cells}}},
+        "replicates": designer.size.fields,
+        "responses": [
+            "identified",
+            "wrong",
+            "refused",
+            "cross_arcsec_rms",
+            "roll_arcsec_rms",
+        ],
+    }
+    text = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=120)
+    write_text(path, text)
+    plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
+    for cell in cells:
+        try:
+            resolve_point(plan.spec, cell.settings)
+        except InputError as error:
+            raise error.within(cell.name) from None
+    return plan
 
 
 def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:

@@ -76,12 +76,8 @@ def draw_causes(statement: Statement, fig: Any) -> None:
     for n, group in enumerate(GROUPS):
         value, *ends = 100 * np.array([one[group] for one in statement.causes]).T
         bars = np.abs(ends - value)
-        style: dict[str, Any] = {
-            "fmt": "o",
-            "color": INK[n],
-            "label": f"{group} the boresight",
-        }
-        axes.errorbar(value, places + 0.2 * n, xerr=bars, **style)
+        label = f"{group} the boresight"
+        axes.errorbar(value, places + 0.2 * n, xerr=bars, fmt="o", color=INK[n], label=label)
     axes.axvline(100, color="#888888")
     axes.set_yticks(places, [one["cause"] for one in statement.causes])
     axes.invert_yaxis()
@@ -115,18 +111,19 @@ def draw_sky(statement: Statement, fig: Any) -> None:
     axes.legend(loc="lower right", bbox_to_anchor=(1.15, 0))
 
 
-def draw_by(fig: Any, rows: list[dict[str, Any]], key: str, label: str) -> None:
-    """Noise-equivalent angle, error and fraction of right attitudes against a quantity."""
+def draw_by(name: str, key: str, label: str, statement: Statement, fig: Any) -> None:
+    """Noise-equivalent angle, error and fraction of right attitudes in a field's rows, against a quantity."""
+    rows = getattr(statement, name)
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
     for n, group in enumerate(GROUPS):
         for kind, style in (("NEA", "o-"), ("rms", "s--")):
-            name = f"{kind.lower()}_{group}"
-            ends = np.array([row["intervals"][name] for row in rows]).T
-            values = np.array([row[name] for row in rows])
+            what = f"{kind.lower()}_{group}"
+            ends = np.array([row["intervals"][what] for row in rows]).T
+            values = np.array([row[what] for row in rows])
             draw_bars(errors, x, values, ends, style, color=INK[n], label=f"{kind} {group}")
     # The intervals of few fields may go on beyond the axis.
-    known = np.array([row[name] for row in rows for name in row["intervals"]])
+    known = np.array([row[what] for row in rows for what in row["intervals"]])
     known = known[np.isfinite(known)]
     errors.set_yscale("log")
     if known.size:
@@ -182,14 +179,12 @@ FIGURES: dict[str, tuple[Callable[[Statement, Any], None], tuple[float, float], 
         "Where the frames are solved lost in space, at rest (ensemble).",
     ),
     "rates": (
-        lambda statement, fig: draw_by(fig, statement.rates, "rate_deg_s", "rate [°/s]"),
+        partial(draw_by, "rates", "rate_deg_s", "rate [°/s]"),
         (9, 3),
         "By rate: NEA (temporal), rms (ensemble), 95 % intervals over the fields; right attitudes, exact bounds.",
     ),
     "boresight": (
-        lambda statement, fig: draw_by(
-            fig, statement.boresight_rates, "rate_deg_s", "rate about the boresight [°/s]"
-        ),
+        partial(draw_by, "boresight_rates", "rate_deg_s", "rate about the boresight [°/s]"),
         (9, 3),
         "By rate about the boresight: NEA (temporal), rms (ensemble), right attitudes.",
     ),
@@ -199,9 +194,7 @@ FIGURES: dict[str, tuple[Callable[[Statement, Any], None], tuple[float, float], 
         "Right attitudes by the angle from Sun and Moon, with exact bounds.",
     ),
     "magnitudes": (
-        lambda statement, fig: draw_by(
-            fig, statement.magnitudes, "limit_mag", "faintest star of the catalog [V]"
-        ),
+        partial(draw_by, "magnitudes", "limit_mag", "faintest star of the catalog [V]"),
         (9, 3),
         "By magnitude limit: NEA (temporal), rms (ensemble), and right attitudes.",
     ),
@@ -322,19 +315,10 @@ PRINTED = 3  # number of sections on a terminal: the terms, their causes and the
 
 def command(sheet: MeasuredFrames, options: list[str]) -> str:
     """The shell command that repeats the datasheet; `options` without those of the scene and its fields."""
-    options = list(options)
+    words = ["skysim", "datasheet", sheet.scene_name, *options]
     for key, value in sheet.overrides.items():
-        options += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
-    return shlex.join(
-        [
-            "skysim",
-            "datasheet",
-            sheet.scene_name,
-            *options,
-            "--fields",
-            str(sheet.size.fields),
-        ]
-    )
+        words += ["--seed", value] if key == "seed" else ["--set", f"{key}={value}"]
+    return shlex.join([*words, "--fields", str(sheet.size.fields)])
 
 
 def datasheet_report(statement: Statement, options: list[str]) -> Report:

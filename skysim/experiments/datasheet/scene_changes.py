@@ -23,7 +23,6 @@ from skysim.core.yaml_reader import explain, parse_yaml
 from skysim.experiments.study.factors import Settings
 from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.scene.sections.camera import CameraConfig
-from skysim.scene.sections.light import StarsConfig
 from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
 from skysim.tracking.onboard_model import onboard_catalog
 
@@ -71,7 +70,9 @@ def parse_end_of_life(text: str) -> EndOfLife:
     try:
         return EndOfLife.model_validate(tree)
     except ValidationError as error:
-        raise explain(error, EndOfLife, tree, [], {}).within("--end-of-life") from None
+        raise explain(error, EndOfLife, tree, [], {}).within(
+            "datasheet.end_of_life"
+        ) from None
 
 
 def added_dark_e_s(camera: CameraConfig, life: EndOfLife) -> float:
@@ -111,7 +112,7 @@ def aged(camera: CameraConfig, life: EndOfLife) -> dict[str, Settings]:
 
 def catalog_end_mag(scene: Scene) -> float:
     """The V magnitude up to which the tracker's catalog has stars; no star is faint enough for a tracker of LEDs."""
-    if not isinstance(scene.light, StarsConfig):
+    if scene.stars is None:
         return -math.inf
     stars = onboard_catalog("tracker.catalog", scene.tracker.catalog)
     return float(stars.v_mag.max()) + CATALOG_MARGIN_MAG
@@ -173,7 +174,7 @@ def disturbances(scene: Scene) -> dict[str, Settings]:
     for electrons in (100, 1000):
         glow = {"kind": "uniform", "e_s": electrons / exposure_s}
         found[f"stray light, {electrons} e- a pixel"] = {"background": [*own, glow]}
-    if not isinstance(scene.light, StarsConfig):
+    if scene.stars is None:
         return found
     for count in (5, 20):
         found[f"false stars, {count} among {TRUE_STARS} true"] = {
@@ -197,7 +198,7 @@ def beside(body: str, least_deg: float, greatest_deg: float) -> Settings:
 def has_bodies(scene: Scene) -> bool:
     """Whether Sun and Moon can be in the scene's sky, and their places are known at its start."""
     known = BODIES_YEARS[0] <= scene.start_time.year <= BODIES_YEARS[1]
-    return isinstance(scene.light, StarsConfig) and known
+    return scene.stars is not None and known
 
 
 def excluding_bodies(scene: Scene) -> tuple[str, ...]:

@@ -341,7 +341,7 @@ def outcome_cells(row: Record) -> list[str]:
 
 
 def outcome_row(row: Record) -> list[str]:
-    """Cells of a row's outcomes, and of the rms errors of its right attitudes."""
+    """Cells of a row's outcomes, and of the rms errors of its right attitudes, as OUTCOME_HEADERS."""
     return [*outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
 
 
@@ -355,8 +355,7 @@ def pair_cells(row: Record) -> list[str]:
     return [*errors, bounded(row["nees"]), *outcome_cells(row)]
 
 
-OUTCOME_HEADERS = ["right %", "refused", "false"]
-RIGHT_HEADERS = ["rms of the right: across ″", "about ″"]
+OUTCOME_HEADERS = ["right %", "refused", "false", "rms of the right: across ″", "about ″"]
 PAIR_HEADERS = ["NEA across ″", "rms across ″", "NEA about ″", "rms about ″", "NEES"]
 PAIR_HEADERS += ["both right %", "one refused", "one false"]
 
@@ -455,7 +454,7 @@ def exclusion_section(statement: Statement) -> StatementSection:
         [row["body"].capitalize(), f"{row['off_deg']:g}", *outcome_row(row)]
         for row in statement.exclusions
     ]
-    headers = ["body", "angle °", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    headers = ["body", "angle °", *OUTCOME_HEADERS]
     return StatementSection("Exclusion angles", texts, headers, rows, ["exclusions"])
 
 
@@ -480,7 +479,7 @@ def life_section(statement: Statement) -> StatementSection:
     rows = [
         [row["cause"], *outcome_row(row), *ratio_cells(row)] for row in statement.end_of_life
     ]
-    headers = ["damage", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    headers = ["damage", *OUTCOME_HEADERS]
     headers += ["mean square across %", "mean square about %"]
     return StatementSection("At the end of life", texts, headers, rows)
 
@@ -559,5 +558,5 @@ def disturbance_section(statement: Statement) -> StatementSection:
         " frames."
     ]
     rows = [[row["disturbance"], *outcome_row(row)] for row in statement.disturbances]
-    headers = ["disturbance", *OUTCOME_HEADERS, *RIGHT_HEADERS]
+    headers = ["disturbance", *OUTCOME_HEADERS]
     return StatementSection("Under disturbances", texts, headers, rows)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
@@ -80,12 +81,10 @@ class SurveyRun:
     @property
     def inliers(self) -> list[Correspondences]:
         """The correspondences without those that the adjustment rejected."""
-        keep = [np.ones(len(match.led), dtype=bool) for match in self.matches]
-        for frame, row in self.survey.outliers.tolist():
-            keep[frame][row] = False
+        frame, row = self.survey.outliers.T
         return [
-            Correspondences(m.light[k], m.led[k])
-            for m, k in zip(self.matches, keep, strict=True)
+            Correspondences(*(np.delete(part, row[frame == k]) for part in match))
+            for k, match in enumerate(self.matches)
         ]
 
     @property
@@ -189,9 +188,7 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
     """(F, N) light of each LED in each frame, multiplied with its squared distance; NaN if it is not identified."""
     out = np.full(run.seen.shape, np.nan)
     survey = run.survey
-    camera_m = survey.body_from_lab.inv().apply(
-        np.tile(survey.lever.camera_body_m, (len(out), 1))
-    )
+    camera_m = survey.body_from_lab.inv().apply(survey.lever.camera_body_m)
     for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
         squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
         out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2
@@ -248,9 +245,13 @@ def coverage_before(
 
 
 class NextStops(NamedTuple):
-    """Attitudes to hold next, and the predicted accuracy with them; None if they do not determine the unknowns."""
+    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them.
+
+    It is None if they do not determine the unknowns.
+    """
 
     lab_from_body: Rotation
+    shown: Bools
     accuracy: SurveyAccuracy | None
 
 
@@ -263,8 +264,9 @@ def next_stops(
         scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
     )
     attitudes = Rotation.concatenate([so_far.held, further.inv()])
-    seen = np.vstack([so_far.seen, model.visible(further.inv(), margin_px)])
-    return NextStops(further, predicted(model, attitudes, seen))
+    shown = model.visible(further.inv(), margin_px)
+    seen = np.vstack([so_far.seen, shown])
+    return NextStops(further, shown, predicted(model, attitudes, seen))
 
 
 def predicted(
@@ -438,16 +440,22 @@ def coverage_statistics(so_far: Coverage) -> Record:
         if so_far.accuracy
         else np.full(len(measured), so_far.model.leds_sigma_m)
     )
-    sigma_mm = (1e3 * sigma_m).tolist()
-    columns = so_far.model.leds.id.tolist(), frames.tolist(), measured.tolist(), sigma_mm
-    keys = ("led", "frames", "measured", "sigma_mm")
+    led = so_far.model.leds.id
     return {
         "leds": len(frames),
         "measured": int(measured.sum()),
         "seen_once": int(np.sum(frames == 1)),
         "unseen": int(np.sum(frames == 0)),
-        "by_led": [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)],
+        "by_led": rows_of_columns(
+            led=led, frames=frames, measured=measured, sigma_mm=1e3 * sigma_m
+        ),
     }
+
+
+def rows_of_columns(**columns: NDArray[Any]) -> list[Record]:
+    """Rows as numbers from columns by name."""
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
 def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
@@ -462,14 +470,11 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
     }
 
 
-def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[dict[str, float | int]]:
+def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
     up = lab_from_body.apply([0.0, 0.0, 1.0])
     tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
-    columns = (
-        *euler_deg(lab_from_body).T.tolist(),
-        tilt_deg.tolist(),
-        shown.sum(axis=1).tolist(),
+    roll, pitch, yaw = euler_deg(lab_from_body).T
+    return rows_of_columns(
+        roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, tilt_deg=tilt_deg, leds=shown.sum(axis=1)
     )
-    keys = ("roll_deg", "pitch_deg", "yaw_deg", "tilt_deg", "leds")
-    return [dict(zip(keys, row, strict=True)) for row in zip(*columns, strict=True)]

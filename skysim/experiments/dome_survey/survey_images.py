@@ -129,13 +129,12 @@ def write_attitudes(
 def write_solved(path: Path, rows: Sequence[Record]) -> None:
     """Write the attitudes of `survey_findings.attitude_rows` that are solved, with the upper half of the covariance."""
     solved = [row for row in rows if row["status"] == "solved"]
-    quaternions = np.array([row["cam_from_lab_xyzw"] for row in solved])
-    covariances = np.array([row["covariance_rad2"] for row in solved])
     more: dict[str, list[float]] = {"leds": [row["matches"] for row in solved]}
     for n, axis in enumerate("xyzw"):
-        more[f"cam_from_lab_{axis}"] = quaternions[:, n].tolist()
+        more[f"cam_from_lab_{axis}"] = [row["cam_from_lab_xyzw"][n] for row in solved]
     for i, j in zip(*np.triu_indices(3), strict=True):
-        more[f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"] = covariances[:, i, j].tolist()
+        name = f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"
+        more[name] = [row["covariance_rad2"][i][j] for row in solved]
     names = [row["file"] for row in solved]
     write_attitudes(path, names, survey_frames.from_rows(solved), more)
 
@@ -206,15 +205,17 @@ class News(NamedTuple):
 
 @dataclass
 class WatchedFolder:
-    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name."""
+    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name.
+
+    A file is read when a look finds it as the look before did. `_seen` has its stamp, and whether it was read.
+    """
 
     folder: Path
     camera: Camera
     settings: Settings
     _lights: dict[str, Centroids] = field(default_factory=dict)
     _attitudes: dict[str, Rotation] = field(default_factory=dict)
-    _seen: dict[str, Stamp] = field(default_factory=dict)
-    _done: dict[str, Stamp] = field(default_factory=dict)
+    _seen: dict[str, tuple[Stamp, bool]] = field(default_factory=dict)
 
     @property
     def pictures(self) -> list[SurveyImage]:
@@ -244,11 +245,11 @@ class WatchedFolder:
         }
         for path in [*paths, self.folder / ATTITUDES]:
             stamp = stamp_of(path)
-            before = self._seen.get(path.name)
-            if stamp is None:
+            before, was_read = self._seen.get(path.name, (None, False))
+            if stamp is None or (stamp == before and was_read):
                 continue
-            self._seen[path.name] = stamp
-            if stamp != before or stamp == self._done.get(path.name):
+            self._seen[path.name] = (stamp, stamp == before)
+            if stamp != before:
                 continue
             try:
                 if path.name == ATTITUDES:
@@ -260,7 +261,6 @@ class WatchedFolder:
                 news.complaints.append(error)
             else:
                 news.read.append(path.name)
-            self._done[path.name] = stamp
         return news
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_plan import SurveyModel
@@ -117,8 +117,7 @@ class CalibrationPrior:
 
     def pixels(self, body_from_lab: Rotation) -> Floats:
         """(N, 2) pixel positions of the LEDs; far outside the image for LEDs behind the camera."""
-        in_body = body_from_lab.apply(self.leds.position_m) - self.lever.camera_body_m
-        xy_px = self.camera.pixels(self.lever.cam_from_body.apply(in_body))
+        xy_px = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         return np.nan_to_num(xy_px, nan=-1e9)
 
 
@@ -201,9 +200,9 @@ def design_of(lab: Lab) -> Sources:
 
 def require_dome(scene: Scene) -> DomeConfig:
     """The dome of a scene. Raises InputError if its light is another."""
-    if not isinstance(scene.light, DomeConfig):
+    if scene.dome is None:
         raise InputError("light.kind", f"a survey needs LEDs, not {scene.light.kind}", "dome")
-    return scene.light
+    return scene.dome
 
 
 def survey_model(

@@ -17,7 +17,7 @@ from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Bools, Record
 from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
@@ -96,17 +96,14 @@ class HeldAttitudes(NamedTuple):
         for _ in range(DRAWS):
             focal, *lever = rng.standard_normal(4)
             own_m = rng.standard_normal(model.leds.position_m.shape) * model.leds_sigma_m
+            leds_m = model.leds.position_m + own_m
+            lever_m = model.lever.camera_body_m + np.array(lever) * model.lever_sigma_m
+            zoom = 1 + focal * model.focal_sigma_px / model.camera.focal_px
             other = replace(
                 model,
-                camera=model.camera.zoomed(
-                    1 + focal * model.focal_sigma_px / model.camera.focal_px
-                ),
-                leds=replace(model.leds, position_m=model.leds.position_m + own_m),
-                lever=replace(
-                    model.lever,
-                    camera_body_m=model.lever.camera_body_m
-                    + np.array(lever) * model.lever_sigma_m,
-                ),
+                camera=model.camera.zoomed(zoom),
+                leds=replace(model.leds, position_m=leds_m),
+                lever=replace(model.lever, camera_body_m=lever_m),
             )
             shown = other.visible(held, self.margin_px)
             found.append(int(survey_plan.measurable(other, held, shown).sum()))
@@ -280,28 +277,25 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
 def comparison(plan: HeldAttitudes, errors: list[SimulatedErrors]) -> list[Record]:
     """Rows with predicted errors, simulated errors (rms over all surveys), and their ratio with its standard error."""
     accuracy = accuracy_statistics(plan.first(len(plan.lab_from_body)))
-    return [
-        compared(
-            what, accuracy[key], scale * np.array([getattr(one, name) for one in errors])
+    led_m2, lever_m2, focal_px2, *_ = np.array(errors).T
+    rows = []
+    for what, key, squares in (
+        ("LED place mm", "led_mm", 1e6 * led_m2),
+        ("lever mm", "lever_mm", 1e6 * lever_m2),
+        ("focal length px", "focal_px", focal_px2),
+    ):
+        mean = float(squares.mean())
+        sigma = accuracy[key]
+        ratio = math.sqrt(mean) / sigma if sigma else None
+        # The relative error of the root of a mean square.
+        relative = float(squares.std() / (2 * mean * np.sqrt(len(squares))))
+        rows.append(
+            {
+                "what": what,
+                "predicted": sigma,
+                "simulated": math.sqrt(mean),
+                "ratio": ratio,
+                "ratio_sigma": ratio and ratio * relative,
+            }
         )
-        for what, key, name, scale in (
-            ("LED place mm", "led_mm", "led_m2", 1e6),
-            ("lever mm", "lever_mm", "lever_m2", 1e6),
-            ("focal length px", "focal_px", "focal_px2", 1),
-        )
-    ]
-
-
-def compared(what: str, sigma: float | None, squares: Floats) -> Record:
-    """One row: the root of the mean square has the relative error std(square) / (2 mean sqrt(n))."""
-    mean = float(squares.mean())
-    simulated = math.sqrt(mean)
-    relative = float(squares.std() / (2 * mean * np.sqrt(len(squares))))
-    ratio = simulated / sigma if sigma else None
-    return {
-        "what": what,
-        "predicted": sigma,
-        "simulated": simulated,
-        "ratio": ratio,
-        "ratio_sigma": ratio and ratio * relative,
-    }
+    return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +75,8 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
         "The dome from above: LED errors, faults, next attitudes.",
     )
     residuals = Figure(
-        residual_figure(run), "Residuals: their distribution, and their means over the chip."
+        png(partial(draw_residuals, run), (10, 4)),
+        "Residuals: their distribution, and their means over the chip.",
     )
     blocks = [
         verdict(statistics, 1e3 * run.accuracy.led_rms_m),
@@ -125,17 +127,15 @@ def truth_blocks(statistics: Record) -> list[Block]:
         f"True error of the LEDs: {statistics['led_mm_before']:.2g} mm rms before, {statistics['led_mm_after']:.2g} mm"
         f" after (predicted {predicted} mm); {statistics['renamed']} with another identity."
     )
-    errors = (
-        "cross_arcsec_median",
-        "cross_arcsec_worst",
-        "roll_arcsec_median",
-        "roll_arcsec_worst",
-    )
-    trackers = [(when, statistics[when]) for when in ("before", "after")]
-    rows = [
-        [when, f"{one['solved']} / {one['stops']}", *(one[key] for key in errors)]
-        for when, one in trackers
-    ]
+    rows = []
+    for when in ("before", "after"):
+        one = statistics[when]
+        errors = (
+            one[f"{name}_arcsec_{kind}"]
+            for name in ("cross", "roll")
+            for kind in ("median", "worst")
+        )
+        rows.append([when, f"{one['solved']} / {one['stops']}", *errors])
     heads = ("cross, median", "worst", "roll, median", "worst")
     columns = [
         text_column("the tracker"),
@@ -208,21 +208,13 @@ def coordinates(place_m: list[float]) -> str:
     return f"({', '.join(f'{1e3 * one:.1f}' for one in place_m)}) mm"
 
 
-def residual_figure(run: SurveyRun) -> bytes:
-    """PNG of the residuals: their distribution against the Gaussian of their noise, and their means over the chip."""
+def draw_residuals(run: SurveyRun, fig: Any) -> None:
+    """Draw the residuals: their distribution against the Gaussian of their noise, and their means over the chip."""
     xy_px, residual_px = residuals_px(run)
-
-    def draw(fig: Any) -> None:
-        left, right = fig.subplots(1, 2)
-        draw_histogram(left, residual_px.ravel(), run.noise_px)
-        draw_means(
-            right,
-            xy_px,
-            residual_px,
-            (run.survey.camera.width_px, run.survey.camera.height_px),
-        )
-
-    return png(draw, (10, 4))
+    camera = run.survey.camera
+    left, right = fig.subplots(1, 2)
+    draw_histogram(left, residual_px.ravel(), run.noise_px)
+    draw_means(right, xy_px, residual_px, (camera.width_px, camera.height_px))
 
 
 def draw_histogram(axes: Any, residual_px: Floats, noise_px: float) -> None:
@@ -430,21 +422,20 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rota
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
-    marks = {
-        "dark": (faults.dark, "x", "black"),
-        "displaced": (list(faults.displaced), "D", "magenta"),
-        "exchanged": ([led for led, _, _ in faults.exchanged], "s", "red"),
-    }
-    for name, (numbers, marker, color) in marks.items():
+    exchanged = [led for led, _, _ in faults.exchanged]
+    for name, numbers, marker, color in (
+        ("dark", faults.dark, "x", "black"),
+        ("displaced", list(faults.displaced), "D", "magenta"),
+        ("exchanged", exchanged, "s", "red"),
+    ):
         rows = rows_of(numbers, leds.id)
         colors = (
             {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
         )
         if len(rows):
             axes.scatter(x_m[rows], y_m[rows], 70, marker=marker, label=name, **colors)
-        for row in rows:
-            text = {"textcoords": "offset points", "color": color}
-            axes.annotate(str(leds.id[row]), (x_m[row], y_m[row]), (6, 6), **text)
+        for led, at in zip(leds.id[rows], leds.position_m[rows, :2], strict=True):
+            axes.annotate(str(led), at, (6, 6), textcoords="offset points", color=color)
     lever = so_far.model.lever
     toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
     for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):

@@ -316,7 +316,7 @@ def test_uneven_illumination_is_not_counted_as_prnu() -> None:
 
 def test_error_propagation_matches_that_of_a_product() -> None:
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]])
-    value, sigma = propagate(lambda p: p[0] * p[1], np.array([2.0, 5.0]), covariance)
+    value, sigma, *_ = propagate(lambda p: p[0] * p[1], np.array([2.0, 5.0]), covariance)
     slope = np.array([5.0, 2.0])
     assert value == pytest.approx(10)
     assert sigma == pytest.approx(np.sqrt(slope @ covariance @ slope), rel=1e-6)

@@ -204,9 +204,9 @@ def test_the_glass_darkens_by_the_same_share_in_each_krad():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("-1", "--end-of-life: dose_krad: .* allowed: greater than 0"),
-        ("{dose_krad: 1, dose: 2}", "--end-of-life: dose: unknown key"),
-        ("{dark_e_s_krad: 2}", "--end-of-life: dose_krad: missing"),
+        ("-1", "datasheet.end_of_life: dose_krad: .* allowed: greater than 0"),
+        ("{dose_krad: 1, dose: 2}", "datasheet.end_of_life: dose: unknown key"),
+        ("{dark_e_s_krad: 2}", "datasheet.end_of_life: dose_krad: missing"),
     ],
 )
 def test_an_end_of_life_that_means_nothing_is_refused(text, message):

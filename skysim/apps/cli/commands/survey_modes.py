@@ -231,14 +231,12 @@ def print_coverage(
 def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
     """Statistics of a coverage, with the attitudes to hold next and the accuracy predicted with them."""
 
-    margin_px = prior.margin_px
     further = survey_findings.next_stops(
-        request.scene, so_far, margin_px, request.next_stops, request.tilt_deg
+        request.scene, so_far, prior.margin_px, request.next_stops, request.tilt_deg
     )
-    shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
     return {
         "coverage": survey_findings.coverage_statistics(so_far),
-        "next": survey_findings.stop_rows(further.lab_from_body, shown),
+        "next": survey_findings.stop_rows(further.lab_from_body, further.shown),
         "next_reaches": survey_findings.accuracy_statistics(further.accuracy),
     }
 

@@ -157,14 +157,11 @@ class Survey:
         self, so_far: survey_findings.Coverage, taken: int, count: int
     ) -> SurveyPlan:
         """Attitudes to hold after the frames taken so far."""
-        margin_px = self.before.margin_px
         further = survey_findings.next_stops(
-            self.scene, so_far, margin_px, count, tilt_deg(self.scene)
+            self.scene, so_far, self.before.margin_px, count, tilt_deg(self.scene)
         )
-        shown = so_far.model.visible(further.lab_from_body.inv(), margin_px)
-        return survey_plan(
-            further.lab_from_body, shown, (plan_step(taken + len(shown), further.accuracy),)
-        )
+        step = plan_step(taken + len(further.shown), further.accuracy)
+        return survey_plan(further.lab_from_body, further.shown, (step,))
 
     def map_file(self) -> bytes:
         """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
