@@ -2,13 +2,8 @@
 
 At the end of its life a camera has more dark current and hot pixels, and a darker lens, after an ionizing dose.
 
-Dark current. Displacement damage D in MeV/g adds K D carriers a second in each cm^3 of depleted silicon, with the
-universal damage factor K = 1.9e5 (1 +- 0.3) per cm^3 s and MeV/g at 300 K, a week after the irradiation (Srour & Lo
-2000, IEEE Trans. Nucl. Sci. 47, 2451). Protons of 60 MeV give D = 2.8e7 MeV/g in each krad (6.24e10 MeV/g of ionization
-by a stopping power of 8.6 MeV cm^2/g, 3.9e-3 of it displacement). The depth of the depleted layer is assumed. The
-charge that ionization sets free at interfaces depends on the process: give `dark_e_s_krad` from a test of the chip.
-
-Hot pixels and transmission have no common law: their defaults are assumed.
+Each krad adds dark current and hot pixels and takes light. What a dose does depends on the chip's process and on the
+glass, so the defaults are assumptions, which the sheet marks: give the numbers of a test.
 """
 
 from __future__ import annotations
@@ -18,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
-from skysim.core.units import ConfigModel, Fraction, Length, NotNegative, Number, Positive
+from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Positive
 from skysim.core.yaml_reader import explain, parse_yaml
 from skysim.experiments.study.factors import Settings
 from skysim.scene.scene import BODIES_YEARS, Scene
@@ -32,32 +27,26 @@ FALSE_STARS_PX = 0.05
 TRUE_STARS = 20
 OFF_DEG = (10.0, 20.0, 30.0, 45.0, 60.0, 90.0)  # angles of the boresight from a bright body
 
-DAMAGE_E_S_M3 = 1.9e5 * 2.8e7 * 1e6  # carriers per second, m^3 and krad, at DAMAGE_C
-DAMAGE_C = 26.85
 ALL = "all together"
 
 
 class EndOfLife(ConfigModel):
-    """What a camera has suffered: a dose, and what each krad of it does.
+    """What a camera has suffered: a dose, and what each krad of it does; the defaults are assumed.
 
     Attributes
     ----------
     dose_krad
         Ionizing dose at the chip and in the lens, krad(Si)
-    depth
-        Depth of the depleted silicon of a pixel; the default is assumed
     dark_e_s_krad
-        Dark current added by each krad at the chip's dark_temperature_c; by default that of Srour & Lo for
-        protons of 60 MeV
+        Dark current added by each krad at the chip's dark_temperature_c
     hot_pixels_krad, hot_e_s
-        Fraction of the pixels that each krad makes hot, and their mean dark current; the defaults are assumed
+        Fraction of the pixels that each krad makes hot, and their mean dark current
     transmission_krad
-        Fraction of the light that the glass loses in each krad; the default is assumed, for glass that is made for it
+        Fraction of the light that the glass loses in each krad
     """
 
     dose_krad: Positive
-    depth_m: Length = 2e-6
-    dark_e_s_krad: NotNegative | None = None
+    dark_e_s_krad: NotNegative = 100.0
     hot_pixels_krad: Fraction = 5e-4
     hot_e_s: NotNegative = 1000.0
     transmission_krad: Annotated[Number, Field(ge=0, lt=1)] = 0.002
@@ -75,23 +64,13 @@ def parse_end_of_life(text: str) -> EndOfLife:
         ) from None
 
 
-def added_dark_e_s(camera: CameraConfig, life: EndOfLife) -> float:
-    """Dark current that the dose adds to a pixel at the chip's dark_temperature_c."""
-    if life.dark_e_s_krad is not None:
-        return life.dose_krad * life.dark_e_s_krad
-    chip = camera.detector
-    warmer = (chip.dark_temperature_c - DAMAGE_C) / chip.dark_doubling_c
-    volume_m3 = camera.pixel_m**2 * life.depth_m
-    return life.dose_krad * DAMAGE_E_S_M3 * volume_m3 * 2.0**warmer
-
-
 def aged(camera: CameraConfig, life: EndOfLife) -> dict[str, Settings]:
     """Settings of the aged camera: each damage alone, and all together.
 
     A transmission that is a curve is not changed.
     """
     chip = camera.detector
-    dark_e_s = chip.dark_e_s + added_dark_e_s(camera, life)
+    dark_e_s = chip.dark_e_s + life.dose_krad * life.dark_e_s_krad
     hot = min(chip.hot_pixels + life.dose_krad * life.hot_pixels_krad, 1.0)
     parts: dict[str, Settings] = {
         f"dark current {dark_e_s:.3g} e-/s": {"camera.detector.dark_e_s": dark_e_s},

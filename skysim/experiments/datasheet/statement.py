@@ -465,15 +465,9 @@ def life_section(statement: Statement) -> StatementSection:
     keys = ", ".join(
         f"{name} {value:g}{'' if name in life.model_fields_set else ' (assumed)'}"
         for name, value in life
-        if value is not None
     )
     texts = [
         f"The camera after its dose, at rest, on the same fields, units and noise as before: {keys}.",
-        ""
-        if life.dark_e_s_krad is not None
-        else "Dark current: protons of 60 MeV, displacement damage by Srour & Lo (2000, IEEE Trans. Nucl. Sci. 47,"
-        " 2451) in the depleted silicon. Ionization at interfaces depends on the process and is not in it: give"
-        " dark_e_s_krad.",
         "What is left of the mean square is in percent of that of the new camera, with 95 % intervals.",
     ]
     rows = [

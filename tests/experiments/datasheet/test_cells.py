@@ -174,24 +174,11 @@ def test_a_turn_about_the_boresight_smears_the_edge_as_far_as_the_streak_says():
     assert all(one.settings["trial.rate_axis"] == "boresight" for one in cells)
 
 
-def test_displacement_damage_follows_the_universal_factor():
-    """1.9e5 carriers a second in a cm^3 for each MeV/g, and 2.8e7 MeV/g a krad, in a pixel of 10 x 10 x 2 um at 300 K.
-
-    It halves with each doubling step that the chip is colder.
-    """
+def test_a_dose_adds_its_dark_current_to_the_chip_s() -> None:
     camera = load("shefex2", {}).camera
-    chip = camera.detector.model_copy(
-        update={"dark_temperature_c": 26.85, "dark_doubling_c": 7.0}
-    )
-    warm = camera.model_copy(update={"pixel_m": 10e-6, "detector": chip})
-    expected = 3 * 1.9e5 * 2.8e7 * (1e-3 * 1e-3 * 2e-4)
-    life = scene_changes.parse_end_of_life("3")
-    assert scene_changes.added_dark_e_s(warm, life) == pytest.approx(expected)
-    chip = chip.model_copy(update={"dark_temperature_c": 26.85 - 14.0})
-    cold = warm.model_copy(update={"detector": chip})
-    assert scene_changes.added_dark_e_s(cold, life) == pytest.approx(expected / 4)
-    given = scene_changes.parse_end_of_life("{dose_krad: 3, dark_e_s_krad: 40}")
-    assert scene_changes.added_dark_e_s(cold, given) == pytest.approx(120)
+    life = scene_changes.parse_end_of_life("{dose_krad: 3, dark_e_s_krad: 40}")
+    together = scene_changes.aged(camera, life)[scene_changes.ALL]
+    assert together["camera.detector.dark_e_s"] == camera.detector.dark_e_s + 120
 
 
 def test_the_glass_darkens_by_the_same_share_in_each_krad():
