@@ -37,7 +37,7 @@ def row(frame: int) -> FrameRow:
 
 
 def score(name: str) -> TrackerScore:
-    times = {"time_ms_median": 12.5, "time_ms_p95": 123.0}
+    times = {"time_ms_median": 12.5, "time_ms_p95": 123.0, "nees": 3.14}
     errors = dict.fromkeys(
         [
             f"{angle}_arcsec_{what}"

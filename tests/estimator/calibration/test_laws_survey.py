@@ -87,7 +87,7 @@ def whole_matrix(terms: ba.NormalEquations) -> Floats:
 # Bundle adjustment
 
 
-@law(ba.linearize, ba.residuals, Bundle.apply_step, Sightings.take)
+@law(ba.linearize, ba.residuals, Bundle.start, Bundle.apply_step, Sightings.take)
 @given(rng=SEEDS)
 def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
     rng: np.random.Generator,

@@ -39,12 +39,19 @@ def apart(a: NDArray, b: NDArray) -> NDArray:
 # Catalog
 
 
-@law(catalog.from_columns, catalog.at_epoch, catalog.apparent, catalog.unit)
+@law(
+    catalog.from_columns,
+    catalog.StarCatalog.brightest_first,
+    catalog.at_epoch,
+    catalog.apparent,
+    catalog.unit,
+)
 @given(rng=SEEDS, year=some.floats(1900, 2100))
 def test_stars_move_across_the_sky_and_no_farther_than_they_can(
     rng: np.random.Generator, year: float
 ) -> None:
     stars = drawn(rng)
+    assert (np.diff(stars.brightest_first().v_mag) >= 0).all()
     np.testing.assert_allclose(
         np.sum(stars.vectors * stars.drift_rad_yr, axis=1), 0, rtol=0, atol=1e-15
     )

@@ -195,7 +195,7 @@ def test_every_number_of_the_report_is_the_store_s(tmp_path: Path) -> None:
     assert (counts["failed"], counts["wrong"]) == (3, 0)
     assert dict(html.tables["Scene"])["code version"] == "cafe0123"
     assert html.tables[POINTS] == [heads, *rows]
-    assert html.tables["Runs"][1:] == [["pool", "2", "180", "4.0", "45.0"]]
+    assert html.tables["Runs"][1:] == [["pool", "2", "180", "4.0", "45"]]
     assert html.said["pre"] == "title: Which <dome>?"
     assert "Not finished" not in html.said["verdict bad"]
 
