@@ -190,7 +190,7 @@ class Tab:
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
-                    self.tracker_panel = settings_panel.TrackerPanel(self, self.study_panel)
+                    self.tracker_panel = settings_panel.TrackerPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
