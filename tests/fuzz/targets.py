@@ -109,7 +109,7 @@ def catalogs(data: bytes) -> None:
     rejects(lambda: catalog.read(path), ImageError)
     rejects(lambda: published_catalogs.read_cat(path, 5.0, 2010.0, COLOR), ImageError)
     rejects(lambda: cat_file.read_stars(write_file(data, "stars.cat")), ImageError)
-    rejects(lambda: validate.describe_file(path), InputError)
+    rejects(lambda: validate.describe_file(path, {}), InputError)
 
 
 def maps(data: bytes) -> None:

@@ -126,7 +126,7 @@ def test_a_scene_or_study_without_a_version_gets_the_line_to_add(tmp_path: Path)
 
 
 def test_a_shipped_camera_is_checked_by_its_name() -> None:
-    assert check_file(Path("imx264")).what == "a camera of 2448 x 2048 pixels"
+    assert check_file(Path("imx264"), {}).what == "a camera of 2448 x 2048 pixels"
 
 
 @pytest.mark.slow
@@ -141,10 +141,10 @@ def test_each_kind_of_file_is_recognized_and_each_fault_is_one_line(tmp_path: Pa
         (DATA / "catalogs" / "hipparcos_hp6.5.ecsv", "a catalog of 7996 stars"),
         (DATA / "catalogs" / "gaia_v8.0.ecsv", "a catalog of 45735 stars"),
     ):
-        result = check_file(path)
+        result = check_file(path, {})
         assert (result.fault, result.what[: len(what)]) == ("", what)
     for path in (broken, xml, tmp_path / "none.yaml", ROOT / "data/published/afit.yaml"):
-        fault = check_file(path).fault
+        fault = check_file(path, {}).fault
         assert fault
         assert "\n" not in fault
 
@@ -159,9 +159,11 @@ def test_every_file_that_skysim_reads_is_valid(tmp_path: Path) -> None:
         (Path("end_to_end"), "a study of 6 trials"),
         (SCENES / "vehicles/simsat.xml", "a vehicle of 73.35 kg"),
     ):
-        result = check_file(path)
+        result = check_file(path, {})
         assert (result.fault, result.what[: len(what)]) == ("", what)
-    assert "allowed: a .yaml file or one of afit_board" in check_file(Path("nosuch")).fault
+    assert (
+        "allowed: a .yaml file or one of afit_board" in check_file(Path("nosuch"), {}).fault
+    )
 
 
 def test_an_endless_file_is_refused_without_waiting(tmp_path: Path) -> None:
@@ -169,7 +171,7 @@ def test_an_endless_file_is_refused_without_waiting(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / f"pipe.{suffix}")
         (tmp_path / f"zero.{suffix}").symlink_to("/dev/zero")
         for name in ("pipe", "zero"):
-            assert check_file(tmp_path / f"{name}.{suffix}").fault.endswith(
+            assert check_file(tmp_path / f"{name}.{suffix}", {}).fault.endswith(
                 "not a regular file"
             )
 
@@ -182,15 +184,15 @@ def test_a_wrong_key_of_a_trial_is_answered_with_the_allowed_ones(tmp_path: Path
         r"trial\.false_light: unknown key; did you mean false_lights\?; allowed: .*noise_px.*"
     )
     assert re.fullmatch(
-        rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path).fault
+        rf"factors\.strays: 0: {says} \(.*mine\.yaml, line 9\)", check_file(path, {}).fault
     )
 
 
 def test_an_error_found_at_setup_has_its_line(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\ntracker:\n  map: nothing.ecsv\n")
-    assert "nothing.ecsv" in check_file(path).fault
-    assert "mine.yaml, line 4" in check_file(path).fault
+    assert "nothing.ecsv" in check_file(path, {}).fault
+    assert "mine.yaml, line 4" in check_file(path, {}).fault
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,53 +71,13 @@ class Pixels:
 NO_PIXELS = Pixels(b"", {}, ALL_PIXELS, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class LightRow:
-    """A true light on the frame: HIP or LED number, pixel, electrons, V magnitude (NaN of an LED)."""
-
-    id: int
-    x: float
-    y: float
-    electrons: float
-    magnitude: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LightColumns(Sequence[LightRow]):
-    """The true lights of a frame as columns, since objects for hundreds of stars take longer to send than the pixels.
-
-    Attributes
-    ----------
-    id, electrons, magnitude
-        (N,) as in `LightRow`
-    xy_px
-        (N, 2) pixels
-    """
-
-    id: NDArray[np.int64]
-    xy_px: Floats
-    electrons: Floats
-    magnitude: Floats
-
-    def __len__(self) -> int:
-        return len(self.id)
-
-    @overload
-    def __getitem__(self, n: int) -> LightRow: ...
-    @overload
-    def __getitem__(self, n: slice) -> LightColumns: ...
-    def __getitem__(self, n: int | slice) -> LightRow | LightColumns:
-        if isinstance(n, slice):
-            return LightColumns(
-                self.id[n], self.xy_px[n], self.electrons[n], self.magnitude[n]
-            )
-        x, y = self.xy_px[n].tolist()
-        return LightRow(
-            int(self.id[n]), x, y, float(self.electrons[n]), float(self.magnitude[n])
-        )
-
-
-NO_LIGHTS = LightColumns(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty(0))
+# The true lights of a frame, as rows of an array, since objects for hundreds of stars take longer to send than the
+# pixels: HIP or LED number, pixel (x, y), electrons, V magnitude (NaN of an LED).
+Lights = Any  # numpy's types do not know that parts of a recarray are recarrays
+LIGHT = np.dtype(
+    [("id", np.int64), ("xy_px", float, 2), ("electrons", float), ("magnitude", float)]
+)
+NO_LIGHTS: Lights = np.recarray(0, LIGHT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +183,7 @@ class FrameView:
     body_wxyz: Floats
     exposure_s: float
     statistics: plots.FrameStatistics
-    lights: LightColumns
+    lights: Lights
     result: TrackerResult | None
     ms: float
     t_s: float = 0.0

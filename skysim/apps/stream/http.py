@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -23,7 +23,6 @@ from skysim.results.plots import jpeg, to_8bit
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # timeout of a client that stops reading
 FINISH_TIMEOUT_S = 5.0  # time for clients to take the last frame
-KEPT_DISCONNECTED = 20  # maximum number of disconnected clients with their own counters
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
 <body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
 <p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
@@ -45,9 +44,9 @@ class FrameHub:
     sender_status
         Function that returns the sender's counters
     clients
-        Connected clients, and the last KEPT_DISCONNECTED disconnected ones
+        Connected clients
     earlier
-        Number of clients that disconnected before, and the sums of their counters
+        Number of disconnected clients, and the sums of their counters
     """
 
     def __init__(self, sender_status: Callable[[], dict[str, Any]]) -> None:
@@ -56,7 +55,6 @@ class FrameHub:
         self.ended = False
         self.changed = threading.Condition()
         self.clients: list[Client] = []
-        self.disconnected: deque[Client] = deque()
         self.earlier = Counter(clients=0, sent=0, dropped=0)
 
     def connect(self) -> Client:
@@ -65,14 +63,11 @@ class FrameHub:
             return self.clients[-1]
 
     def disconnect(self, client: Client) -> None:
-        """Mark a client as disconnected. The oldest ones are merged into `earlier`, so that memory stays bounded."""
+        """Merge a client into `earlier`, so that memory stays bounded."""
         with self.changed:
-            self.disconnected.append(client)
+            self.clients.remove(client)
+            self.earlier.update(clients=1, **asdict(client))
             self.changed.notify_all()
-            if len(self.disconnected) > KEPT_DISCONNECTED:
-                old = self.disconnected.popleft()
-                self.clients.remove(old)
-                self.earlier.update(clients=1, **asdict(old))
 
     def counters(self) -> dict[str, Any]:
         """Counters of each client, and the sums of the earlier ones."""
@@ -90,9 +85,7 @@ class FrameHub:
         with self.changed:
             self.ended = True
             self.changed.notify_all()
-            self.changed.wait_for(
-                lambda: len(self.clients) == len(self.disconnected), FINISH_TIMEOUT_S
-            )
+            self.changed.wait_for(lambda: not self.clients, FINISH_TIMEOUT_S)
 
     def wait_newer(self, number: int) -> Packet | None:
         """Wait for a packet newer than `number` and return it; None if the stream has ended without one."""

@@ -46,16 +46,10 @@ class Pace:
 
     def is_on_time(self, _: int, t_s: float) -> bool:
         """Return True if a frame whose exposure ends at t_s is less than one frame period late, so worth rendering."""
-        return (
-            self.zero_s is None
-            or not self.speed
-            or self.late_s(t_s) < 1 / (self.rate_hz * self.speed)
-        )
+        return self.late_s(t_s) * self.speed * self.rate_hz < 1
 
     def wait(self, t_s: float) -> None:
-        remaining_s = -self.late_s(t_s)
-        if remaining_s > 0:
-            time.sleep(remaining_s)
+        time.sleep(max(-self.late_s(t_s), 0.0))
 
 
 DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed

@@ -28,7 +28,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 import httpx
 from astropy.io import fits
 
-from skysim.apps.gui.messages import ALL_PIXELS, LIMITS, Display, LightColumns, Pixels
+from skysim.apps.gui.messages import ALL_PIXELS, LIGHT, LIMITS, Display, Pixels
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.views import overlay as served_module
 from skysim.apps.gui.views.live import Contents
@@ -409,18 +409,21 @@ def test_a_worker_keeps_the_pixels_of_its_newest_images() -> None:
 def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
     count = 500
     random = np.random.default_rng(7)
-    lights = LightColumns(
-        np.arange(count),
-        random.uniform(0, 1000, (count, 2)),
-        random.random(count),
-        random.random(count),
+    lights = np.rec.fromarrays(
+        [
+            np.arange(count),
+            random.uniform(0, 1000, (count, 2)),
+            random.random(count),
+            random.random(count),
+        ],
+        LIGHT,
     )
     again = pickle.loads(pickle.dumps(lights))
     assert len(pickle.dumps(lights)) < 41 * count + 1000  # eight bytes a number
     assert len(again) == count
     assert again[3] == lights[3]
     assert [light.id for light in again[5:8]] == [5, 6, 7]
-    assert again[3].x == lights.xy_px[3, 0]
+    assert again[3].xy_px[0] == lights.xy_px[3, 0]
 
 
 def test_page_contents_are_sent_with_the_next_frame_or_separately() -> None:

@@ -29,7 +29,7 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
+from skysim.apps.gui.messages import LIGHT, Detection, TrackerResult
 from skysim.apps.gui.page import readouts, strips
 from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
@@ -41,11 +41,14 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 
 def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> None:
     places_px = np.array([[10.0, 20], [40, 50], [70, 80]])
-    true = LightColumns(
-        np.array([3, 4, 5]),
-        places_px,
-        np.array([5000.0, 900, 100]),
-        np.array([1.5, np.nan, 4]),
+    true = np.rec.fromarrays(
+        [
+            np.array([3, 4, 5]),
+            places_px,
+            np.array([5000.0, 900, 100]),
+            np.array([1.5, np.nan, 4]),
+        ],
+        LIGHT,
     )
     found = [
         Detection(200, 200, 0.1, 50),

@@ -21,7 +21,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui import server
-from skysim.apps.gui.messages import Detection, LightColumns, TrackerResult
+from skysim.apps.gui.messages import LIGHT, Detection, TrackerResult
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
 from skysim.apps.gui.views import forms, keys, overlay
 from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
@@ -288,11 +288,14 @@ def test_a_scene_is_saved_as_its_differences_without_overwriting(tmp_path: Path)
 
 # Marks.
 
-LIGHTS = LightColumns(
-    np.array([1, 2]),
-    np.array([[10.0, 20], [50, 60]]),
-    np.array([1e4, 1e3]),
-    np.array([2.0, 4.0]),
+LIGHTS = np.rec.fromarrays(
+    [
+        np.array([1, 2]),
+        np.array([[10.0, 20], [50, 60]]),
+        np.array([1e4, 1e3]),
+        np.array([2.0, 4.0]),
+    ],
+    LIGHT,
 )
 SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
 

@@ -40,11 +40,10 @@ def test_all_functions_of_table_1_of_ptase_work_in_the_page(page: Any) -> None:
     set_to(page, "field, °", "20")
     onto_the_page(page)
     choose_stage(page, "identifier", "fialho_2")  # step 3
-    page.get_by_label("noise, ″ an axis").fill("3")  # step 4
-    page.get_by_label("noise, magnitudes").fill("0.25")
-    panel(page, "Monte Carlo")
+    panel(page, "Monte Carlo")  # step 4
+    page.get_by_label("noise, ″ an axis").fill("3")
+    page.get_by_label("noise, mag", exact=True).fill("0.25")
     page.get_by_label("false", exact=True).fill("0")
-    page.get_by_text("noise of a centroid: 3″ an axis").wait_for()
     onto_the_page(page)
     page.keyboard.press("2")  # step 5
     page.get_by_text(f"{RUNS} of {RUNS} trials").wait_for()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from skysim.sources.orbit_availability import Pointing, SkySamples
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
-LAWS = ("inertial", "zenith")
 
 
 def availability(
     scene: SceneArg,
     law: Annotated[
-        str, typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it.")
+        Literal["inertial", "zenith"],
+        typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it."),
     ] = "inertial",
     off_deg: Annotated[
         float, typer.Option(help="Angle of the boresight from the zenith, 180 is nadir.")
@@ -39,7 +39,7 @@ def availability(
         float, typer.Option(help="Its azimuth from the flight direction, left positive.")
     ] = 0.0,
     span: Annotated[
-        str, typer.Option(help="orbit, day or year, from the scene's start_time.")
+        Literal["orbit", "day", "year"], typer.Option(help="From the scene's start_time.")
     ] = "orbit",
     samples: Annotated[
         int, typer.Option(min=10, max=10_000_000, help="Times that are computed.")
@@ -61,7 +61,10 @@ def availability(
             "the scene has none",
             "a scene with a section orbit with exclusion",
         )
-    check_options(law, span, bool(off_deg or around_deg))
+    if law == "inertial" and (off_deg or around_deg):
+        raise InputError(
+            "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
+        )
     pointing = pointing_of(config, law, off_deg, around_deg)
     with progress_callback("availability", quiet=json) as watch:
         found = computed(config, pointing, SPANS_S[span], samples, watch)
@@ -78,17 +81,6 @@ def availability(
     else:
         title = f"{config.name}: {span} of {found.t_s[-1] / HOUR_S:.4g} h"
         print_table(fraction_table(fractions, exclusion), title)
-
-
-def check_options(law: str, span: str, is_turned: bool) -> None:
-    """Raise InputError for an unknown law or span, or for an angle from the zenith that has no effect."""
-    for value, allowed, name in ((law, LAWS, "law"), (span, tuple(SPANS_S), "span")):
-        if value not in allowed:
-            raise InputError(f"--{name} {value}", "", ", ".join(allowed))
-    if law == "inertial" and is_turned:
-        raise InputError(
-            "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
-        )
 
 
 def fraction_table(fractions: dict[str, float], exclusion: ExclusionConfig) -> Table:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,6 @@ from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, loa
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.stream.http import FrameHub
     from skysim.apps.stream.sinks import Sink
     from skysim.simulation.flight import Flight
 
@@ -102,12 +100,22 @@ def send_all(
 ) -> dict[str, Any]:
     """Send all frames of a flight, and return the counters of the sender and its receivers.
 
-    Ctrl-C ends the stream. Flight and sinks are closed at its end.
+    Ctrl-C ends the stream. Flight, sinks and server are closed at its end. Raises InputError if the port cannot be
+    served.
     """
+    from skysim.apps.stream.http import FrameHub, start_server
     from skysim.apps.stream.sender import Pace, Sender
 
     sender = Sender(flight, Pace(speed, flight.lab.scene.exposure.rate_hz), sinks)
-    with serving(port, host, sender.statistics) as hub:
+    with ExitStack() as stack:
+        hub = None
+        if port is not None:
+            hub = FrameHub(sender.statistics)
+            server = start_server(hub, host, port)
+            stack.callback(server.shutdown)
+            stack.callback(hub.finish)
+            address = f"http://{host}:{server.server_port}/"
+            print(f"skysim stream: {address}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
         try:
             sender.run(hub.publish if hub else None)
         except KeyboardInterrupt:
@@ -117,25 +125,6 @@ def send_all(
             for sink in sinks:
                 sink.close()
     return sender.statistics() | (hub.counters() if hub else {})
-
-
-@contextmanager
-def serving(port: int | None, host: str, status: Any) -> Iterator[FrameHub | None]:
-    """Serve a frame hub over HTTP within this context; yields None without a port. Raises InputError."""
-    from skysim.apps.stream.http import FrameHub, start_server
-
-    if port is None:
-        yield None
-        return
-    hub = FrameHub(status)
-    server = start_server(hub, host, port)
-    address = f"http://{host}:{server.server_port}/"
-    print(f"skysim stream: {address}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
-    try:
-        yield hub
-    finally:
-        hub.finish()
-        server.shutdown()
 
 
 def summary(statistics: dict[str, Any]) -> str:

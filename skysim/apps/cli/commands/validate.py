@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import typer
@@ -66,11 +65,9 @@ def validate(
         return
     if not files:
         raise InputError("", "no files", "files, or --schema scene")
-    programs = {}
-    if program:
-        from skysim.tracking import tracker_interface
+    from skysim.tracking import tracker_interface
 
-        programs = tracker_interface.program_commands(program)
+    programs = tracker_interface.program_commands(program)
     verdicts = [check_file(path, programs) for path in files]
     if program and not any(verdict.fault for verdict in verdicts):
         used_programs(program, {name for path in files for name in names_in_file(path)})
@@ -106,7 +103,7 @@ def check(
         print_check(result.facts, findings)
 
 
-def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -> FileVerdict:
+def check_file(path: Path, programs: Mapping[str, str]) -> FileVerdict:
     """Check one file; errors become the verdict's `fault`.
 
     Parameters
@@ -120,9 +117,7 @@ def check_file(path: Path, programs: Mapping[str, str] = MappingProxyType({})) -
         return FileVerdict(str(path), fault=str(error))
 
 
-def describe_file(
-    path: Path, programs: Mapping[str, str] = MappingProxyType({})
-) -> tuple[str, tuple[str, ...]]:
+def describe_file(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str, ...]]:
     """Return a description of the file and warnings. Raises InputError with one line."""
     from skysim.core.yaml_reader import is_file, read_yaml
     from skysim.scene import opencv_calibration

@@ -1,4 +1,4 @@
-"""Actions of the user, by keys or by a palette (Ctrl-K) that lists all actions and filters them by typed text."""
+"""Actions of the user, by keys or by a palette (Ctrl-K, F1) that lists all actions and filters them by typed text."""
 
 from __future__ import annotations
 
@@ -76,6 +76,7 @@ class Palette:
             self.field.on("keydown.up.prevent", lambda: self.choose(self.chosen - 1))
             self.field.on("keydown.enter.prevent", self.enter)
             self.list = ui.element("div").classes("lab-commands").props('role="listbox"')
+            widgets.quiet(keys.PURPOSE)
         ui.add_body_html(f"<script>{OPEN_JS}</script>")
         ui.on("palette", self.open)
 
@@ -144,23 +145,25 @@ class Actions:
         self.page = page
         self.sensor = sensor
         self.step = step
-        self.performers = {**performers, "help": self.toggle_help}
+        self.palette = Palette(self.commands)
+        self.performers = {**performers, "help": self.palette.open}
         self.others = others
         self.steps = np.zeros(3)
         self.moving = False
-        self.help = keys.help_dialog()
-        self.palette = Palette(self.commands)
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"])
 
     def commands(self) -> list[Command]:
-        """Every action with its key."""
-        by_key = [key for key in keys.KEYS if key.action in self.performers]
+        """Every action with its key; that of a key that is held, such as an arrow, is only named."""
         return [
-            Command(key.help, partial(self.perform, key.action), key.label) for key in by_key
-        ] + [*self.others]
+            *(
+                Command(key.help, partial(self.perform, key.action), key.label)
+                for key in keys.KEYS
+            ),
+            *self.others,
+        ]
 
     async def key(self, event: KeyEventArguments) -> None:
-        """Perform the action of a pressed key, unless a dialog is open."""
+        """Perform the action of a pressed key, unless the palette is open."""
         name = event.key.name.lower() if len(event.key.name) == 1 else event.key.name
         action = keys.ACTION_BY_KEY.get(name)
         if (
@@ -168,9 +171,8 @@ class Actions:
             or action is None
             or event.modifiers.ctrl
             or event.modifiers.meta
+            or self.palette.dialog.value
         ):
-            return
-        if self.palette.dialog.value or (self.help.value and action not in ("help", "close")):
             return
         if action == "move":
             right, up, roll_sign = keys.MOVES[name]
@@ -204,10 +206,5 @@ class Actions:
     async def perform(self, action: str) -> None:
         """Clear an older message and perform the action of a key."""
         self.page.show_message("")
-        if action == "close":
-            self.help.close()
-        elif action in self.performers:
+        if action in self.performers:
             await perform(self.performers[action])
-
-    def toggle_help(self) -> None:
-        self.help.set_value(not self.help.value)

@@ -33,6 +33,7 @@ from skysim.experiments.study.plan import Plan, TrialSection
 from skysim.scene.loader import load
 
 POLL_S = 0.5
+MODEL = "A trial of centroids takes stars of the catalog with random errors."
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 
 
@@ -80,6 +81,7 @@ class MonteCarloPanel:
             )
             self.count.mark("runs")
             self.kind = widgets.select(TRIAL_KINDS, value="centroids", label="of")
+            self.kind.tooltip(MODEL)
             self.noise = widgets.number("noise, px", value=0.1, min=0, max=10, step=0.05)
             self.noise.on_value_change(self.show_noise)
             self.magnitude = widgets.number("noise, mag", value=0.25, min=0, max=5, step=0.05)
@@ -88,7 +90,8 @@ class MonteCarloPanel:
             self.field.on("keydown.enter", self.set_field_of_view)
         with widgets.row(3) as self.model:
             self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
-            self.noise_text = widgets.quiet().mark("noise-text")
+            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1)
+            self.arcsec.on("blur", self.angle_typed).on("keydown.enter", self.angle_typed)
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
             "instant-feedback"
         )
@@ -117,11 +120,22 @@ class MonteCarloPanel:
             self.field.set_value(round(info.field_deg, 3))
         self.show_noise()
 
-    def show_noise(self) -> None:
-        """Show the centroids' noise as an angle in the middle of the frame."""
+    @property
+    def noise_arcsec(self) -> float:
+        """The centroids' noise as an angle in the middle of the frame."""
         info = self.page.scene_info
-        angle = f"{float(self.noise.value or 0) * info.pixel_arcsec:.3g}″" if info else ""
-        self.noise_text.set_text(f"noise of a centroid: {angle} an axis")
+        pixel_arcsec = info.pixel_arcsec if info else 0.0
+        return float(f"{float(self.noise.value or 0) * pixel_arcsec:.4g}")
+
+    def show_noise(self) -> None:
+        self.arcsec.set_value(self.noise_arcsec)
+
+    def angle_typed(self) -> None:
+        """Set the noise from a typed angle."""
+        info = self.page.scene_info
+        if info and self.arcsec.value != self.noise_arcsec:
+            noise_px = float(self.arcsec.value or 0) / info.pixel_arcsec
+            self.noise.set_value(float(f"{noise_px:.4g}"))
 
     def study_chosen(self) -> None:
         """Hide the Monte Carlo fields when a study file is chosen."""

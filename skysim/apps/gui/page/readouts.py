@@ -12,7 +12,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import (
     Detection,
     FrameView,
-    LightRow,
+    Lights,
     SceneInfo,
     TrackerResult,
     places_px,
@@ -179,7 +179,7 @@ class LightsPanel:
 
 
 def rows(
-    lights: Collection[LightRow],
+    lights: Lights,
     detections: Collection[Detection],
     name: Callable[[int], str],
 ) -> Iterator[dict[str, Any]]:
@@ -195,7 +195,7 @@ def rows(
     found_px = places_px(found)
     left = dict(enumerate(found))
     for light in lights:
-        distance_px = np.hypot(*(found_px - (light.x, light.y)).T)
+        distance_px = np.hypot(*(found_px - light.xy_px).T)
         is_near = distance_px.min(initial=np.inf) < overlay.NEAR_PX
         spot = left.pop(int(distance_px.argmin()), None) if is_near else None
         yield {
@@ -218,22 +218,17 @@ def rows(
         yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": texts}
 
 
-def cells(light: LightRow, spot: Detection | None, name: Callable[[int], str]) -> list[str]:
+def cells(light: Any, spot: Detection | None, name: Callable[[int], str]) -> list[str]:
     magnitude = "" if math.isnan(light.magnitude) else f"{light.magnitude:.2f}"
-    texts = [
-        name(light.id),
-        magnitude,
-        f"{light.electrons:.4g}",
-        f"{light.x:.2f}",
-        f"{light.y:.2f}",
-    ]
+    x, y = light.xy_px
+    texts = [name(light.id), magnitude, f"{light.electrons:.4g}", f"{x:.2f}", f"{y:.2f}"]
     if spot is None:
         return [*texts, "", ""]
-    error_px = math.hypot(spot.x - light.x, spot.y - light.y)
+    error_px = math.hypot(spot.x - x, spot.y - y)
     return [*texts, f"{error_px:.3f}", name(spot.id) if spot.id >= 0 else "–"]
 
 
-def state(light: LightRow, spot: Detection | None) -> str:
+def state(light: Any, spot: Detection | None) -> str:
     if spot is None or spot.id < 0:
         return "quiet"
     return "good" if spot.id == light.id else "warn"

@@ -20,7 +20,8 @@ from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 TIME_S = attrgetter("t_s")  # time of a row
-CONTROL_KEYS = ("motion.control", "motion.maneuver")
+CONTROL = "motion.control"
+CONTROL_KEYS = (CONTROL, "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
 LOOK_S = 0.05  # interval of checks whether the flight still plays
 DRAW_S = 0.7  # interval of drawing the strips while frames are computed
@@ -57,9 +58,6 @@ class RunPanel:
         Index of the frame on the page
     started_s, from_s
         Time of the last start of playback, and the time in the flight at this start
-    closed_scene, closed_overrides
-        Last scene with a closed loop and its overrides, with which an opened loop is closed
-        again
     """
 
     feedback = ""
@@ -69,7 +67,6 @@ class RunPanel:
     plays_when_done = False
     started_s = 0.0
     drawn_s = 0.0
-    closed_scene = ""
 
     def __init__(
         self, page: context.PageContext, contents: live.Contents, sensor: SensorView
@@ -79,7 +76,6 @@ class RunPanel:
         self.sensor = sensor
         self.when_shown: Callable[[], None] | None = None
         self.factor = SPEEDS["real time"]
-        self.closed_overrides: dict[str, str] = {}
         self.slot = ui.context.slot
         self.build()
         ui.on("moment", self.clicked)
@@ -145,13 +141,8 @@ class RunPanel:
         self.clear()
         control = info.scene.motion.control
         self.feedback = control.feedback if control else ""
-        state = self.page.state
-        if self.feedback:
-            self.closed_scene = state.scene
-            self.closed_overrides = dict(state.overrides)
-        offered = (
-            forms.FEEDBACKS if self.closed_scene == state.scene else {"": forms.FEEDBACKS[""]}
-        )
+        has_loop = self.feedback or CONTROL in self.page.state.overrides
+        offered = forms.FEEDBACKS if has_loop else {"": forms.FEEDBACKS[""]}
         self.loop.set_options(offered, value=self.feedback)
 
     def clear(self) -> None:
@@ -167,26 +158,23 @@ class RunPanel:
         self.enable()
 
     async def close_loop(self) -> None:
-        """Reopen the scene with another feedback. An opened loop can be closed again with its old controller."""
+        """Reopen the scene with another feedback. An opened loop is closed again with the controller of the file."""
         state = self.page.state
         feedback = str(self.loop.value or "")
-        if self.closed_scene != state.scene or feedback == self.feedback:
+        if feedback == self.feedback:
             return
+        stays_closed = feedback and self.feedback
+        replaced = CONTROL if stays_closed else CONTROL_KEYS
         others = {
             key: value
             for key, value in state.overrides.items()
-            if not key.startswith(CONTROL_KEYS)
+            if not key.startswith(replaced)
         }
-        controls = {}
-        maneuver = {}
-        for key, value in self.closed_overrides.items():
-            if key.startswith(CONTROL_KEYS):
-                controls[key] = value
-            if feedback and key.startswith("motion.maneuver"):
-                maneuver[key] = value
-        control = forms.loop_overrides(state.scene, others | controls, feedback)
+        control = forms.loop_overrides(
+            state.scene, state.overrides if stays_closed else others, feedback
+        )
         self.loop.disable()  # no second change while this one runs
-        await self.page.open(state.scene, others | maneuver | control)
+        await self.page.open(state.scene, others | control)
         if self.page.is_open:
             # The old value, if the scene refused the change.
             self.loop.set_value(self.feedback)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from nicegui import run, ui
 
-from skysim.apps.gui.page.monte_carlo_panel import MonteCarloPanel
 from skysim.apps.gui.views import context, forms, keys, live, widgets
 from skysim.core.errors import InputError
 
@@ -38,7 +37,6 @@ NAMES = {  # by group and key
     },
 }
 FOCUS_S = 0.2  # time until a part that opens is drawn
-MODEL = "Sensor model: the Monte Carlo simulation of centroids takes stars of the catalog with random errors."
 
 
 @dataclass
@@ -297,32 +295,18 @@ class ScenePanel:
 class TrackerPanel:
     """The settings of F6 and F7 in PTASE: image processing with the sensor's noise, and identification.
 
-    It has a form of two parts, without keys that have no effect, and the noise of the lights in Monte Carlo studies.
+    It has a form of two parts, without keys that have no effect.
 
     Attributes
     ----------
-    study
-        Panel of the Monte Carlo studies
     shown
         Scene and overrides in the form
     """
 
-    def __init__(self, page: context.PageContext, study: MonteCarloPanel) -> None:
-        self.page = page
-        self.study = study
+    def __init__(self, page: context.PageContext) -> None:
         self.shown: tuple[str, Mapping[str, str]] | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
-        widgets.quiet(MODEL).style("margin: 10px 0 4px")
-        with widgets.row():
-            self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1).mark(
-                "noise-arcsec"
-            )
-            self.arcsec.on("blur", self.typed).on("keydown.enter", self.typed)
-            magnitude = widgets.number("noise, magnitudes", min=0, max=5, step=0.05)
-            magnitude.classes("w-36 flex-none").bind_value(study.magnitude)
-            widgets.checkbox("with noise").bind_value(study.with_noise).mark("model-noise")
-        study.noise.on_value_change(self.show_noise)
 
     def set_scene(self, fields: Sequence[forms.FormField]) -> None:
         """Show the fields of the current scene."""
@@ -333,23 +317,6 @@ class TrackerPanel:
                 for group in NAMES
             }
         )
-        self.show_noise()
-
-    def show_noise(self) -> None:
-        """Show the noise of a centroid as an angle in the middle of the frame."""
-        info = self.page.scene_info
-        if info:
-            self.arcsec.set_value(
-                float(f"{float(self.study.noise.value or 0) * info.pixel_arcsec:.4g}")
-            )
-
-    def typed(self) -> None:
-        """Set the noise from a typed angle."""
-        info = self.page.scene_info
-        noise = self.study.noise
-        shown = float(f"{float(noise.value or 0) * info.pixel_arcsec:.4g}") if info else 0.0
-        if info and self.arcsec.value != shown:
-            noise.set_value(float(f"{float(self.arcsec.value or 0) / info.pixel_arcsec:.4g}"))
 
     def open(self, action: str) -> None:
         """Show the part of an action (sensor or identifier) and focus its first field."""

@@ -190,7 +190,7 @@ class Tab:
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
-                    self.tracker_panel = settings_panel.TrackerPanel(self, self.study_panel)
+                    self.tracker_panel = settings_panel.TrackerPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
@@ -211,6 +211,7 @@ class Tab:
             "noise": self.head.toggle_noise,
             "monte_carlo": self.start_study,
             "play": self.run_panel.toggle,
+            "undo": self.history.undo,
             "live": self.head.go_live,
             "attitude": self.attitude.focus,
             "sensor": partial(self.set_up_tracker, "sensor"),
@@ -228,7 +229,6 @@ class Tab:
             Command(
                 "show the previous frame of the flight", partial(self.run_panel.step, -1), ","
             ),
-            Command("undo the last change", self.history.undo, "Ctrl Z"),
             Command("redo the change that was undone", self.history.redo, "Ctrl Shift Z"),
             Command("compute the flight of the scene, or stop that", self.run_panel.simulate),
             Command("change between the dark and the light theme", self.arrangement.toggle),

@@ -8,9 +8,9 @@ from nicegui import ui
 
 
 class Key(NamedTuple):
-    """Keys as the browser names them, their action, and their label and description on the screen and in the help.
+    """Keys as the browser names them, their action, their label and description on the screen, and a line of help.
 
-    A key without a description is only in the help.
+    A key without a description is only in the list of actions, which has the lines of help.
     """
 
     keys: tuple[str, ...]
@@ -28,6 +28,10 @@ MOVES = {  # right, up, roll clockwise; unit: one step of a key press
     "e": (0, 0, -1),
     "r": (0, 0, 1),
 }
+PURPOSE = (
+    "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
+    " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
+)
 KEYS = (
     Key(
         tuple(MOVES)[:4],
@@ -83,8 +87,8 @@ KEYS = (
         "list every action; type a part of its name",
     ),
     Key(("F10",), "F10", "log", "log", "show the log of this session"),
-    Key(("F1",), "F1", "help", "help", "show this help"),
-    Key(("Escape",), "Esc", "close", "close", "close the help"),
+    Key(("F1",), "F1", "help", "help", "list every action with its key"),
+    Key(("Escape",), "Esc", "close", "close", "close the list of actions"),
 )
 ACTION_BY_KEY = {name: key.action for key in KEYS for name in key.keys}
 
@@ -110,24 +114,3 @@ def focus(field: ui.element) -> None:
     list closes, and then takes the focus from the page, whose keys no longer act.
     """
     field.client.run_javascript(f"getElement({field.id}).$el.querySelector('input').focus()")
-
-
-def help_dialog() -> ui.dialog:
-    """A dialog on the purpose of the page and its keys."""
-    with (
-        ui.dialog() as dialog,
-        ui.card().style("max-width: 600px; padding: 20px 24px; gap: 12px"),
-    ):
-        ui.label("skysim gui").style("font-weight: 600; font-size: 15px")
-        ui.label(
-            "Point the star sensor, view its frame, and compare the tracker's attitude with the true one. Under a"
-            " dome the angles are the vehicle's (roll, pitch, yaw); under the stars the camera's (RA, Dec, roll)."
-        )
-        with ui.element("div").style(
-            "display: grid; grid-template-columns: 110px 1fr; gap: 4px 12px"
-        ):
-            for key in KEYS:
-                label = f'<span class="lab-keys" style="padding: 0; border: 0"><kbd>{key.label}</kbd></span>'
-                ui.html(label, sanitize=False)
-                ui.label(key.help)
-    return dialog

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import (
     LIMITS,
     Display,
-    LightColumns,
+    Lights,
     Pixels,
     TrackerResult,
     places_px,
@@ -51,7 +51,7 @@ Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: LightColumns,
+    lights: Lights,
     result: TrackerResult | None,
     shown: Collection[str],
     name: Callable[[int], str],
@@ -105,9 +105,7 @@ def marks(
     }
 
 
-def bright_count(
-    lights: LightColumns, identified: Collection[int], near: NDArray[np.bool_]
-) -> int:
+def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.bool_]) -> int:
     """Number of lights that are at least as bright as the faintest identified one, or else the faintest detected one.
 
     Detected ones alone are no measure: in a field of hundreds of faint stars, noise is detected beside some of them.

@@ -21,8 +21,6 @@ from skysim.apps.gui.messages import (
     Detection,
     FrameView,
     Lens,
-    LightColumns,
-    LightRow,
     Pose,
     SceneInfo,
     TrackerResult,
@@ -87,7 +85,7 @@ class SensorView:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
-        self.lights: LightColumns = NO_LIGHTS
+        self.lights = NO_LIGHTS
         self.size_px = (4, 3)
         self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
@@ -243,7 +241,7 @@ class SensorView:
         self.hover_px = (event.args["x"], event.args["y"]) if event.args["inside"] else None
         self.update_text()
 
-    def nearest(self, x: float, y: float) -> tuple[Detection | None, LightRow | None]:
+    def nearest(self, x: float, y: float) -> tuple[Detection | None, Any]:
         """The nearest detection and the nearest true light within a few widths of a mark, or None."""
         radius_px = max(8.0, self.size_px[0] / 60)
 
@@ -259,12 +257,13 @@ class SensorView:
             None if light is None else self.lights[light],
         )
 
-    def light_text(self, detection: Detection | None, light: LightRow | None) -> str:
+    def light_text(self, detection: Detection | None, light: Any) -> str:
         """Text on a light: its true place, its detection and the error."""
         lines = []
-        if light:
+        if light is not None:
+            x, y = light.xy_px
             brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
-            lines += [f"truth      {light.x:8.2f} {light.y:8.2f}   {self.name(light.id)}"]
+            lines += [f"truth      {x:8.2f} {y:8.2f}   {self.name(light.id)}"]
             lines += [f"           {brightness}{light.electrons:.4g} e-"]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
@@ -280,10 +279,9 @@ class SensorView:
                 f"           {identity}",
                 f"           flux {detection.flux:.4g}{residual}",
             ]
-            if light:
-                lines += [
-                    f"           error {math.hypot(detection.x - light.x, detection.y - light.y):.3f} px"
-                ]
+            if light is not None:
+                error_px = math.hypot(detection.x - x, detection.y - y)
+                lines += [f"           error {error_px:.3f} px"]
         return "\n".join(lines)
 
 

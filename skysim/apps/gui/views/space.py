@@ -97,7 +97,7 @@ class Scene3D:
             return
         found = view.result.detections if view.result else ()
         identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
-        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id}
+        fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
 

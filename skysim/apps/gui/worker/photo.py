@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from skysim.apps.gui.messages import (
     NO_LIGHTS,
     NO_PIXELS,
     Lens,
-    LightColumns,
+    Lights,
     Pixels,
     Pose,
     TrackerResult,
@@ -61,7 +61,7 @@ class Photo:
     pose: Pose | None = None
     names: tuple[str, str, str] = ("RA", "Dec", "roll")
     angles_deg: Triple | None = None
-    lights: LightColumns = NO_LIGHTS
+    lights: Lights = field(default_factory=lambda: NO_LIGHTS)
     prefix: str = "HIP"
     hint: str = ""
 

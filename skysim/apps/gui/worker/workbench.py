@@ -17,11 +17,12 @@ from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.gui.messages import (
+    LIGHT,
     AmbiguityMap,
     Detection,
     FrameView,
     Lens,
-    LightColumns,
+    Lights,
     SceneInfo,
     TrackerResult,
 )
@@ -184,7 +185,7 @@ def id_prefix(lab: Lab) -> str:
     return "LED" if np.isnan(lab.camera.sources.magnitude).all() else "HIP"
 
 
-def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
+def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     """Return the true lights of a frame, the brightest first.
 
     Parameters
@@ -198,9 +199,8 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> LightColumns:
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    return LightColumns(
-        ids, sources.flux_xy_px[rows], sources.electrons[rows], np.array(magnitudes, float)
-    )
+    xy_px = sources.flux_xy_px[rows]
+    return np.rec.fromarrays([ids, xy_px, sources.electrons[rows], magnitudes], LIGHT)
 
 
 def magnitude_by_id(lab: Lab) -> dict[int, float]:
