@@ -25,7 +25,7 @@ from skysim.core.types import Floats, Sources
 from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
-from skysim.scene.sections.leds import LedConfig, PwmConfig, SequentialConfig
+from skysim.scene.sections.leds import PwmConfig, SequentialConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import Ints
@@ -42,11 +42,14 @@ SURVEY = "survey"  # a line whose part begins so is a way to survey the LEDs
 UNITS = {
     **dict.fromkeys(("shell", "shell_bent", "shell_flat"), "m2"),
     **dict.fromkeys(
-        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"),
-        "each",
-    ),
-    **dict.fromkeys(
         (
+            "led",
+            "board",
+            "panel",
+            "mounting_led",
+            "mounting_board",
+            "resistor",
+            "filter",
             "driver",
             "microcontroller",
             "sequencer",
@@ -290,26 +293,24 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     return found
 
 
-def build_design(scene: Scene) -> DomeDesign:
-    """The scene's dome as designed. Raises InputError without a dome."""
+def build_design(scene: Scene, what: str = "parts") -> DomeDesign:
+    """The scene's dome as designed. Raises InputError without a dome, which has no `what`."""
     light = scene.dome
     if light is None:
-        raise InputError("light.kind", f"{scene.light.kind} has no parts", "dome")
+        raise InputError("light.kind", f"{scene.light.kind} has no {what}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
-    return DomeDesign(
-        light, surface, leds, max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
-    )
+    # Boards stand out.
+    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    return DomeDesign(light, surface, leds, cap_deg)
 
 
 def single_leds(design: DomeDesign) -> Quantities:
-    """LEDs one by one, each in its hole."""
+    """LEDs one by one, each in its hole, or at the rim with a fiber to its hole."""
     count = len(design.leds)
-    return {
-        "led": count,
-        "mounting_led": count,
-        "wire": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
-    }
+    line = "fiber" if design.light.layout.kind == "fibers" else "wire"
+    length_m = float(design.to_rim_m(design.leds.place[:, :3]).sum())
+    return {"led": count, "mounting_led": count, line: length_m}
 
 
 def boards(design: DomeDesign) -> Quantities:
@@ -337,16 +338,6 @@ def tape(design: DomeDesign) -> Quantities:
     return {kind: length_m, "mounting_tape": length_m, "wire": float(wire_m)}
 
 
-def fibers(design: DomeDesign) -> Quantities:
-    """LEDs at the rim, each with a fiber to its hole."""
-    count = len(design.leds)
-    return {
-        "led": count,
-        "fiber": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
-        "mounting_led": count,
-    }
-
-
 def panel(design: DomeDesign) -> Quantities:
     """An LCD panel, with all that drives it."""
     return {"panel": 1}
@@ -355,7 +346,6 @@ def panel(design: DomeDesign) -> Quantities:
 MOUNTED: dict[str, Callable[[DomeDesign], Quantities]] = {
     "patch_boards": boards,
     "string": tape,
-    "fibers": fibers,
     "lcd": panel,
 }
 
@@ -384,11 +374,8 @@ def electronics(design: DomeDesign) -> Quantities:
     if led.drive.kind == "direct" and led.code is None:
         return {"resistor": count}
     channels: Quantities = {"driver": count, "microcontroller": count}
-    return channels | {"filter": count} if has_filter(led) else channels
-
-
-def has_filter(led: LedConfig) -> bool:
-    return isinstance(led.drive, PwmConfig) and led.drive.filter is not None
+    filtered = isinstance(led.drive, PwmConfig) and led.drive.filter is not None
+    return channels | {"filter": count} if filtered else channels
 
 
 def to_csv(parts: PartsList, name: str) -> str:

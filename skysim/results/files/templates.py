@@ -22,13 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.results.files.parts import build_design
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.layouts.string import directions
-from skysim.sources.dome.surface import Surface, build_surface, perpendicular
+from skysim.sources.dome.surface import Surface, perpendicular
 
 # A flat drawing in millimeters, as SVG to print and as DXF for a cutter.
 
@@ -185,20 +184,14 @@ def template(lab: Lab, ending: str) -> str:
 
 def dome_of(lab: Lab) -> Dome:
     """The dome that a scene's builder makes. Raises InputError without a dome."""
-    light = lab.scene.dome
-    if light is None:
-        raise InputError("light.kind", f"{lab.scene.light.kind} has no templates", "dome")
-    surface = build_surface(light.surface)
-    leds = design_leds(light, surface, lab.camera.band)
-    # Boards stand out.
-    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    design = build_design(lab.scene, "templates")
     return Dome(
         lab.scene.name,
-        surface,
-        cap_deg,
-        leds.id,
-        leds.place[:, :3],
-        light.led.disk_diameter_m / 2,
+        design.surface,
+        design.cap_deg,
+        design.leds.id,
+        design.leds.place[:, :3],
+        design.light.led.disk_diameter_m / 2,
     )
 
 
