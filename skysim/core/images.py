@@ -483,11 +483,10 @@ def check_name(path: Path) -> None:
     check_bytes(path)
 
 
-def check_numbers(path: Path, pixels: NDArray) -> NDArray:
-    """The pixels. Raises InputError unless they are real numbers."""
+def check_numbers(path: Path, pixels: NDArray) -> None:
+    """Raise InputError unless the pixels are real numbers."""
     if pixels.dtype.kind not in "uif":
         raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
-    return pixels
 
 
 def is_fits(path: Path) -> bool:

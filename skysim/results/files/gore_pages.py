@@ -27,6 +27,7 @@ from skysim.results.files.templates import (
     Polyline,
     Shape,
     SheetText,
+    cross,
     gore,
     gore_count,
     moved,
@@ -113,12 +114,8 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
 
 def registration_mark(x_mm: float, y_mm: float) -> list[Shape]:
     """A circle with a cross."""
-    reach_mm = 1.5 * MARK_MM
-    return [
-        Circle(x_mm, y_mm, MARK_MM, "MARKS"),
-        Polyline(np.array([[x_mm - reach_mm, y_mm], [x_mm + reach_mm, y_mm]]), layer="MARKS"),
-        Polyline(np.array([[x_mm, y_mm - reach_mm], [x_mm, y_mm + reach_mm]]), layer="MARKS"),
-    ]
+    circle = Circle(x_mm, y_mm, MARK_MM, "MARKS")
+    return [circle, *cross(x_mm, y_mm, 1.5 * MARK_MM, "MARKS")]
 
 
 def write_pdf(path: Path, dome: Dome, paper: str) -> int:

@@ -322,9 +322,14 @@ def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterat
     """A circle with a cross for each LED, and its number."""
     for number, (x, y) in zip(numbers, xy_mm, strict=True):
         yield Circle(x, y, radius_mm)
-        yield Polyline(np.array([[x - 1, y], [x + 1, y]]), layer="CENTERS")
-        yield Polyline(np.array([[x, y - 1], [x, y + 1]]), layer="CENTERS")
+        yield from cross(x, y, 1.0, "CENTERS")
         yield SheetText(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
+
+
+def cross(x_mm: float, y_mm: float, reach_mm: float, layer: str) -> Iterator[Shape]:
+    """Two lines of twice this reach through a point."""
+    for arm in np.diag([reach_mm, reach_mm]):
+        yield Polyline(np.add(np.outer([-1, 1], arm), (x_mm, y_mm)), layer=layer)
 
 
 def shell_obj(dome: Dome) -> str:
