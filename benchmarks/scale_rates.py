@@ -6,7 +6,6 @@ seconds of CPU, which other load lengthens less. docs/explanation/scale.md uses 
 
 from __future__ import annotations
 
-import io
 import tarfile
 import tempfile
 import time
@@ -25,7 +24,7 @@ from benchmarks.timing import figure, verdict, versus
 from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
 from skysim.experiments import dataset_run, dataset_shards
-from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
+from skysim.experiments.dataset_labels import label_frame, labeller
 from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.plan import Plan
@@ -72,7 +71,6 @@ def measure() -> list[dict[str, Any]]:
     return [
         *frames(),
         *parts(),
-        writing(),
         *centroids(),
         *closed_loop(),
         *worker_cost(),
@@ -152,7 +150,7 @@ def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
     """Milliseconds of CPU of a frame: render; label (detection, masks); encode (COCO, numbers); write (the tar)."""
     spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
     with tempfile.TemporaryFile() as file:
-        tar = dataset_shards.TarWriter(file)
+        tar = tarfile.TarFile(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
         by = None
         for number, levels, setup, one in dataset_run.labelled_frames(made, 0):
             by = by or labeller(setup.lab.scene)
@@ -167,7 +165,7 @@ def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
                 )
                 dataset_shards.coco_annotations(one, number)
             with timed(spent, "write"):
-                dataset_shards.add_frame(tar, number, one, row | {"levels": levels})
+                dataset_shards.add_frame(tar, number, one, row | {"levels": levels}, False)
     spent["label"] -= spent["render"]
     return {name: 1e3 * seconds / PARTS for name, seconds in spent.items()}
 
@@ -178,40 +176,6 @@ def timed(spent: dict[str, float], name: str) -> Iterator[None]:
     begin = time.process_time()
     yield
     spent[name] += time.process_time() - begin
-
-
-def writing() -> dict[str, Any]:
-    """The tar of a shard, beside Python's tarfile and numpy.save with the same members."""
-    _, _, _, one = next(dataset_run.labelled_frames(small_plan(PER_SHARD), 0))
-    kept = [(number, one) for number in range(PER_SHARD)]
-    return versus(
-        "write 16 frames as a tar",
-        lambda: ours(kept),
-        "tarfile",
-        lambda: by_tarfile(kept),
-        repeats=10,
-    )
-
-
-def ours(kept: list[tuple[int, LabelledFrame]]) -> None:
-    """Write the frames as skysim does, to memory."""
-    tar = dataset_shards.TarWriter(io.BytesIO())
-    for number, one in kept:
-        dataset_shards.add_frame(tar, number, one, {})
-    tar.close()
-
-
-def by_tarfile(kept: list[tuple[int, LabelledFrame]]) -> None:
-    """Write the same with Python's library."""
-    with tarfile.open(fileobj=io.BytesIO(), mode="w") as tar:
-        for number, one in kept:
-            for name, array in (("image", one.frame.image_dn), ("sources", one.sources)):
-                file = io.BytesIO()
-                np.save(file, array)
-                member = tarfile.TarInfo(f"{number:09d}.{name}.npy")
-                member.size = file.tell()
-                file.seek(0)
-                tar.addfile(member, file)
 
 
 # Trials, motion, clusters.

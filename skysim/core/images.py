@@ -261,7 +261,9 @@ CAMERA_RAW = (".dng", ".cr2", ".nef", ".arw")  # of digital cameras with a Bayer
 IMAGE_SUFFIXES = (*SUFFIXES, *encoded.SUFFIXES, NPY, *CAMERA_RAW)
 NOISE_E = 10.0  # assumed noise of a pixel, of read-out and sky, in frames of unknown scale
 WHOLE_SCALE = 65535.0  # of frames without noise
-LUMINANCE = {"blue": 0.114, "green": 0.587, "red": 0.299}  # ITU-R BT.601, in OpenCV's order
+LUMINANCE = np.array(
+    [0.114, 0.587, 0.299]
+)  # of blue, green and red (ITU-R BT.601), OpenCV's order
 
 
 @dataclass(frozen=True, slots=True)
@@ -481,11 +483,10 @@ def check_name(path: Path) -> None:
     check_bytes(path)
 
 
-def check_numbers(path: Path, pixels: NDArray) -> NDArray:
-    """The pixels. Raises InputError unless they are real numbers."""
+def check_numbers(path: Path, pixels: NDArray) -> None:
+    """Raise InputError unless the pixels are real numbers."""
     if pixels.dtype.kind not in "uif":
         raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
-    return pixels
 
 
 def is_fits(path: Path) -> bool:
@@ -507,10 +508,7 @@ def monochrome(image: NDArray) -> NDArray:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
         return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
-    gray = np.zeros(image.shape[:2])
-    for n, weight in enumerate(LUMINANCE.values()):
-        gray += weight * image[:, :, n]
-    return gray
+    return np.asarray(image[:, :, :3] @ LUMINANCE)
 
 
 class LiveCamera:

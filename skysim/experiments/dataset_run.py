@@ -8,6 +8,7 @@ continues: frames that are made again have the same bytes.
 from __future__ import annotations
 
 import json
+import tarfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -26,7 +27,6 @@ from skysim.experiments.dataset_shards import (
     ZARR,
     ZARR_ARRAY,
     Storage,
-    TarWriter,
     shard_name,
 )
 from skysim.experiments.study import study_file
@@ -291,7 +291,11 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     coco = []
     name = shard_name(SHARDS, shard, "tar")
     with storage.writer(name) if "webdataset" in plan.formats else nullcontext() as file:
-        tar = TarWriter(file) if file else None
+        tar = (
+            tarfile.TarFile(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
+            if file
+            else None
+        )
         for frame, levels, setup, one in labelled_frames(plan, shard):
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
             row = dataset_shards.frame_labels(one, setup.lab.scene, numbers)

@@ -116,48 +116,12 @@ class Storage:
 ZARR = "images.zarr"
 ZARR_ARRAY = "images"
 IMAGE_NAME = {False: "image.npy", True: "image.npz"}  # of a frame in a tar; True: compressed
-BLOCK = 512  # bytes of a block of a tar file
 COCO_SNR = 3.0  # sources below have no annotation; they are in the other labels
 CATEGORIES = ("source", *MASKS)
 SOURCE_JSON = (
     '{"id": %d, "image_id": %d, "category_id": 1, "bbox": [%s], "area": %r, '
     '"segmentation": [[%s]], "iscrowd": 0, "source": %d, "electrons": %r, "detected": %s}'
 )
-
-
-def to_npy(array: NDArray) -> bytes:
-    """The header of an array in NumPy's format, version 1."""
-    file = io.BytesIO()
-    description = np.lib.format.header_data_from_array_1_0(array)
-    np.lib.format.write_array_header_1_0(file, description)
-    return file.getvalue()
-
-
-class TarWriter:
-    """A tar file in the POSIX ustar format, without times and owners, so that the same frames give the same bytes."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.file = file
-        self.position = 0
-
-    def add(self, name: str, *parts: bytes | memoryview) -> int:
-        """Append a file made of several parts; return the position of the last part in the tar."""
-        header = tarfile.TarInfo(name)
-        header.size = sum(len(part) for part in parts)
-        self._write(header.tobuf(tarfile.USTAR_FORMAT))
-        for part in parts:
-            last = self.position
-            self._write(part)
-        self._write(bytes(-self.position % BLOCK))
-        return last
-
-    def close(self) -> None:
-        """Write the two empty blocks at the end."""
-        self._write(bytes(2 * BLOCK))
-
-    def _write(self, data: bytes | memoryview) -> None:
-        self.file.write(data)
-        self.position += len(data)
 
 
 def key_of(frame: int) -> str:
@@ -170,20 +134,30 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
     return f"{folder}/{shard:06d}.{suffix}"
 
 
+def add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
+    """Append a file without time and owner, so that the same frames give the same bytes; return where it ends."""
+    header = tarfile.TarInfo(name)
+    header.size = len(data)
+    begin = tar.offset + tarfile.BLOCKSIZE
+    tar.addfile(header, io.BytesIO(data))
+    return begin + len(data)
+
+
 def add_frame(
-    tar: TarWriter, number: int, one: LabelledFrame, labels: Record, compress: bool
+    tar: tarfile.TarFile, number: int, one: LabelledFrame, labels: Record, compress: bool
 ) -> int:
     """Append a frame with its labels; return the position of its first pixel, -1 if it is compressed (an .npz)."""
     key = key_of(number)
     image = np.ascontiguousarray(one.frame.image_dn)
+    data = io.BytesIO()
     if compress:
-        packed = io.BytesIO()
-        np.savez_compressed(packed, image=image)
-        tar.add(f"{key}.{IMAGE_NAME[True]}", packed.getvalue())
-        position = -1
+        np.savez_compressed(data, image=image)
     else:
-        position = tar.add(f"{key}.{IMAGE_NAME[False]}", to_npy(image), image.data.cast("B"))
-    tar.add(f"{key}.sources.npy", to_npy(one.sources), one.sources.tobytes())
+        np.save(data, image)
+    end = add_file(tar, f"{key}.{IMAGE_NAME[compress]}", data.getvalue())
+    sources = io.BytesIO()
+    np.save(sources, one.sources)
+    add_file(tar, f"{key}.sources.npy", sources.getvalue())
     masks = {
         name: {"size": list(image.shape), "counts": counts}
         for name, counts in one.masks.items()
@@ -193,8 +167,8 @@ def add_frame(
         "unmatched_px": one.unmatched_px.tolist(),
         "hidden": one.truth.hidden.tolist(),
     }
-    tar.add(f"{key}.frame.json", json.dumps(labels | more).encode())
-    return position
+    add_file(tar, f"{key}.frame.json", json.dumps(labels | more).encode())
+    return -1 if compress else end - image.nbytes
 
 
 def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:

@@ -569,9 +569,7 @@ def file_names(tree: Any) -> Iterator[tuple[str, str]]:
 
 
 def load_camera(
-    path: Path,
-    lens: Keys | None = None,
-    overrides: OverrideTexts | None = None,
+    path: Path, lens: Keys | None = None, overrides: OverrideTexts | None = None
 ) -> CameraConfig:
     """The `camera` section of a scene, or of a file with only a camera. Raises InputError.
 

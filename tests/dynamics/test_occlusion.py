@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
@@ -268,7 +269,7 @@ def test_without_sources_occlusion_returns_nothing() -> None:
 
 
 def made(text: dict[str, Any]) -> Surface:
-    return surface.build_surface(light.SurfaceConfig.model_validate(text))
+    return surface.build_surface(TypeAdapter(light.AnySurface).validate_python(text))
 
 
 def places(inside: Surface, half_deg: float) -> Floats:

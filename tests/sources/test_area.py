@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
-from skysim.scene.sections.light import SurfaceConfig
+from skysim.scene.sections.light import AnySurface
 from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
 
 
 def surface(**config: object) -> Surface:
-    return build_surface(SurfaceConfig.model_validate(config))
+    return build_surface(TypeAdapter(AnySurface).validate_python(config))
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
@@ -43,7 +44,7 @@ BAND = Band.from_efficiency("cmos")
 
 
 def surface(part: dict[str, Any]) -> Any:
-    return dome_surface.build_surface(light.SurfaceConfig.model_validate(part))
+    return dome_surface.build_surface(TypeAdapter(light.AnySurface).validate_python(part))
 
 
 def lit_dome(
@@ -114,7 +115,7 @@ def test_a_sphere_about_the_bearing_has_constant_distance() -> None:
 def test_the_apex_has_its_declared_height(part: dict) -> None:
     """Straight above the dome's own axis; the offset moves it along."""
     made = surface(part)
-    offset = light.SurfaceConfig.model_validate(part).offset_m
+    offset = TypeAdapter(light.AnySurface).validate_python(part).offset_m
     above = np.array([offset[0], offset[1], 0.0])
     top = made.meet(above, np.array([[0.0, 0.0, 1.0]]))[0]
     np.testing.assert_allclose(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -83,7 +84,7 @@ def lit(layout: dict[str, Any], surface: dict[str, Any] = SPHERE, **led: Any) ->
 
 
 def inside(part: dict[str, Any]) -> Any:
-    return surface.build_surface(light.SurfaceConfig.model_validate(part))
+    return surface.build_surface(TypeAdapter(light.AnySurface).validate_python(part))
 
 
 def full_e_s_sr() -> float:

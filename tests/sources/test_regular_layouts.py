@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
@@ -39,7 +40,7 @@ def lit(layout: dict[str, Any], on: dict[str, Any] = SPHERE, **led: Any) -> Sour
 
 
 def inside(config: dict[str, Any]) -> surface.Surface:
-    return surface.build_surface(light.SurfaceConfig.model_validate(config))
+    return surface.build_surface(TypeAdapter(light.AnySurface).validate_python(config))
 
 
 def angles(places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

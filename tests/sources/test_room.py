@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import search
@@ -47,7 +48,7 @@ def part_m(segments: int, on: dict[str, Any] = CAP, **room: Any) -> np.ndarray:
     config = RoomConfig.model_validate(
         room | {"door": ["1 mm", "1 km"], "segments": segments}
     )
-    made = surface.build_surface(light.SurfaceConfig.model_validate(on))
+    made = surface.build_surface(TypeAdapter(light.AnySurface).validate_python(on))
     return rooms.largest_part_m(config, LETTER_BOX, made, 40.0, segments)[0]
 
 
@@ -69,7 +70,7 @@ def test_a_panel_beside_the_zenith_is_sampled_from_its_near_edge_to_its_far_one(
         "height": "1 m",
         "offset": ["0.501 m", "0 m", "0 m"],
     }
-    made = surface.build_surface(light.SurfaceConfig.model_validate(panel))
+    made = surface.build_surface(TypeAdapter(light.AnySurface).validate_python(panel))
     x_m = rooms.shell_m(RoomConfig.model_validate({"segments": 1}), made, 40.0, np.zeros(1))[
         :, 0
     ]
@@ -145,7 +146,7 @@ def test_the_check_states_how_a_dome_fits_its_room() -> None:
         for side in rooms.largest_part_m(
             RoomConfig.model_validate({"door": ["0.9 m", "2.1 m"], "segments": 4}),
             (0.9, 2.1),
-            surface.build_surface(light.SurfaceConfig.model_validate(CAP)),
+            surface.build_surface(TypeAdapter(light.AnySurface).validate_python(CAP)),
             40.0,
             4,
         )[0]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.special import eval_jacobi
 
 from skysim.core.errors import InputError
@@ -58,7 +59,7 @@ KINDS = {
 
 
 def made(part: dict[str, Any], **more: Any) -> Surface:
-    return build_surface(light.SurfaceConfig.model_validate(part | more))
+    return build_surface(TypeAdapter(light.AnySurface).validate_python(part | more))
 
 
 def rays_up(count: int, seed: int, most_deg: float = 35.0) -> np.ndarray:
@@ -523,7 +524,7 @@ def test_a_scene_flies_under_a_surveyed_dome(cloud: dict) -> None:
             "light.layout.cap_deg": "27",
         },
     )
-    assert loaded.light.surface == light.SurfaceConfig.model_validate(cloud)
+    assert loaded.light.surface == TypeAdapter(light.AnySurface).validate_python(cloud)
     shape = build_surface(loaded.light.surface)
     assert shape.meet(np.zeros(3), UP)[0, 2] == pytest.approx(48 * INCH_M, abs=1e-4)
 
@@ -571,8 +572,8 @@ def complaint(more: str) -> str:
 @pytest.mark.parametrize(
     ("surface", "says"),
     [
-        ("{kind: torus}", "light.surface.kind: 'torus' is not allowed; allowed: 'sphere', 'ellipsoid', 'flat'"),
-        ("{kind: [flat]}", r"light.surface.kind: \['flat'\] is not allowed"),
+        ("{kind: torus}", "light.surface.kind: unknown kind 'torus'; .*allowed: sphere, ellipsoid, flat"),
+        ("{kind: [flat]}", r"light.surface.kind: unknown kind .*\['flat'\]"),
         ("{apex: 1 m}", "light.surface: kind is missing"),
         ("{kind: sphere, apex: 1 m}", "light.surface.radius: missing"),
         ("{kind: flat, apex: 1 m, radius: 1 m}", "light.surface.radius: unknown key; .*allowed: .*width, height"),
@@ -669,11 +670,9 @@ def test_points_that_determine_no_smooth_dome_are_refused(tmp_path: Path) -> Non
 
 
 def test_every_kind_of_part_has_its_surface() -> None:
-    assert set(light.SURFACE_CONFIGS) == set(SURFACES)
-    assert all(
-        part.model_fields["kind"].annotation.__args__ == (kind,)
-        for kind, part in light.SURFACE_CONFIGS.items()
-    )
+    parts, _ = get_args(light.AnySurface)
+    kinds = [part.model_fields["kind"].annotation.__args__ for part in get_args(parts)]
+    assert kinds == [(kind,) for kind in SURFACES]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.stats import chi2
 
 from estimator.trackers.dome_tracker import DomeTracker
@@ -59,7 +60,7 @@ def is_chi_square(normal: Floats) -> None:
 
 def inside_of(**more: Any) -> Surface:
     ball = {"kind": "sphere", "apex": "1.2 m", "radius": "1 m"}
-    return surface.build_surface(light.SurfaceConfig.model_validate(ball | more))
+    return surface.build_surface(TypeAdapter(light.AnySurface).validate_python(ball | more))
 
 
 # --- the laws of the draws ----------------------------------------------------------------------------------

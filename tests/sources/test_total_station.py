@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from pydantic import TypeAdapter
 from scipy.stats import chi2
 
 from estimator.identification.chance import GATE_SIGMA
@@ -181,7 +182,7 @@ def survey_of(**more: Any) -> SurveyErrorsConfig:
 def test_the_tracker_uses_the_station_s_measurements() -> None:
     """Places, covariance and common errors, over surveys: all errors together are chi-square as claimed."""
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate(
+        TypeAdapter(light.AnySurface).validate_python(
             {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m", "error": "0.4 mm"}
         )
     )
@@ -251,7 +252,7 @@ def test_the_final_match_and_identification_use_the_same_gates() -> None:
 def test_without_an_instrument_the_map_claims_one_sigma_for_all() -> None:
     plain = SurveyErrorsConfig.model_validate({"led_sigma": "0.2 mm"})
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate(
+        TypeAdapter(light.AnySurface).validate_python(
             {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"}
         )
     )
@@ -262,7 +263,7 @@ def test_without_an_instrument_the_map_claims_one_sigma_for_all() -> None:
 def test_the_survey_s_ellipsoid_moves_with_its_leds() -> None:
     """The setup's rigid motion, and not the sights' errors: LEDs stay on the believed sphere to the scale's error."""
     inside = surface.build_surface(
-        light.SurfaceConfig.model_validate(
+        TypeAdapter(light.AnySurface).validate_python(
             {"kind": "sphere", "apex": "1.3 m", "radius": "1.3 m"}
         )
     )

@@ -36,8 +36,8 @@ from skysim.experiments.datasheet.scene_changes import (
 )
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
-from skysim.experiments.study.plan import Plan, Study, TrialSpec, make_plan, resolve_point
-from skysim.experiments.study.study_file import dome_seeds
+from skysim.experiments.study.plan import Plan, Study, TrialSpec, resolve_point
+from skysim.experiments.study.study_file import dome_seeds, make_plan
 from skysim.experiments.study.unused_options import tracks
 from skysim.scene.scene import Scene
 

@@ -340,7 +340,7 @@ def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
 
 
 def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
-    """A, B, then for each factor A with its column replaced by B's. `table.sample_outputs` relies on this order.
+    """A, B, then for each factor A with its column replaced by B's. `table.response_indices` relies on this order.
 
     A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
     """

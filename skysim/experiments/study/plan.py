@@ -20,9 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from skysim.core import yaml_reader
 from skysim.core.errors import InputError
-from skysim.core.paths import STUDIES
 from skysim.core.plugins import Programs
 from skysim.core.units import (
     ConfigModel,
@@ -38,9 +36,8 @@ from skysim.core.units import (
     Triple,
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
-from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value, points
-from skysim.experiments.study.own_code import digests_of
-from skysim.results.files.parts import Prices, find_prices, read_prices
+from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value
+from skysim.results.files.parts import Prices
 from skysim.scene import loader
 from skysim.scene.scene import Requirements, Scene
 
@@ -558,38 +555,6 @@ def digest(value: Any) -> str:
     """First 16 hexadecimal digits of the SHA-256 of a JSON value."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def find(name: str) -> Path:
-    """Path of a study that is given by path, or by its name in scenes/studies/ or scenes/papers/studies/."""
-    return yaml_reader.find_file(name, STUDIES, "study")
-
-
-def make_plan(
-    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
-) -> Plan:
-    """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
-    folder = path.resolve().parent
-    spec = TrialSpec(
-        study.scene,
-        str(folder),
-        study.seed,
-        study.set,
-        trial,
-        study.paired,
-        study.hardware,
-        dict(programs),
-        digests_of(programs),
-    )
-    if study.optimize is None:
-        chosen = points(study.design, study.factors, study.seed)
-        return Plan(path, study, spec, chosen, text=text)
-    parts = study.optimize.cost.parts
-    try:
-        prices = read_prices(find_prices(parts, folder)) if parts else None
-    except InputError as error:
-        raise error.within("optimize.cost.parts") from None
-    return Plan(path, study, spec, [], prices, text)
 
 
 def resolve_point(spec: TrialSpec, settings: Settings) -> tuple[Scene, Trial]:

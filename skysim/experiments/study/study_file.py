@@ -12,12 +12,14 @@ from pydantic import ValidationError
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.paths import STUDIES
 from skysim.core.plugins import Programs
 from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
     check_version,
     explain,
+    find_file,
     read_yaml,
     set_key,
     where_of,
@@ -31,7 +33,9 @@ from skysim.experiments.study.factors import (
     Settings,
     Value,
     make_point,
+    points,
 )
+from skysim.experiments.study.own_code import digests_of
 from skysim.experiments.study.plan import (
     TRIAL,
     AttitudeRange,
@@ -44,11 +48,11 @@ from skysim.experiments.study.plan import (
     Study,
     Threshold,
     Trial,
-    find,
-    make_plan,
+    TrialSpec,
     resolve_point,
 )
 from skysim.results import metrics
+from skysim.results.files.parts import find_prices, read_prices
 from skysim.scene import unused
 from skysim.scene.scene import Scene, ephemeris_problem
 from skysim.scene.sections.light import CollimatedDisplayConfig
@@ -71,6 +75,11 @@ MEASURED_BY: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
     **dict.fromkeys(("streak_px", "detect_ms", "computer_ms"), ("frames", "flight")),
 }
+
+
+def find(name: str) -> Path:
+    """Path of a study that is given by path, or by its name in scenes/studies/ or scenes/papers/studies/."""
+    return find_file(name, STUDIES, "study")
 
 
 def load(
@@ -134,6 +143,33 @@ def plan_of(
             error = error.at(where_of(error.key.split("."), [(path, text)], {}))
         raise error from None
     return plan
+
+
+def make_plan(
+    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
+) -> Plan:
+    """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
+    folder = path.resolve().parent
+    spec = TrialSpec(
+        study.scene,
+        str(folder),
+        study.seed,
+        study.set,
+        trial,
+        study.paired,
+        study.hardware,
+        dict(programs),
+        digests_of(programs),
+    )
+    if study.optimize is None:
+        chosen = points(study.design, study.factors, study.seed)
+        return Plan(path, study, spec, chosen, text=text)
+    parts = study.optimize.cost.parts
+    try:
+        prices = read_prices(find_prices(parts, folder)) if parts else None
+    except InputError as error:
+        raise error.within("optimize.cost.parts") from None
+    return Plan(path, study, spec, [], prices, text)
 
 
 def check(plan: Plan, to_run: bool) -> None:

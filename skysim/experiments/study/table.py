@@ -321,9 +321,14 @@ def indices(plan: Plan, store: Store) -> list[Index]:
 
 def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     """Indices of every factor for one error; NaN if no replicate is complete."""
-    a, b, ab = sample_outputs(plan, store, AXES[response])
     names = list(plan.study.factors)
-    count = a.shape[1]
+    outputs = complete_outputs(plan, store, AXES[response])
+    # (S, N) errors at A and at B, and (D, S, N) at A with one column of B: points are in the order A, B, AB_1 .. AB_D.
+    count = len(plan.points) // (len(names) + 2)
+    blocks = outputs.reshape(len(outputs), len(names) + 2, count)
+    a = blocks[:, 0]
+    b = blocks[:, 1]
+    ab = blocks[:, 2:].transpose(1, 0, 2)
     if not len(a):
         return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
     estimate = generalized(a, b, ab)
@@ -336,21 +341,6 @@ def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
     variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
     sigma_arcsec = math.sqrt(variance)
     return to_indices(names, response, [estimate, low, high], count, sigma_arcsec)
-
-
-def sample_outputs(
-    plan: Plan, store: Store, axes: tuple[str, ...]
-) -> tuple[Floats, Floats, Floats]:
-    """(S, N), (S, N) and (D, S, N) errors at A, at B, and at A with one column of B.
-
-    There are N sample rows, D factors and S outputs, see `complete_outputs`.
-    """
-    width = len(plan.study.factors)
-    complete = complete_outputs(plan, store, axes)
-    # Points are in the order A, B, AB_1 .. AB_D.
-    rows = len(plan.points) // (width + 2)
-    blocks = complete.reshape(len(complete), width + 2, rows)
-    return blocks[:, 0], blocks[:, 1], blocks[:, 2:].transpose(1, 0, 2)
 
 
 def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:

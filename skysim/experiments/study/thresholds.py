@@ -281,27 +281,19 @@ def interval_text(found: Crossing, name: str, unit: str) -> str:
         for level, trials in found.needs
     )
     needs = f"; needs {counts}" if counts else ""
-    if math.isinf(found.low) and math.isinf(found.high):
-        span = f"no level is certain{needs}"
-    elif math.isinf(found.low):
-        span = f"below {found.high:.4g}{needs}"
-    elif math.isinf(found.high):
-        span = f"above {found.low:.4g}{needs}"
-    else:
-        return (
-            f"each end at {100 * metrics.CONFIDENCE:g} %: {found.low:.4g} to {found.high:.4g}"
-        )
-    return f"{100 * metrics.CONFIDENCE:g} %: {span}"
+    both = math.isfinite(found.low) and math.isfinite(found.high)
+    each = f"{'each end at ' * both}{100 * metrics.CONFIDENCE:g} %"
+    return f"{each}: {span(found)}{needs}"
 
 
-def certain_text(found: Crossing) -> str:
-    """The interval of a crossing in brackets; an open end is named."""
+def span(found: Crossing) -> str:
+    """The interval of a crossing; an open end is named."""
     low, high = found.low, found.high
     if math.isfinite(low) and math.isfinite(high):
-        return f" ({low:.4g} to {high:.4g})"
+        return f"{low:.4g} to {high:.4g}"
     if math.isfinite(low):
-        return f" (above {low:.4g})"
-    return f" (below {high:.4g})" if math.isfinite(high) else " (no level is certain)"
+        return f"above {low:.4g}"
+    return f"below {high:.4g}" if math.isfinite(high) else "no level is certain"
 
 
 def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
@@ -319,7 +311,7 @@ def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
     at = [
         f"{one.between[0]:.4g} to {one.between[1]:.4g}{unit}{label}"
         if one.between
-        else f"{one.value:.3g}{unit}{label}{certain_text(one)}"
+        else f"{one.value:.3g}{unit}{label} ({span(one)})"
         for label, one in found
         if math.isfinite(one.value)
     ]

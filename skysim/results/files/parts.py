@@ -42,11 +42,14 @@ SURVEY = "survey"  # a line whose part begins so is a way to survey the LEDs
 UNITS = {
     **dict.fromkeys(("shell", "shell_bent", "shell_flat"), "m2"),
     **dict.fromkeys(
-        ("led", "board", "panel", "mounting_led", "mounting_board", "resistor", "filter"),
-        "each",
-    ),
-    **dict.fromkeys(
         (
+            "led",
+            "board",
+            "panel",
+            "mounting_led",
+            "mounting_board",
+            "resistor",
+            "filter",
             "driver",
             "microcontroller",
             "sequencer",
@@ -294,19 +297,17 @@ def build_design(scene: Scene, what: str = "parts") -> DomeDesign:
         raise InputError("light.kind", f"{scene.light.kind} has no {what}", "dome")
     surface = build_surface(light.surface)
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
-    return DomeDesign(
-        light, surface, leds, max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
-    )
+    # Boards stand out.
+    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
+    return DomeDesign(light, surface, leds, cap_deg)
 
 
 def single_leds(design: DomeDesign) -> Quantities:
-    """LEDs one by one, each in its hole."""
+    """LEDs one by one, each in its hole, or at the rim with a fiber to its hole."""
     count = len(design.leds)
-    return {
-        "led": count,
-        "mounting_led": count,
-        "wire": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
-    }
+    line = "fiber" if design.light.layout.kind == "fibers" else "wire"
+    length_m = float(design.to_rim_m(design.leds.place[:, :3]).sum())
+    return {"led": count, "mounting_led": count, line: length_m}
 
 
 def boards(design: DomeDesign) -> Quantities:
@@ -334,20 +335,9 @@ def tape(design: DomeDesign) -> Quantities:
     return {kind: length_m, "mounting_tape": length_m, "wire": float(wire_m)}
 
 
-def fibers(design: DomeDesign) -> Quantities:
-    """LEDs at the rim, each with a fiber to its hole."""
-    count = len(design.leds)
-    return {
-        "led": count,
-        "fiber": float(design.to_rim_m(design.leds.place[:, :3]).sum()),
-        "mounting_led": count,
-    }
-
-
 MOUNTED: dict[str, Callable[[DomeDesign], Quantities]] = {
     "patch_boards": boards,
     "string": tape,
-    "fibers": fibers,
 }
 
 

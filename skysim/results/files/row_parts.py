@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -225,7 +224,7 @@ def are_below(numbers: Array, end: int) -> bool:
 
 def read_column(path: Path, name: str) -> Array:
     """A column of a part: numbers, or objects for text. Raises InputError if it cannot be read."""
-    with part_errors(path):
+    try:
         import pyarrow.parquet
 
         # Texts are read as numbers of distinct texts, since there are few of them.
@@ -235,13 +234,6 @@ def read_column(path: Path, name: str) -> Array:
         coded = column.combine_chunks().dictionary_encode()
         texts = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
         return texts[coded.indices.fill_null(len(texts) - 1).to_numpy()]
-
-
-@contextmanager
-def part_errors(path: Path) -> Iterator[None]:
-    """Raise InputError for a part that is missing or damaged, or without pyarrow."""
-    try:
-        yield
     except ImportError:
         raise InputError(path, f"Parquet {EXTRA}") from None
     except (

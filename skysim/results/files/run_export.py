@@ -217,7 +217,7 @@ def truth_table(run: Recording, bar: Bar) -> Any:
     from astropy.table import Table
 
     rows = [truth_row(truth) for truth in truths(run, bar)]
-    return Table({name: [row[name] for row in rows] for name in rows[0]}, meta=run.meta)
+    return Table(rows=rows, meta=run.meta)
 
 
 def truth_row(truth: FrameTruth) -> dict[str, Any]:

@@ -180,13 +180,12 @@ def template(lab: Lab, ending: str) -> str:
 def dome_of(lab: Lab) -> Dome:
     """The dome that a scene's builder makes. Raises InputError without a dome."""
     design = build_design(lab.scene, "templates")
-    leds = design.leds
     return Dome(
         lab.scene.name,
         design.surface,
         design.cap_deg,
-        leds.id,
-        leds.place[:, :3],
+        design.leds.id,
+        design.leds.place[:, :3],
         design.light.led.disk_diameter_m / 2,
     )
 
@@ -319,13 +318,10 @@ def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterat
         yield SheetText(x + radius_mm + 0.5, y - 0.5, 2.0, f"{number}")
 
 
-def cross(x_mm: float, y_mm: float, reach_mm: float, layer: str) -> list[Shape]:
-    """Two lines through a point."""
-    middle = np.array([x_mm, y_mm])
-    return [
-        Polyline(np.array([middle - arm, middle + arm]), layer=layer)
-        for arm in reach_mm * np.eye(2)
-    ]
+def cross(x_mm: float, y_mm: float, reach_mm: float, layer: str) -> Iterator[Shape]:
+    """Two lines of twice this reach through a point."""
+    for arm in np.diag([reach_mm, reach_mm]):
+        yield Polyline(np.add(np.outer([-1, 1], arm), (x_mm, y_mm)), layer=layer)
 
 
 def shell_obj(dome: Dome) -> str:

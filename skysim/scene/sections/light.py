@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
-    BeforeValidator,
     ConfigDict,
     Field,
     ModelWrapValidatorHandler,
@@ -74,19 +73,6 @@ class SurfaceConfig(ConfigModel):
     offset_m: Position = (0.0, 0.0, 0.0)
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def validate_by_kind(
-        cls, value: Any, handler: ModelWrapValidatorHandler[SurfaceConfig]
-    ) -> SurfaceConfig:
-        """Validate a section with the class of its `kind` when called on the base class."""
-        kind = value.get("kind") if cls is SurfaceConfig and isinstance(value, dict) else None
-        return (
-            SURFACE_CONFIGS[kind].model_validate(value)
-            if kind in list(SURFACE_CONFIGS)
-            else handler(value)
-        )
 
 
 def check_below_apex(rim_height_m: float | None, apex_m: float) -> None:
@@ -213,26 +199,6 @@ class SurveyedSurfaceConfig(RimmedConfig):
         return value
 
 
-SURFACE_CONFIGS: dict[Any, type[SurfaceConfig]] = {
-    "sphere": SphereSurfaceConfig,
-    "ellipsoid": EllipsoidSurfaceConfig,
-    "flat": FlatSurfaceConfig,
-    "cylinder": CylinderSurfaceConfig,
-    "surveyed": SurveyedSurfaceConfig,
-}
-
-
-def check_surface_kind(value: Any) -> Any:
-    """The value. Raises an error at the key `kind`, with the allowed kinds, for an unknown kind."""
-    if (
-        isinstance(value, dict)
-        and "kind" in value
-        and value["kind"] not in list(SURFACE_CONFIGS)
-    ):
-        SurfaceConfig.model_validate({"kind": value["kind"]})
-    return value
-
-
 AnySurface = Annotated[
     SphereSurfaceConfig
     | EllipsoidSurfaceConfig
@@ -240,7 +206,6 @@ AnySurface = Annotated[
     | CylinderSurfaceConfig
     | SurveyedSurfaceConfig,
     Field(discriminator="kind"),
-    BeforeValidator(check_surface_kind),
 ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -480,15 +480,8 @@ def pareto_png(
     other: Panel,
     points: Sequence[int],
     front: Sequence[int],
-    also: Mapping[str, Floats] | None,
 ) -> bytes:
-    """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled.
-
-    Parameters
-    ----------
-    also
-        Fronts of other searches with the same objectives, (K, 2) by label
-    """
+    """Candidates in the plane of the two objectives; Pareto-optimal ones are joined and, if few, labeled."""
 
     def draw(fig: Any) -> None:
         axes = fig.subplots()
@@ -499,15 +492,10 @@ def pareto_png(
         y = other.value[marked]
         low = other.low[marked]
         high = other.high[marked]
-        fronts = also or {}
-        heights = [other.value, *(values[:, 1] for values in fronts.values())]
-        axes.set_ylim(*layout.limits(heights, [low, high], False, False))
-        for name, values in fronts.items():
-            style: Any = {"color": INK[0], "markerfacecolor": "none", "markersize": 4}
-            axes.plot(*values.T, "s:", label=name, **style)
+        axes.set_ylim(*layout.limits([other.value], [low, high], False, False))
         axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(x, y, "D--", color=ORANGE, label="front")
-        style = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}
+        style: Any = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}
         style |= {"xytext": (5, 5), "textcoords": "offset points"}
         if len(x) <= MAX_LABELED_POINTS:
             for n, *at in zip(marked.tolist(), x, y, strict=True):

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core.paths import STUDIES, shipped_files
-from skysim.core.types import Floats
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study import answer, search, thresholds
 from skysim.experiments.study.execution.store import Store
@@ -203,16 +202,10 @@ def compose(
     store: Store,
     found: Analysis,
     command: Callable[[str], str],
-    also: Mapping[str, Floats] | None = None,
 ) -> Report:
     """The report of an analyzed study: its question, its answer, one figure, and then the details.
 
-    Parameters
-    ----------
-    command
-        See `commands`
-    also
-        See `figures.pareto_png`
+    `command` is the function of `commands`.
     """
     lines = select_responses(found.lines, responses(study))
     front = [one.number for one in found.result.front] if found.result else []
@@ -221,7 +214,7 @@ def compose(
     )
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
-        *search_figures(lines, study, front, costs, also),
+        *search_figures(lines, study, front, costs),
         *(
             Figure(figures.indices_png(found.indices, one), shares.format(one), name=one)
             for one in dict.fromkeys(index.response for index in found.indices)
@@ -538,7 +531,6 @@ def search_figures(
     study: Study,
     front: Sequence[int],
     costs: Mapping[int, float] | None,
-    also: Mapping[str, Floats] | None,
 ) -> list[Figure]:
     """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
     if study.optimize is None or not lines:
@@ -555,6 +547,6 @@ def search_figures(
         text = f"{named[1]} against {named[0]}: the Pareto front of {len(front)} among {len(lines)} candidates."
         shown.insert(
             0,
-            Figure(figures.pareto_png(one, other, points, front, also), text, name="pareto"),
+            Figure(figures.pareto_png(one, other, points, front), text, name="pareto"),
         )
     return shown
