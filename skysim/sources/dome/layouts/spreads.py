@@ -122,7 +122,7 @@ def optimized(
     rng = random_stream(config.hardware_seed)
     reach = optimize.field_reach_rad(config, surface)
     sites = project_from_bearing(
-        surface, scattered_cap(optimize.OPTIONS.sites_per_led * config.count, reach, rng)
+        surface, scattered_cap(optimize.SITES_PER_LED * config.count, reach, rng)
     )
     spirals = [
         project_from_bearing(surface, cap(config.count, half))
@@ -150,7 +150,7 @@ def optimized_places(
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
     rng.random(2 * len(points[0]))  # the numbers that the sites were drawn with
-    place_m = optimize.optimize_places(config, points[0], points[1:], rng, optimize.OPTIONS)
+    place_m = optimize.optimize_places(config, points[0], points[1:], rng)
     place_m.flags.writeable = False
     return place_m, rng.bit_generator.state
 
