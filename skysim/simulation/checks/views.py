@@ -175,10 +175,8 @@ def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
 
 def before_lights_e_s(lit: Lit) -> float:
     """Electrons s^-1 px^-1 of light with edges in the background of other lights; 0 if it hides them."""
-    glow = lit.edged.e_s() if lit.edged and lit.hides is None else None
-    return (
-        0.0 if glow is None or lit.edged is None else lit.edged.share * float(np.median(glow))
-    )
+    glow = lit.edged() if lit.edged and lit.hides is None else None
+    return 0.0 if glow is None else float(np.median(glow))
 
 
 def view(
