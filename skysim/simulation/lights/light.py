@@ -17,7 +17,7 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -319,10 +319,6 @@ class KnownLight(Light):
 
     sources: Sources
     emitter: Emitter
-
-    def with_sources(self, sources: Sources) -> Self:
-        """The same light with other sources."""
-        return replace(self, sources=sources)
 
 
 class Obstacle(Light):

@@ -65,8 +65,6 @@ class Image(NamedTuple):
         (K,) cosines of the angle of incidence
     wall_m
         (K, 3) places on the wall where the LEDs are mirrored
-    along
-        (K, 3) directions from there toward the LEDs
     """
 
     led: Ints
@@ -74,7 +72,6 @@ class Image(NamedTuple):
     distance_m: Floats
     cosine: Floats
     wall_m: Floats
-    along: Floats
 
 
 def mirrored(
@@ -153,8 +150,8 @@ def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) ->
     # d = sqrt(|det dF / du|).
     distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
     found = distinct(led, toward, solved & (distance_m > 0))
-    wall_m, along, cosine = (part[found] for part in rays)
-    return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
+    wall_m, _, cosine = (part[found] for part in rays)
+    return Image(led[found], toward[found], distance_m[found], cosine, wall_m)
 
 
 def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:
