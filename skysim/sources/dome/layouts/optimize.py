@@ -41,7 +41,7 @@ from skysim.sources.dome.layouts.fisher import (
     variances,
     visible_from,
 )
-from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread
+from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread, tilts_rad
 from skysim.sources.dome.surface import Surface
 
 # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed).
@@ -256,7 +256,8 @@ def descend(
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
         # 2. Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
         spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
-        step_m = spacing_m * np.exp(rng.uniform(*np.log(steps), (config.count, 1)))
+        low, high = np.log(steps)
+        step_m = spacing_m * np.exp(rng.uniform(low, high, (config.count, 1)))
         target_m = place_m + step_m * rng.standard_normal(place_m.shape)
         both_m = np.concatenate([place_m, sites_m[tree.query(target_m)[1]]])
         visibility = Visibility(*visible_from(both_m, R_body_from_lab, *geometry))
@@ -373,7 +374,7 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
         camera_m = lab_from_body.apply(np.array(config.camera_m))
         met_m = surface.meet(camera_m, lab_from_body.apply(cone))
         met_m = met_m[np.isfinite(met_m[:, 0])]
-        reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
+        reach = max(reach, *tilts_rad(met_m), 0.0)
     return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
 
 
