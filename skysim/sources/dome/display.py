@@ -221,20 +221,14 @@ def block_sources(
         led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng
     )
     # n^2 pixels of the panel, each dimmed by scatter, gray level and lens.
+    full = panel_strength_e_s_sr(led, band) * config.block**2
+    strength = full * scatter * pulses.strength * gain
     return Sources(
         id=stars.id[blocks.star],
         place=np.column_stack([place_m, np.ones(count)]),
         normal=surface.inward(place_m),
         radius_m=np.broadcast_to(radius_m, (count,)).copy(),
-        strength=panel_strength_e_s_sr(led, band)
-        * config.block**2
-        * scatter
-        * pulses.strength
-        * gain,
-        period_s=pulses.period_s,
-        start_s=pulses.start_s,
-        on_s=pulses.on_s,
-        clock=pulses.clock,
+        **pulses._replace(strength=strength)._asdict(),
         magnitude=stars.magnitude[blocks.star],
         chromatic=chromatic_of(led, band, np.zeros(count)),
     )

@@ -91,11 +91,7 @@ def led_sources(
         place=np.column_stack([placed.place_m, np.ones(count)]),
         normal=placed.normal,
         radius_m=np.full(count, led.disk_diameter_m / 2),
-        strength=strength * pulses.strength,
-        period_s=pulses.period_s,
-        start_s=pulses.start_s,
-        on_s=pulses.on_s,
-        clock=pulses.clock,
+        **pulses._replace(strength=strength * pulses.strength)._asdict(),
         magnitude=placed.magnitude,
         chromatic=chromatic if band.chromatic is not None else None,
     )
