@@ -194,9 +194,9 @@ def draw_glow(image: NDArray, beam: Beam, exposure_s: float) -> None:
     smooth = sum(lit.glow() for lit in beam.lits if lit.glow)
     background.fill(image, np.atleast_2d(smooth), exposure_s)
     for edged in (lit.edged for lit in beam.lits if lit.edged):
-        glow = edged.e_s()
+        glow = edged()
         if glow is not None:
-            background.add(image, glow, edged.share * exposure_s)
+            background.add(image, glow, exposure_s)
 
 
 def draw_lights(image: NDArray, beam: Beam, exposure: Exposure) -> SourceTruth:
@@ -206,17 +206,17 @@ def draw_lights(image: NDArray, beam: Beam, exposure: Exposure) -> SourceTruth:
     """
     truths = []
     # The first path is the image, the others are ghosts.
-    for path in beam.paths:
-        exposed = exposure.exposed(path.optics)
+    for number, optics in enumerate(beam.paths):
+        exposed = exposure.exposed(optics)
         for lit in beam.lits:
             if lit.points is not None:
                 drawn = render(
                     image, lit.points, *exposed, lit.emitter, any_of(beam.before(lit))
                 )
-                truths.append(stray.as_ghosts(drawn, path.number))
+                truths.append(stray.as_ghosts(drawn, number))
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
-                truths += [stray.as_ghosts(body, path.number) for body in bodies]
+                truths += [stray.as_ghosts(body, number) for body in bodies]
     sources = concatenated(truths)
     for config in beam.glares:
         stray.add_glare(image, config)

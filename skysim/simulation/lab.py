@@ -303,7 +303,7 @@ class Lab:
 
     def with_sources(self, sources: Sources) -> Lab:
         """The lab with other stars or LEDs for its main camera."""
-        return self.with_light(self.camera.known.with_sources(sources))
+        return self.with_light(replace(self.camera.known, sources=sources))
 
     def of_camera(self, number: int) -> Lab:
         """The lab with only one of its cameras, which becomes the main one."""

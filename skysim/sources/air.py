@@ -24,6 +24,7 @@ from skysim.sources.refraction import (
     standard_pressure_hpa,
     standard_temperature_c,
 )
+from skysim.sources.stars import sky_axes
 
 # Scintillation, for any aperture and exposure, in weak turbulence. A layer of the strength Cn^2 dz at the distance z
 # along the ray gives a star's light the power spectrum
@@ -297,17 +298,9 @@ def topocentric_axes(time: datetime.datetime, site: SiteConfig) -> Floats:
     assert site.longitude_deg is not None  # the scene's validation requires it
     longitude, latitude = np.radians([site.longitude_deg, site.latitude_deg])
     sidereal = longitude + erfa.era00(ut1_jd(time), 0.0)
-    sin_l = np.sin(sidereal)
-    cos_l = np.cos(sidereal)
-    sin_b = np.sin(latitude)
-    cos_b = np.cos(latitude)
-    # North, east and zenith at the site in axes of the intermediate equator.
-    in_cirs = [
-        [-sin_b * cos_l, -sin_b * sin_l, cos_b],
-        [-sin_l, cos_l, 0.0],
-        [cos_b * cos_l, cos_b * sin_l, sin_b],
-    ]
-    return np.array(in_cirs) @ erfa.c2i06a(tt_jd(time), 0.0)
+    # At the site in axes of the intermediate equator.
+    east, north, zenith = sky_axes(sidereal, latitude)
+    return np.array([north, east, zenith]) @ erfa.c2i06a(tt_jd(time), 0.0)
 
 
 def horizon_rad(config: HorizonConfig | None, azimuth_rad: Floats) -> Floats:

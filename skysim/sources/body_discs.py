@@ -21,6 +21,7 @@ from skysim.core.jit import jit
 from skysim.core.time import J2000_JD
 from skysim.core.types import Floats
 from skysim.sources.ephemeris import Place
+from skysim.sources.stars import sky_axes
 
 # Laws of `brightness`.
 LIMB_DARKENED = 0
@@ -372,7 +373,10 @@ def magnitude(name: str, place: Place, tt_jd: float) -> float:
     phase_deg = float(np.degrees(place.phase_rad))
     if name == "moon":
         return moon_magnitude(place.distance_km, sun_au, phase_deg)
-    at_1_au = PLANETS[name](phase_deg, place, tt_jd)
+    if name in PLANETS:
+        at_1_au = PLANETS[name](phase_deg, place, tt_jd)
+    else:
+        at_1_au = by_phase(name, phase_deg)
     return float(5 * np.log10(sun_au * place.distance_km / AU_KM) + at_1_au)
 
 
@@ -409,33 +413,35 @@ def polynomial(phase_deg: float, coefficients: tuple[float, ...]) -> float:
     return float(sum(c * phase_deg**k for k, c in enumerate(coefficients)))
 
 
-def mercury(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    return polynomial(
-        phase_deg,
-        (-0.613, 6.3280e-2, -1.6336e-3, 3.3644e-5, -3.4265e-7, 1.6893e-9, -3.0334e-12),
-    )
+# Coefficients of f(a) + V(1, 0), of Uranus and Neptune of f(a) alone, by the phase angle in degrees up to which they
+# hold. Near inferior conjunction the clouds of Venus scatter sunlight forward.
+PHASE_LAWS: dict[str, dict[float, tuple[float, ...]]] = {
+    "mercury": {
+        180.0: (
+            -0.613,
+            6.3280e-2,
+            -1.6336e-3,
+            3.3644e-5,
+            -3.4265e-7,
+            1.6893e-9,
+            -3.0334e-12,
+        )
+    },
+    "venus": {
+        163.7: (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9),
+        180.0: (236.05828, -2.81914, 8.39034e-3),
+    },
+    "mars": {50.0: (-1.601, 2.267e-2, -1.302e-4), 180.0: (-0.367, -2.573e-2, 3.445e-4)},
+    "jupiter": {180.0: (-9.395, -3.7e-4, 6.16e-4)},
+    "uranus": {3.1: (0.0,), 180.0: (0.0, 6.587e-3, 1.045e-4)},
+    "neptune": {1.9: (0.0,), 180.0: (0.0, 7.944e-3, 9.617e-5)},
+}
 
 
-def venus(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    """V magnitude of Venus at 1 au from Sun and observer.
-
-    Two polynomials: near inferior conjunction the clouds scatter sunlight forward.
-    """
-    far = (-4.384, -1.044e-3, 3.687e-4, -2.814e-6, 8.938e-9)
-    return polynomial(
-        phase_deg, far if phase_deg < 163.7 else (236.05828, -2.81914, 8.39034e-3)
-    )
-
-
-def mars(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    return polynomial(
-        phase_deg,
-        (-1.601, 2.267e-2, -1.302e-4) if phase_deg <= 50 else (-0.367, -2.573e-2, 3.445e-4),
-    )
-
-
-def jupiter(phase_deg: float, _place: Place, _tt_jd: float) -> float:
-    return polynomial(phase_deg, (-9.395, -3.7e-4, 6.16e-4))
+def by_phase(name: str, phase_deg: float) -> float:
+    """The polynomial of PHASE_LAWS at a phase angle."""
+    laws = PHASE_LAWS[name].items()
+    return polynomial(phase_deg, next(law for limit, law in laws if phase_deg <= limit))
 
 
 def saturn(phase_deg: float, place: Place, _tt_jd: float) -> float:
@@ -460,24 +466,19 @@ def uranus(phase_deg: float, place: Place, _tt_jd: float) -> float:
     latitudes_deg = np.degrees(
         np.arctan(np.tan(latitudes_rad("uranus", place)) / (1 - URANUS_FLATTENING) ** 2)
     )
-    by_phase = polynomial(phase_deg, (0.0, 6.587e-3, 1.045e-4)) if phase_deg > 3.1 else 0.0
-    return -7.110 + by_phase - 8.4e-4 * float(np.abs(latitudes_deg).mean())
+    along_equator = -7.110 + by_phase("uranus", phase_deg)
+    return along_equator - 8.4e-4 * float(np.abs(latitudes_deg).mean())
 
 
 def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
     """V magnitude of Neptune at 1 au from Sun and observer. Neptune brightened from 1980 to 2000."""
     year = 2000 + (tt_jd - J2000_JD) / JULIAN_YEAR_DAY
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
-    return at_full + (
-        polynomial(phase_deg, (0.0, 7.944e-3, 9.617e-5)) if phase_deg > 1.9 else 0.0
-    )
+    return at_full + by_phase("neptune", phase_deg)
 
 
+# Planets whose magnitude depends on more than the phase.
 PLANETS: dict[str, Callable[[float, Place, float], float]] = {
-    "mercury": mercury,
-    "venus": venus,
-    "mars": mars,
-    "jupiter": jupiter,
     "saturn": saturn,
     "uranus": uranus,
     "neptune": neptune,
@@ -486,8 +487,7 @@ PLANETS: dict[str, Callable[[float, Place, float], float]] = {
 
 def latitudes_rad(name: str, place: Place) -> Floats:
     """(2,) planetocentric latitudes of the Sun and of the observer above the planet's equator."""
-    ra, dec = np.radians(POLES_DEG[name])
-    pole = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    _, _, pole = sky_axes(*np.radians(POLES_DEG[name]))
     sines = [
         -(vector @ pole) / np.linalg.norm(vector)
         for vector in (place.from_sun_km, place.to_body_km)

@@ -40,6 +40,7 @@ from skysim.sources.orbit_elements import (
     read_elements,
     read_oem,
 )
+from skysim.sources.stars import sky_axes
 
 
 class CameraOrbit(Protocol):
@@ -84,15 +85,8 @@ class CircularOrbit:
         inclination = np.radians(config.inclination_deg)
         along = np.radians(config.argument_deg) + rate * after_s
         node = np.radians(config.raan_deg) + node_rate * after_s
-        toward_node = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=-1)
-        ahead = np.stack(
-            [
-                -np.sin(node) * np.cos(inclination),
-                np.cos(node) * np.cos(inclination),
-                np.full(len(node), np.sin(inclination)),
-            ],
-            axis=-1,
-        )
+        east, north, toward_node = sky_axes(node, np.zeros_like(node))
+        ahead = np.cos(inclination) * east + np.sin(inclination) * north
         # Position and velocity in the orbital plane.
         radius_m = EARTH_RADIUS_M + config.altitude_m
         cosine = np.cos(along)[:, None]

@@ -109,36 +109,31 @@ def write(
     columns: Iterable[CatalogColumn],
     rows: list[dict[str, Any]],
     meta: dict[str, Any],
-    extra: tuple[str, ...] = (),
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
     Parameters
     ----------
     rows
-        A dict for each star, with the columns, `source` and the `extra` text columns
+        A dict for each star, with the columns and `source`
     """
     columns = tuple(columns)
-    text_columns = ("source", *extra)
-    # ECSV's description of the columns: numbers, then texts.
+    # ECSV's description of the columns: numbers, then the source.
     datatype = [
         {"name": c.name}
         | ({"unit": c.unit} if c.unit else {})
         | {"datatype": "int64" if c.format == "d" else "float64"}
         for c in columns
-    ] + [{"name": name, "datatype": "string"} for name in text_columns]
+    ] + [{"name": "source", "datatype": "string"}]
     with (
         files.atomic_file(path) as temporary,
         open(temporary, "w", encoding="utf-8", newline="") as out,
     ):
         out.write(header_text(datatype, meta | {"rows": len(rows)}))
         table = csv.writer(out, lineterminator="\n")
-        table.writerow([*(c.name for c in columns), *text_columns])
+        table.writerow([*(c.name for c in columns), "source"])
         for row in rows:
-            table.writerow(
-                [format(row[c.name], c.format) for c in columns]
-                + [row[t] for t in text_columns]
-            )
+            table.writerow([*(format(row[c.name], c.format) for c in columns), row["source"]])
 
 
 def header_text(datatype: list[dict[str, Any]], meta: dict[str, Any]) -> str:

@@ -371,11 +371,7 @@ def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -
     if not isinstance(spectrum, str) and fwhm_m is None:
         focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
         return np.array([focus_m, 0.0, corner_px, 0.0])
-    power = (
-        measured(spectrum).response_at
-        if isinstance(spectrum, str)
-        else colored(spectrum, fwhm_m or 0.0)
-    )
+    power, _ = broad_spectrum(spectrum, fwhm_m)
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
@@ -488,31 +484,31 @@ def radiant_strength_e_s_sr(
 
     S is the spectrum's shape, R the camera's response.
     """
-    if isinstance(spectrum, str):
-        power = measured(spectrum)
-        electrons = band.integral(
-            lambda wavelength_m: power.response_at(wavelength_m) * wavelength_m / HC_J_M
-        )
-        electrons_per_joule = electrons / power.integral(np.ones_like)
-    elif fwhm_m is None:
+    if not isinstance(spectrum, str) and fwhm_m is None:
         # A line has one wavelength.
         electrons_per_joule = band.response_at(spectrum) * spectrum / HC_J_M
     else:
-        gaussian = colored(spectrum, fwhm_m)
-        electrons_per_joule = band.integral(
-            lambda wavelength_m: gaussian(wavelength_m) * wavelength_m / HC_J_M
+        power, total = broad_spectrum(spectrum, fwhm_m)
+        electrons = band.integral(
+            lambda wavelength_m: power(wavelength_m) * wavelength_m / HC_J_M
         )
+        electrons_per_joule = electrons / total
     return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
 
 
-def measured(spectrum: str) -> Band:
-    """The relative power of an LED per nanometer: data/led/white.csv or a file.
+def broad_spectrum(
+    spectrum: Spectrum, fwhm_m: float | None
+) -> tuple[Callable[[Floats], Floats], float]:
+    """The power of an LED, not a line, per meter of wavelength to any scale, and its integral: a file's or `colored`.
 
     Features narrower than the steps of `Band.integral` are not resolved. Raises InputError for a file that is not a
     curve.
     """
+    if not isinstance(spectrum, str):
+        return colored(spectrum, fwhm_m or 0.0), 1.0
     path = spectrum_file(spectrum)
-    return _read_curve(path, path.stat().st_mtime_ns, math.inf)
+    measured = _read_curve(path, path.stat().st_mtime_ns, math.inf)
+    return measured.response_at, float(measured.integral(np.ones_like))
 
 
 def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
@@ -535,15 +531,15 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
     # The eye's response in daylight.
     photopic = _read_curve(DATA / "bands" / "photopic.csv")
     if isinstance(spectrum, str):
-        power = measured(spectrum)
-        seen = float(photopic.integral(power.response_at))
+        power, total = broad_spectrum(spectrum, fwhm_m)
+        seen = float(photopic.integral(power))
         if not seen:
             raise InputError(
                 "light.led.spectrum",
                 f"{spectrum} is invisible and has no candelas",
                 "radiant_intensity",
             )
-        return LUMINOUS_EFFICACY_LM_W * seen / float(power.integral(np.ones_like))
+        return LUMINOUS_EFFICACY_LM_W * seen / total
     if not photopic.response_at(spectrum):
         allowed = "{:g} to {:g} nm".format(*(photopic.wavelength_m[[0, -1]] * 1e9))
         raise InputError(

@@ -288,18 +288,15 @@ def gaia_table() -> Table:
     bp = rows["bp"].astype(float)
     rp = rows["rp"].astype(float)
     # The few stars without a color get a typical one.
-    v_mag, b_v, v_i = johnson(
+    light = johnson(
         rows["g"].astype(float), np.where((bp > 0) & (rp > 0), bp - rp, TYPICAL_BP_RP)
     )
-    zeros = {name: np.zeros(len(rows)) for name in MOTION}
-    light = dict(zip(LIGHT, (v_mag, b_v, v_i), strict=True))
     return {
         "hip": number,
         "ra_deg": rows["ra"],
         "dec_deg": rows["dec"],
-        **zeros,
-        **light,
-        "scatter_mag": np.zeros(len(rows)),
+        **{name: np.zeros(len(rows)) for name in (*MOTION, "scatter_mag")},
+        **dict(zip(LIGHT, light, strict=True)),
         "source": np.full(len(rows), "gaia"),
     }
 

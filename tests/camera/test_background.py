@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.background import (
     BACKGROUNDS,
     NANOLAMBERT_V0,
+    diffuse_air_mass,
     fill,
     glow_map,
     moonlight_nl,
@@ -190,9 +191,13 @@ def vmag_arcsec2(nanolamberts: float) -> float:
     return (20.7233 - np.log(nanolamberts / 34.08)) / 0.92104
 
 
+def masses(*zenith_deg: float) -> np.ndarray:
+    return diffuse_air_mass(np.radians(zenith_deg))
+
+
 def test_moonlight_is_as_bright_as_published() -> None:
     """specsim 0.14's krisciunas_schaefer(20 deg, 70 deg, 50 deg, 0.25, 0.15): 19.855 mag arcsec^-2."""
-    value = moonlight_nl(50.0, 45.0, 0.15, 70.0, 20.0)
+    value = moonlight_nl(50.0, 45.0, 0.15, *masses(70.0, 20.0))
     assert vmag_arcsec2(float(value)) == pytest.approx(19.855, abs=5e-4)
 
 
@@ -204,15 +209,15 @@ def test_nanolamberts_convert_to_magnitudes() -> None:
 def test_the_half_moon_is_2_6_magnitudes_below_the_full_moon() -> None:
     """By hand: 0.026 x 90 + 4e-9 x 90^4 = 2.602."""
     full, half = (
-        float(moonlight_nl(60.0, phase, 0.172, 45.0, 30.0)) for phase in (0.0, 90.0)
+        float(moonlight_nl(60.0, phase, 0.172, *masses(45.0, 30.0))) for phase in (0.0, 90.0)
     )
     assert 2.5 * np.log10(full / half) == pytest.approx(2.602, abs=5e-4)
 
 
 def test_scattered_moonlight_decreases_to_90_degrees_and_vanishes_without_air() -> None:
     rho = np.linspace(0.3, 90, 2000)
-    assert (np.diff(moonlight_nl(rho, 10.0, 0.172, 45.0, 30.0)) < 0).all()
-    assert not moonlight_nl(rho, 10.0, 0.0, 45.0, 30.0).any()
+    assert (np.diff(moonlight_nl(rho, 10.0, 0.172, *masses(45.0, 30.0))) < 0).all()
+    assert not moonlight_nl(rho, 10.0, 0.0, *masses(45.0, 30.0)).any()
     # No step where the laws change.
     assert np.abs(np.diff(np.log(scattering(rho)))[rho[1:] > 5]).max() < 0.02
     # 1 / rho^2 and a little Rayleigh.
@@ -232,7 +237,7 @@ def test_moonlight_on_the_frame_comes_from_the_moon_s_side() -> None:
     column = np.array([100, 400, 700])
     toward = np.column_stack([(column - 400) / lens.camera.focal_px, np.zeros(3), np.ones(3)])
     separation = np.degrees(np.arccos(toward @ moon_cam / np.linalg.norm(toward, axis=1)))
-    wanted = moonlight_nl(separation, 20.0, 0.172, 50.0, 20.0) / (
+    wanted = moonlight_nl(separation, 20.0, 0.172, *masses(50.0, 20.0)) / (
         NANOLAMBERT_V0 * 10 ** (-0.4 * 21.0)
     )
     np.testing.assert_allclose(ratio[300, column], wanted, rtol=1e-3)

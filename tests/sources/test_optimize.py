@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -175,8 +173,8 @@ def test_an_optimized_layout_keeps_cap_surface_and_spacing(best: Sources) -> Non
 def test_an_optimized_layout_depends_on_its_seed_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    quick = replace(optimize.OPTIONS, score_attitudes=2000, fresh_attitudes=1000)
-    monkeypatch.setattr(optimize, "OPTIONS", quick)
+    monkeypatch.setattr(optimize, "SCORE_ATTITUDES", 2000)
+    monkeypatch.setattr(optimize, "FRESH_ATTITUDES", 1000)
     few = WANTED | {"count": 20, "tilt_deg": 2, "rounds": 5}
     first, again, other = (lit(few | {"hardware_seed": seed}) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.place, again.place)

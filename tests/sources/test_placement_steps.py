@@ -60,7 +60,9 @@ def test_sites_are_spread_as_widely_as_there_are_that_many() -> None:
     assert len(PLACING.spread(sites_m, 0.3, 190, 40)) == len(PLACING.thin(sites_m, 0.3))
 
 
-def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> None:
+def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The inner field is 0.8 of the tangents of half of 20 x 15 deg; some attitudes see none, one, two and more."""
     rng = np.random.default_rng(4)
     place_m = rng.normal([0, 0, 1.2], [0.4, 0.4, 0], (60, 3))
@@ -70,7 +72,8 @@ def test_attitudes_with_less_than_two_leds_in_the_inner_field_are_counted() -> N
     seen = np.sum((np.abs(x) <= half_x * z) & (np.abs(y) <= half_y * z), axis=1)
     assert {0, 1, 2, 3} <= set(seen)
     config = SimpleNamespace(camera_m=(0.02, 0.01, 0.3), field_deg=(20.0, 15.0))
-    score = OPTIMIZE.PlacementScore(config, SimpleNamespace(inner_field=0.8), R)
+    monkeypatch.setattr(OPTIMIZE, "INNER_FIELD", 0.8)
+    score = OPTIMIZE.PlacementScore(config, R)
     assert score.under_two(place_m) == np.sum(seen < 2)
 
 
@@ -113,16 +116,16 @@ def test_leds_are_moved_to_reduce_an_ambiguity_where_their_spacing_allows_it(
     sites_m = np.random.default_rng(6).uniform(0, 1, (400, 3))
     place_m = sites_m[PLACING.thin(sites_m, 0.2, 20)]
     config = SimpleNamespace(count=20, spacing_m=0.2)
-    options = OPTIMIZE.PlacementOptions(ambiguity_trials=300)
+    monkeypatch.setattr(OPTIMIZE, "AMBIGUITY_TRIALS", 300)
     scorer = SimpleNamespace(
-        config=config, options=options, tail_variance=lambda _: 0.5, under_two=lambda _: 0
+        config=config, tail_variance=lambda _: 0.5, under_two=lambda _: 0
     )
     layouts = []
 
     def overlap(_: object, at_m: np.ndarray) -> object:
         layouts.append(at_m)
         return AMBIGUITY.Ambiguity(
-            np.arange(20), np.arange(20), options.max_overlap + (0.9 - at_m[:, 2]).clip(0)
+            np.arange(20), np.arange(20), OPTIMIZE.MAX_OVERLAP + (0.9 - at_m[:, 2]).clip(0)
         )
 
     monkeypatch.setattr(OPTIMIZE, "layout_ambiguity", overlap)

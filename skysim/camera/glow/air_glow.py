@@ -14,7 +14,8 @@ from skysim.camera.glow.background import (
     NANOLAMBERT_V0,
     ViewingGeometry,
     angular_separation_deg,
-    moonlight_through_nl,
+    diffuse_air_mass,
+    moonlight_nl,
     scattering,
 )
 from skysim.core.constants import SUN_V_MAG
@@ -60,15 +61,6 @@ def seen_place(name: str, sky: Sky) -> Place:
     )
 
 
-def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
-    """Relative length of the line of sight in a thin shell that emits or scatters, 1 at the zenith; 5 on the horizon.
-
-    X = (1 - 0.96 sin^2 Z)^-1/2: van Rhijn's (1921) law with (R / (R + h))^2 = 0.96, h = 131 km (Garstang 1989, PASP
-    101, 306; KS91 eq. 3).
-    """
-    return np.asarray((1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5)
-
-
 def airglow_nl(
     zenith_mag_arcsec2: float, zenith_rad: Floats, extinction_mag: float
 ) -> Floats:
@@ -87,7 +79,7 @@ def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
     altitude_rad = float(sky.altitude_rad(moon.direction[None])[0])
     if altitude_rad < 0:
         return np.zeros(len(directions))
-    return moonlight_through_nl(
+    return moonlight_nl(
         angular_separation_deg(directions, moon.direction),
         math.degrees(moon.phase_rad),
         sky.air.config.extinction_mag,

@@ -153,8 +153,8 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
         to_moon_deg,
         config.phase_angle_deg,
         config.extinction_mag,
-        config.moon_zenith_deg,
-        config.field_zenith_deg,
+        float(diffuse_air_mass(math.radians(config.moon_zenith_deg))),
+        diffuse_air_mass(math.radians(config.field_zenith_deg)),
     )
     # From nanolamberts, by the radiance of one magnitude 0 per square arcsecond.
     radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
@@ -162,18 +162,6 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
 
 
 def moonlight_nl(
-    separation_deg: float | Floats,
-    phase_angle_deg: float,
-    extinction_mag: float,
-    moon_zenith_deg: float,
-    field_zenith_deg: float,
-) -> Floats:
-    """`moonlight_through_nl` with the air masses of zenith distances."""
-    masses = air_mass(moon_zenith_deg), air_mass(field_zenith_deg)
-    return moonlight_through_nl(separation_deg, phase_angle_deg, extinction_mag, *masses)
-
-
-def moonlight_through_nl(
     separation_deg: float | Floats,
     phase_angle_deg: float,
     extinction_mag: float,
@@ -206,9 +194,13 @@ def scattering(separation_deg: float | Floats) -> Floats:
     return np.asarray(molecules + np.maximum(10 ** (6.15 - rho / 40), 6.2e7 / rho**2))
 
 
-def air_mass(zenith_deg: float) -> float:
-    """Air mass along the line of sight, relative to the zenith: (1 - 0.96 sin^2 Z)^-1/2 (KS91 eq. 3)."""
-    return float((1 - 0.96 * math.sin(math.radians(zenith_deg)) ** 2) ** -0.5)
+def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
+    """Relative length of the line of sight in a thin shell that emits or scatters, 1 at the zenith; 5 on the horizon.
+
+    X = (1 - 0.96 sin^2 Z)^-1/2: van Rhijn's (1921) law with (R / (R + h))^2 = 0.96, h = 131 km (Garstang 1989, PASP
+    101, 306; KS91 eq. 3).
+    """
+    return np.asarray((1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5)
 
 
 def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:

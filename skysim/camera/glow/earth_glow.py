@@ -151,7 +151,9 @@ def earth_around(
         for radius in (1.0, LAYER[1])
     ]
     in_cone, weights_sr = cone_rule(*edges)
-    directions = in_cone @ axes_about(-observer_m / distance_m)
+    nadir = -observer_m / distance_m
+    across = perpendicular(nadir[None])[0]
+    directions = in_cone @ np.stack([across, np.cross(nadir, across), nadir])
     return directions, weights_sr * earth_radiance(
         config, observer_m, directions, sun_m, band
     )
@@ -187,9 +189,3 @@ def interval_rule(low: float, high: float, count: int) -> tuple[Floats, Floats]:
     """Nodes and weights of the Gauss-Legendre rule on an interval."""
     x, weight = np.polynomial.legendre.leggauss(count)
     return (low + high + (high - low) * x) / 2, weight * (high - low) / 2
-
-
-def axes_about(z: Floats) -> Floats:
-    """(3, 3) rows: two unit vectors across the unit vector z, and z."""
-    x = perpendicular(z[None])[0]
-    return np.stack([x, np.cross(z, x), z])

@@ -171,9 +171,9 @@ def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
     for lit in beam.lits:
         if lit.glow:
             found[lit.name] += exposure_s * float(np.mean(lit.glow()))
-        edged_e_s = lit.edged.e_s() if lit.edged and lit.hides is None else None
-        if lit.edged and edged_e_s is not None:
-            found[lit.name] += exposure_s * lit.edged.share * float(np.median(edged_e_s))
+        edged_e_s = lit.edged() if lit.edged and lit.hides is None else None
+        if edged_e_s is not None:
+            found[lit.name] += exposure_s * float(np.median(edged_e_s))
     return found
 
 

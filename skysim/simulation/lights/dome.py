@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
 from skysim.camera.thermal_motion import leds_at
-from skysim.core.types import Sources
+from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.scene.sections.surroundings import ThermalConfig
-from skysim.simulation.lights.light import EdgedGlow, Exposure, KnownLight, LightPlan, Lit
+from skysim.simulation.lights.light import Exposure, KnownLight, LightPlan, Lit
 from skysim.simulation.lights.starlight import stars_of
 from skysim.sources import dome
 from skysim.sources.dome import display
@@ -118,14 +118,16 @@ class CollimatedDisplay(KnownLight):
 
 def black_pixels(
     config: DomeConfig | CollimatedDisplayConfig, exposure: Exposure, share: float = 1.0
-) -> EdgedGlow:
+) -> Callable[[], Floats | None]:
     """The light of a display's black pixels, of which a share is left; none without a display or if black is dark."""
-    optics = exposure.optics
-    cam_from_lab = exposure.cam_from_lab
-    camera_m = exposure.camera_m
-    return EdgedGlow(
-        lambda: black_glow(config, optics, cam_from_lab, camera_m, exposure.band), share
-    )
+
+    def e_s() -> Floats | None:
+        glow = black_glow(
+            config, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band
+        )
+        return None if glow is None else share * glow
+
+    return e_s
 
 
 # The light of the scene's section `light`.

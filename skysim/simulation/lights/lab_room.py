@@ -90,8 +90,8 @@ class Mirror(AddedLight):
 def build_wall(plan: LightPlan) -> Iterator[Light]:
     """The light that the wall or the floor of a dome reflects."""
     light = plan.scene.light
-    dome = reflecting_dome(light, known_light(plan).sources)
-    if isinstance(light, DomeConfig) and dome is not None:
+    if isinstance(light, DomeConfig) and light.reflection:
+        dome = reflecting_dome(light, light.reflection, known_light(plan).sources)
         if dome.diffuse is not None:
             yield WallGlow(dome, light.led.warm_up)
         if dome.config.mirrors:

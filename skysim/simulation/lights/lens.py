@@ -17,7 +17,6 @@ from skysim.simulation.lights.light import (
     Beam,
     Exposure,
     Light,
-    LightPath,
     LightPlan,
     Lit,
     beam_of,
@@ -75,10 +74,7 @@ class Ghosts(AddedLight):
     ghosts: tuple[GhostConfig, ...]
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
-        paths = (
-            LightPath(n, ghost_optics(exposure.optics, ghost))
-            for n, ghost in enumerate(self.ghosts, 1)
-        )
+        paths = (ghost_optics(exposure.optics, ghost) for ghost in self.ghosts)
         return beam._replace(paths=(*beam.paths, *paths))
 
 

@@ -17,7 +17,7 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -167,22 +167,6 @@ def any_of(occluders: Sequence[Occluder]) -> OcclusionTest | None:
     return hidden if occluders else None
 
 
-class EdgedGlow(NamedTuple):
-    """Extended light with edges.
-
-    Attributes
-    ----------
-    e_s
-        Returns (h, w) electrons s^-1 px^-1 at evenly spaced nodes from the center of the first pixel to that of the
-        last, or of all pixels; None if no light is in the field
-    share
-        Fraction of that light that is left
-    """
-
-    e_s: Callable[[], Floats | None]
-    share: float = 1.0
-
-
 class Lit(NamedTuple):
     """The light that one `Light` adds to an exposure. Extended light is slow, so functions compute it when needed.
 
@@ -201,7 +185,8 @@ class Lit(NamedTuple):
     glow
         Returns smooth extended light in electrons s^-1 px^-1: a number, or (h, w) at `background.node_directions`
     edged
-        Extended light with edges
+        Returns extended light with edges: (h, w) electrons s^-1 px^-1 at evenly spaced nodes from the center of the
+        first pixel to that of the last, or of all pixels; None if no light is in the field
     around
         Returns directions (M, 3) and irradiances (M,), photo-electrons s^-1 m^-2, of extended light inside and
         outside the field, which a baffle may let through
@@ -219,7 +204,7 @@ class Lit(NamedTuple):
     emitter: Emitter = Emitter()
     discs: tuple[BodyLight, ...] = ()
     glow: Callable[[], Floats | float] | None = None
-    edged: EdgedGlow | None = None
+    edged: Callable[[], Floats | None] | None = None
     around: Callable[[], tuple[Floats, Floats]] | None = None
     hides: Occluder | None = None
     hidden_by: tuple[Occluder, ...] = ()
@@ -238,13 +223,6 @@ class Lit(NamedTuple):
         return any_of(self.hidden_by)
 
 
-class LightPath(NamedTuple):
-    """One path of the light through the lens: number 0 is the image, 1 and above are ghosts."""
-
-    number: int
-    optics: Optics
-
-
 class Beam(NamedTuple):
     """All light of an exposure on its way to the detector.
 
@@ -253,13 +231,13 @@ class Beam(NamedTuple):
     lits
         Light of each source so far
     paths
-        Paths through the lens: the image first, then ghosts
+        Optics of each path through the lens: number 0 is the image, the others are ghosts
     glares
         Veiling glares of the lens
     """
 
     lits: tuple[Lit, ...]
-    paths: tuple[LightPath, ...]
+    paths: tuple[Optics, ...]
     glares: tuple[GlareConfig, ...] = ()
 
     def plus(self, lit: Lit) -> Beam:
@@ -275,8 +253,7 @@ class Beam(NamedTuple):
     def blurred(self, blur_px: float) -> Beam:
         """The beam with the blur of the air in its image, a Gaussian of this standard deviation."""
         image, *ghosts = self.paths
-        blurred = image._replace(optics=replace(image.optics, blur_px=blur_px))
-        return self._replace(paths=(blurred, *ghosts))
+        return self._replace(paths=(replace(image, blur_px=blur_px), *ghosts))
 
     @property
     def discs(self) -> tuple[BodyLight, ...]:
@@ -343,10 +320,6 @@ class KnownLight(Light):
     sources: Sources
     emitter: Emitter
 
-    def with_sources(self, sources: Sources) -> Self:
-        """The same light with other sources."""
-        return replace(self, sources=sources)
-
 
 class Obstacle(Light):
     """An object that hides lights; `during` returns its occluder, and is fast."""
@@ -359,7 +332,7 @@ def find_light(lights: Iterable[Light], kind: type[AnyLight]) -> AnyLight | None
 
 def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
     """The beam of an exposure after all lights."""
-    beam = Beam((), (LightPath(0, exposure.optics),))
+    beam = Beam((), (exposure.optics,))
     for light in lights:
         beam = light.through(beam, exposure)
     return beam

@@ -11,7 +11,6 @@ from skysim.scene.sections.light import BodiesConfig, StarsConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
     AddedLight,
-    EdgedGlow,
     Exposure,
     Light,
     LightPlan,
@@ -65,7 +64,7 @@ class LitEarth(DarkEarth):
         band = exposure.band
         dark = super().during(exposure)
         return dark._replace(
-            edged=EdgedGlow(lambda: earth_light(*seen_from, optics, cam_from_lab, band)),
+            edged=lambda: earth_light(*seen_from, optics, cam_from_lab, band),
             around=lambda: earth_around(*seen_from, band),
         )
 

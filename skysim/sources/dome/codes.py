@@ -19,7 +19,7 @@ from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, Code, DirectConfig, PwmConfig
-from skysim.scene.sections.light import DomeConfig, Light
+from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.codebooks import Words, codebook, light_levels
 
 # Clocks of the LED controllers: each times its pulses with an oscillator of its own. No two oscillators agree, and they
@@ -136,11 +136,9 @@ def filtered_share(pulses: Sources, filter_s: Floats, begin_s: float, end_s: flo
     return (lit1_s - lit0_s - filter_s * (voltage1 - voltage0)) / (end_s - begin_s)
 
 
-def build_clocks(light: Light, sources: Sources, seed: int) -> Clocks | None:
+def build_clocks(light: DomeConfig, sources: Sources, seed: int) -> Clocks | None:
     """The clocks of a dome's controllers in the run of that seed; None if all light is steady."""
-    if not isinstance(light, DomeConfig) or not len(sources):
-        return None
-    if isinstance(light.led.drive, DirectConfig):
+    if not len(sources) or isinstance(light.led.drive, DirectConfig):
         return None
     hardware = hardware_seed(light.layout)
     clocks = Clocks.draw(light.led.clock, int(sources.clock.max()) + 1, hardware, seed)
@@ -216,7 +214,7 @@ class LedCodes:
         return float(self.clock.on_s[0] + t_s * (1 + rate))
 
 
-def build_codes(light: Light, sources: Sources, seed: int) -> LedCodes | None:
+def build_codes(light: DomeConfig, sources: Sources, seed: int) -> LedCodes | None:
     """The code of a dome's LEDs in the run of that seed; None without one.
 
     Raises
@@ -224,9 +222,9 @@ def build_codes(light: Light, sources: Sources, seed: int) -> LedCodes | None:
     InputError
         For more LEDs than the code has words.
     """
-    if not isinstance(light, DomeConfig) or light.led.code is None:
-        return None
     code = light.led.code
+    if code is None:
+        return None
     clock = None
     if code.bit_time_s != "frame":
         clock = Clocks.draw(

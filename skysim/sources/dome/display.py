@@ -164,11 +164,9 @@ def panel_sources(
     )
     flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
     place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
-    patches = LitBlocks(
-        place_m, panel.inward(place_m), config.block * led.disk_diameter_m / 2, 1.0
-    )
+    radius_m = config.block * led.disk_diameter_m / 2
     row = blocks.corner_px[:, 1] / config.pixels[1]
-    return block_sources(config, led, band, stars, blocks, patches, row)
+    return block_sources(config, led, band, stars, blocks, place_m, panel, radius_m, row)
 
 
 def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> PixelBlocks:
@@ -189,35 +187,31 @@ def visible_blocks(config: PanelConfig, position_m: Floats, level: Floats) -> Pi
     return blocks
 
 
-class LitBlocks(NamedTuple):
-    """M lit blocks of pixels.
-
-    Attributes
-    ----------
-    place_m, normal
-        (M, 3) places, and inward normals of the surface
-    radius_m
-        Radius of the disk that represents a block
-    gain
-        Light of a block's pixel, relative to the white pixel `led`
-    """
-
-    place_m: Floats
-    normal: Floats
-    radius_m: Floats | float
-    gain: Floats | float
-
-
 def block_sources(
     config: PanelConfig,
     led: leds.LedConfig,
     band: Band,
     stars: Sources,
     blocks: PixelBlocks,
-    patches: LitBlocks,
-    row: Floats | float,
+    place_m: Floats,
+    surface: Surface,
+    radius_m: Floats | float,
+    row: Floats | float = 0.0,
+    gain: Floats | float = 1.0,
 ) -> Sources:
-    """The blocks as sources, each with n^2 times the light of a pixel; `row` as in `DriveInput`."""
+    """The M blocks as sources, each with n^2 times the light of a pixel.
+
+    Parameters
+    ----------
+    place_m, surface
+        (M, 3) places, and the surface that they are on
+    radius_m
+        Radius of the disk that represents a block
+    row
+        As in `DriveInput`
+    gain
+        Light of a block's pixel, relative to the white pixel `led`
+    """
     rng = random_stream(config.points.hardware_seed)
     count = len(blocks.star)
     # Pixels scatter independently: the mean of n^2 of them scatters by 1 / n as much, and is nearly Gaussian.
@@ -227,20 +221,14 @@ def block_sources(
         led, DriveInput(blocks.level, np.zeros(count, dtype=np.int64), row), rng
     )
     # n^2 pixels of the panel, each dimmed by scatter, gray level and lens.
+    full = panel_strength_e_s_sr(led, band) * config.block**2
+    strength = full * scatter * pulses.strength * gain
     return Sources(
         id=stars.id[blocks.star],
-        place=np.column_stack([patches.place_m, np.ones(count)]),
-        normal=patches.normal,
-        radius_m=np.broadcast_to(patches.radius_m, (count,)).copy(),
-        strength=panel_strength_e_s_sr(led, band)
-        * config.block**2
-        * scatter
-        * pulses.strength
-        * patches.gain,
-        period_s=pulses.period_s,
-        start_s=pulses.start_s,
-        on_s=pulses.on_s,
-        clock=pulses.clock,
+        place=np.column_stack([place_m, np.ones(count)]),
+        normal=surface.inward(place_m),
+        radius_m=np.broadcast_to(radius_m, (count,)).copy(),
+        **pulses._replace(strength=strength)._asdict(),
         magnitude=stars.magnitude[blocks.star],
         chromatic=chromatic_of(led, band, np.zeros(count)),
     )
@@ -323,26 +311,14 @@ def beam_sources(
     At the distance D a source has the strength F D^2, which gives the flux F at the bearing.
     """
     direction = normalized(beam)
-    zeros = np.zeros(len(beam))
-    ones = np.ones(len(beam))
-    place = np.column_stack([direction, zeros])
-    normal = 0 * direction
-    strength = flux_e_s_m2
-    if config.conjugate_m is not None:
-        place = np.column_stack([direction * config.conjugate_m, ones])
-        normal = -direction
-        strength = flux_e_s_m2 * config.conjugate_m**2
-    return Sources(
-        id=stars.hip,
-        place=place,
-        normal=normal,
-        radius_m=zeros,
-        strength=strength,
-        period_s=ones,
-        start_s=zeros,
-        on_s=ones,
-        clock=np.zeros(len(beam), dtype=np.int64),
-        magnitude=stars.v_mag,
+    beams = star_sources.steady_points(stars.hip, direction, flux_e_s_m2, stars.v_mag)
+    if config.conjugate_m is None:
+        return beams
+    return dataclasses.replace(
+        beams,
+        place=np.column_stack([direction * config.conjugate_m, np.ones(len(beam))]),
+        normal=-direction,
+        strength=flux_e_s_m2 * config.conjugate_m**2,
     )
 
 
@@ -409,7 +385,7 @@ def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
 
 
 def spot_radius_m(
-    config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats, normal: Floats
+    config: ProjectorConfig, surface: Surface, chip_m: Floats, place_m: Floats
 ) -> Floats:
     """(N,) radii of uniform disks with the mean square radius of each block's image on the wall.
 
@@ -421,6 +397,7 @@ def spot_radius_m(
     position_m = np.array(config.position_m)
     R_own_from_lab = own_from_lab(config).as_matrix()
     ray = rays(config, chip_m)
+    normal = surface.inward(place_m)
     square_m2 = np.zeros(len(chip_m))
     half_m = config.block * config.pitch_m / 2
     # 1. The mean square of a parallelogram as r^2 of a disk: (a^2 + b^2) / 6.
@@ -486,12 +463,13 @@ def projector_sources(
             "a star's pixel is below the dome's rim",
             "a smaller cap_deg",
         )
-    normal = surface.inward(place_m)
-    lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m, normal)
+    lens_disk_m = spot_radius_m(config, surface, drawn_m, place_m)
     cos_axis = ray @ own_from_lab(config).as_matrix()[2]
     radius_m = np.hypot(lens_disk_m, led.disk_diameter_m / 2)
-    patches = LitBlocks(place_m, normal, radius_m, cos_axis**config.falloff)
-    return block_sources(config, led, band, stars, blocks, patches, 0.0)
+    gain = cos_axis**config.falloff
+    return block_sources(
+        config, led, band, stars, blocks, place_m, surface, radius_m, gain=gain
+    )
 
 
 def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) -> Floats:

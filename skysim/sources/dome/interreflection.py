@@ -225,11 +225,10 @@ class ReflectingDome(NamedTuple):
     diffuse: DiffuseLight | None
 
 
-def reflecting_dome(light: object, leds: Sources) -> ReflectingDome | None:
-    """The reflecting dome of a scene's light and its LEDs; None if nothing reflects."""
-    if not isinstance(light, DomeConfig) or light.reflection is None:
-        return None
-    config = light.reflection
+def reflecting_dome(
+    light: DomeConfig, config: ReflectionConfig, leds: Sources
+) -> ReflectingDome:
+    """The dome of a scene's light, which reflects by its section `config`, and its LEDs."""
     wall = build_surface(light.surface)
     diffuse = None
     if config.diffuse or config.floor:

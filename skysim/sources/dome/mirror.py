@@ -52,31 +52,6 @@ class Rays(NamedTuple):
     cosine: Floats
 
 
-class Image(NamedTuple):
-    """K images of LEDs in the wall.
-
-    Attributes
-    ----------
-    led
-        (K,) rows of the LEDs
-    toward, distance_m
-        (K, 3) directions from the camera, and (K,) virtual distances
-    cosine
-        (K,) cosines of the angle of incidence
-    wall_m
-        (K, 3) places on the wall where the LEDs are mirrored
-    along
-        (K, 3) directions from there toward the LEDs
-    """
-
-    led: Ints
-    toward: Floats
-    distance_m: Floats
-    cosine: Floats
-    wall_m: Floats
-    along: Floats
-
-
 def mirrored(
     config: ReflectionConfig, wall: Surface, leds: Sources, camera_m: Floats, grid: Floats
 ) -> Sources:
@@ -93,18 +68,42 @@ def mirrored(
     """
     if not wall.inside(camera_m):
         return leds.take(np.zeros(0, np.int64))
-    images = find_images(wall, leds.place[:, :3], camera_m, grid)
-    sources = leds.take(images.led)
-    normal = wall.inward(images.wall_m) if len(images.led) else np.zeros((0, 3))
+    # 1.
+    led, start = nearest_rays(wall, leds.place[:, :3], camera_m, grid)
+    led_m = leds.place[led, :3]
+    toward = grid.reshape(-1, 3)[start]
+    # 2. A step is limited, since far from the solution the linear law may lead anywhere.
+    for _ in range(STEPS):
+        offset, jacobian, axes = linearized(wall, led_m, camera_m, toward)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
+        toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
+        toward = normalized(toward)
+    # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in the field.
+    offset, jacobian, _ = linearized(wall, led_m, camera_m, toward)
+    rays = reflect(wall, camera_m, toward)
+    to_led = led_m - rays.wall_m
+    far_m = np.linalg.norm(to_led, axis=1)
+    path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
+    solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
+    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0])
+    solved &= np.sum(to_led * rays.along, axis=1) > 0
+    solved &= cosines_to_grid(toward, grid) > 0
+    # d = sqrt(|det dF / du|).
+    distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
+    found = distinct(led, toward, solved & (distance_m > 0))
     # 4. The virtual LED's normal is the LED's, mirrored at the wall.
+    sources = leds.take(led[found])
+    wall_m = rays.wall_m[found]
+    normal = wall.inward(wall_m) if len(found) else np.zeros((0, 3))
     across = np.sum(sources.normal * normal, axis=1, keepdims=True)
-    virtual_m = camera_m + images.toward * images.distance_m[:, None]
+    virtual_m = camera_m + toward[found] * distance_m[found, None]
     return replace(
         sources,
-        id=sources.id + MIRRORED * numbered(images.led),
+        id=sources.id + MIRRORED * numbered(led[found]),
         place=np.column_stack([virtual_m, np.ones(len(sources))]),
         normal=sources.normal - 2 * across * normal,
-        strength=sources.strength * reflectance(config, images.cosine),
+        strength=sources.strength * reflectance(config, rays.cosine[found]),
     )
 
 
@@ -126,35 +125,6 @@ def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
     r_s = (cosine - n * refracted) / (cosine + n * refracted)
     r_p = (n * cosine - refracted) / (n * cosine + refracted)
     return np.asarray((r_s**2 + r_p**2) / 2)
-
-
-def find_images(wall: Surface, led_m: Floats, camera_m: Floats, grid: Floats) -> Image:
-    """All images of LEDs at (N, 3) in the directions of a grid (h, w, 3), in the LEDs' order: steps 1 to 3."""
-    # 1.
-    led, start = nearest_rays(wall, led_m, camera_m, grid)
-    toward = grid.reshape(-1, 3)[start]
-    # 2. A step is limited, since far from the solution the linear law may lead anywhere.
-    for _ in range(STEPS):
-        offset, jacobian, axes = linearized(wall, led_m[led], camera_m, toward)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            step = -np.einsum("kij,kj->ki", inverse(jacobian), offset)
-        toward = toward + np.einsum("ki,kij->kj", np.clip(step, -0.1, 0.1), axes)
-        toward = normalized(toward)
-    # 3. What a solution must satisfy: F = 0, an LED off the wall and ahead of the reflected ray, in the field.
-    offset, jacobian, _ = linearized(wall, led_m[led], camera_m, toward)
-    rays = reflect(wall, camera_m, toward)
-    to_led = led_m[led] - rays.wall_m
-    far_m = np.linalg.norm(to_led, axis=1)
-    path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
-    solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
-    solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0])
-    solved &= np.sum(to_led * rays.along, axis=1) > 0
-    solved &= cosines_to_grid(toward, grid) > 0
-    # d = sqrt(|det dF / du|).
-    distance_m = np.sqrt(np.abs(np.linalg.det(np.nan_to_num(jacobian))))
-    found = distinct(led, toward, solved & (distance_m > 0))
-    wall_m, along, cosine = (part[found] for part in rays)
-    return Image(led[found], toward[found], distance_m[found], cosine, wall_m, along)
 
 
 def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:

@@ -28,13 +28,11 @@ ALL_ROUND_RAD = np.linspace(0.0, 2 * np.pi, MERIDIANS, endpoint=False)
 
 def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
     """Raise InputError, one line with the size and the limit, for a dome that does not fit into the room."""
-    points_m = shell_m(room, surface, cap_deg, ALL_ROUND_RAD)
-    low_m = points_m.min(axis=0)
-    high_m = points_m.max(axis=0)
+    found = fit(room, surface, cap_deg)
     # Heights above the floor, if the bearing's height is known.
     if room.bearing_height_m is not None:
-        top_m = room.bearing_height_m + high_m[2]
-        bottom_m = room.bearing_height_m + low_m[2]
+        top_m = found["top_m"]
+        bottom_m = found["rim_m"]
         if room.height_m is not None and top_m > room.height_m:
             raise InputError(
                 "light.room.height",
@@ -45,20 +43,20 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
             raise InputError(
                 "light.room.bearing_height",
                 f"{room.bearing_height_m:.3f} m puts the dome's rim {-bottom_m:.3f} m below the floor",
-                f"{-low_m[2]:.3f} m or more, or a higher rim",
+                f"{room.bearing_height_m - bottom_m:.3f} m or more, or a higher rim",
             )
     # Widths between the walls.
     for axis, (key, limit_m) in enumerate(
         (("width", room.width_m), ("length", room.length_m))
     ):
-        if limit_m is not None and high_m[axis] - low_m[axis] > limit_m:
+        if limit_m is not None and found["extent_m"][axis] > limit_m:
             raise InputError(
                 f"light.room.{key}",
-                f"the dome is {high_m[axis] - low_m[axis]:.3f} m wide along {'xy'[axis]}",
+                f"the dome is {found['extent_m'][axis]:.3f} m wide along {'xy'[axis]}",
                 f"{limit_m:.3f} m, the room",
             )
     if room.door_m is not None:
-        check_door(room, room.door_m, surface, cap_deg)
+        check_door(room, room.door_m, found["part_m"], surface, cap_deg)
 
 
 def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
@@ -82,11 +80,14 @@ def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
 
 
 def check_door(
-    room: RoomConfig, door_m: tuple[float, float], surface: Surface, cap_deg: float
+    room: RoomConfig,
+    door_m: tuple[float, float],
+    box_m: list[float],
+    surface: Surface,
+    cap_deg: float,
 ) -> None:
-    """Raise InputError if the largest part of the shell does not go through the door."""
-    box_m, ratio = largest_part_m(room, door_m, surface, cap_deg, room.segments)
-    if ratio <= 1:
+    """Raise InputError if the largest part of the shell, with a box of these sides, does not go through the door."""
+    if np.all(box_m[:2] <= np.sort(door_m)):
         return
     # The least number of segments that would fit is part of the message.
     more = [n for n in PROPOSED_SEGMENTS if n > room.segments]

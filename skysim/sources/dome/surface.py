@@ -148,8 +148,7 @@ class Surface(ABC):
 
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
         """Center and semi-axes of the ellipsoid that estimators use, (3,) each in m: `nearest_ellipsoid`."""
-        nearest = self.nearest_ellipsoid()
-        return nearest.center_m, nearest.semi_axes_m
+        return self.nearest_ellipsoid()[:2]
 
 
 def unit_vectors(z: NDArray, azimuth: NDArray) -> Floats:

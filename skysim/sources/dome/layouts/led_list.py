@@ -10,6 +10,7 @@ from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.display import ideal_led
+from skysim.sources.dome.layouts.placing import tilts_rad
 from skysim.sources.dome.layouts.registry import LAYOUTS
 from skysim.sources.dome.layouts.string import wind
 from skysim.sources.dome.led import full_strength_e_s_sr
@@ -38,7 +39,7 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     full = full_strength_e_s_sr(ideal_led(config.led), band)
     level = leds.strength / max(full, float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
-    tilt_deg = tilts_deg(place_m)
+    tilt_deg = np.degrees(tilts_rad(place_m))
     columns = {"id": [f"{number}" for number in leds.id]}
     for n, axis in enumerate("xyz"):
         columns[f"{axis}_m"] = [f"{value:.12f}" for value in place_m[:, n]]
@@ -66,11 +67,6 @@ def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 
-def tilts_deg(place_m: Floats) -> Floats:
-    """(N,) angles of places (N, 3) from the zenith, seen from the bearing."""
-    return np.degrees(np.arctan2(np.hypot(*place_m[:, :2].T), place_m[:, 2]))
-
-
 def max_tilt_deg(place_m: Floats) -> float:
-    """The greatest of the angles of `tilts_deg`."""
-    return float(tilts_deg(place_m).max())
+    """The greatest angle of places (N, 3) from the zenith, seen from the bearing."""
+    return float(np.degrees(tilts_rad(place_m)).max())

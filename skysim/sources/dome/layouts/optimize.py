@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -42,100 +41,56 @@ from skysim.sources.dome.layouts.fisher import (
     variances,
     visible_from,
 )
-from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread
+from skysim.sources.dome.layouts.placing import contract, spacing_ok, spread, tilts_rad
 from skysim.sources.dome.surface import Surface
 
 # g^4 = g + 1: base of the R3 low-discrepancy sequence (Roberts 2018; assumed).
 GOLDEN = 1.2207440846057596
 
 
-@dataclass(frozen=True, slots=True)
-class PlacementOptions:
-    """Settings of the placement search; `OPTIONS` holds the defaults.
+# Sites and starting layouts.
+SITES_PER_LED = (
+    500  # candidate sites per LED; their spacing is then a twentieth of the LEDs' own
+)
+EVEN_SITES_PER_LED = 10  # sites per LED that suffice for an even layout
+# Steps that find its spacing, between the least spacing and the sites' extent.
+BISECTIONS = 12
+# Fractions of the solid angle to which the best even layout is contracted.
+CONTRACTIONS = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)
 
-    Attributes
-    ----------
-    sites_per_led
-        Candidate sites per LED; their spacing is then a twentieth of the LEDs' own
-    even_sites_per_led
-        Sites per LED that suffice for an even layout
-    bisections
-        Steps that find its spacing, between the least spacing and the sites' extent
-    contractions
-        Fractions of the solid angle to which the best even layout is contracted
-    sparse_below
-        Mean number of LEDs in a field below which the sparse settings apply, else the dense ones. With few LEDs in a
-        field evenness matters most and steps must be small; with many, larger steps gain more.
-    sparse_steps, dense_steps
-        (least, greatest) step in units of the LEDs' spacing
-    sparse_field, dense_field
-        Fraction of the field that the search uses. The margin is for attitudes between the sampled ones, which lose
-        LEDs at the edge.
-    views_per_site
-        Sampled attitudes that see a site; a field's border then passes it in steps of a twentieth of the field
-    min_attitudes, max_attitudes
-        Limits of the number of sampled attitudes
-    generations
-        Number of generations into which the rounds are divided; after each the hardest of fresh attitudes join the
-        sample
-    keep_every
-        Generations from one candidate layout to the next
-    fresh_attitudes, hardest_attitudes
-        Size of a fresh sample, and number of its attitudes that are kept
-    perturbations, perturbation_size
-        Number of random rotations tried for each of these, and their size in half fields
-    score_attitudes
-        Number of independent attitudes on which layouts are compared
-    tail_fraction
-        Fraction of them, the worst, whose mean variance is compared
-    inner_field
-        Fraction of the field in which fewer than two LEDs count as too few
-    max_overlap
-        Fraction of a field's LEDs that may coincide with another field's
-    ambiguity_trials
-        Tries to move one LED of an ambiguous field
-    central_leds
-        Number of LEDs nearest to the field's center, one of which is moved
-    nearby_sites
-        Number of nearest sites that it may take; they reach a fifth of the LEDs' own spacing
-    variance_slack
-        Relative rise of the worst variances that the moves may cost in total
-    """
+# Local search: least and greatest step in units of the LEDs' spacing, and the fraction of the field that is used. The
+# margin is for attitudes between the sampled ones, which lose LEDs at the edge. With few LEDs in a field, less than
+# SPARSE_BELOW in the mean, evenness matters most and steps must be small; with many, larger steps gain more.
+SPARSE_BELOW = 8.0
+SPARSE = (0.02, 0.06), 0.93
+DENSE = (0.01, 0.3), 0.97
+# Sampled attitudes that see a site; a field's border then passes it in steps of a twentieth of the field.
+VIEWS_PER_SITE = 400
+ATTITUDES = 2000, 20_000  # limits of the number of sampled attitudes
+# Generations into which the rounds are divided; after each the hardest of fresh attitudes join the sample.
+GENERATIONS = 15
+KEEP_EVERY = 3  # generations from one candidate layout to the next
 
-    # Sites and starting layouts.
-    sites_per_led: int = 500
-    even_sites_per_led: int = 10
-    bisections: int = 12
-    contractions: tuple[float, ...] = (0.98, 0.96, 0.94, 0.92, 0.9, 0.88, 0.86, 0.84)
-    # Local search.
-    sparse_below: float = 8.0
-    sparse_steps: tuple[float, float] = (0.02, 0.06)
-    sparse_field: float = 0.93
-    dense_steps: tuple[float, float] = (0.01, 0.3)
-    dense_field: float = 0.97
-    views_per_site: int = 400
-    min_attitudes: int = 2000
-    max_attitudes: int = 20_000
-    generations: int = 15
-    keep_every: int = 3
-    # Hardest attitudes.
-    fresh_attitudes: int = 20_000
-    hardest_attitudes: int = 600
-    perturbations: int = 6
-    perturbation_size: float = 0.1
-    # Comparison of layouts.
-    score_attitudes: int = 40_000
-    tail_fraction: float = 0.01
-    inner_field: float = 0.95
-    # Ambiguity.
-    max_overlap: float = 0.5
-    ambiguity_trials: int = 100
-    central_leds: int = 4
-    nearby_sites: int = 60
-    variance_slack: float = 0.02
+# Hardest attitudes: size of a fresh sample, and number of its attitudes that are kept.
+FRESH_ATTITUDES = 20_000
+HARDEST_ATTITUDES = 600
+# Random rotations tried for each of these, and their size in half fields.
+PERTURBATIONS = 6
+PERTURBATION_SIZE = 0.1
 
+# Comparison of layouts: number of independent attitudes, and the fraction of them, the worst, whose mean variance is
+# compared.
+SCORE_ATTITUDES = 40_000
+TAIL_FRACTION = 0.01
+INNER_FIELD = 0.95  # fraction of the field in which fewer than two LEDs count as too few
 
-OPTIONS = PlacementOptions()
+# Ambiguity.
+MAX_OVERLAP = 0.5  # fraction of a field's LEDs that may coincide with another field's
+AMBIGUITY_TRIALS = 100  # tries to move one LED of an ambiguous field
+CENTRAL_LEDS = 4  # number of LEDs nearest to the field's center, one of which is moved
+# Number of nearest sites that it may take; they reach a fifth of the LEDs' own spacing.
+NEARBY_SITES = 60
+VARIANCE_SLACK = 0.02  # relative rise of the worst variances that the moves may cost in total
 
 
 class PlacementScore(NamedTuple):
@@ -150,7 +105,6 @@ class PlacementScore(NamedTuple):
     """
 
     config: layouts.OptimizedConfig
-    options: PlacementOptions
     R_body_from_lab: Floats
     reference: float = 1.0
 
@@ -163,12 +117,12 @@ class PlacementScore(NamedTuple):
         information = total_information(place_m, self.R_body_from_lab, *geometry)
         variance = np.sort(variances(information))
         # Mean of the worst.
-        tail = math.ceil(self.options.tail_fraction * len(variance))
+        tail = math.ceil(TAIL_FRACTION * len(variance))
         return float(variance[-tail:].mean()) / self.reference
 
     def under_two(self, place_m: Floats) -> int:
         """Number of attitudes with fewer than two LEDs in the inner part of the field; two fix an attitude."""
-        geometry = camera_geometry(self.config, self.options.inner_field)
+        geometry = camera_geometry(self.config, INNER_FIELD)
         return int(
             np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2)
         )
@@ -179,13 +133,12 @@ class PlacementScore(NamedTuple):
         In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
         sees fewer than two LEDs; the tail variance, times 1 + the fraction of ambiguous fields.
         """
+        geometry = camera_geometry(self.config)
         tail = self.tail_variance(place_m)
         ambiguity = layout_ambiguity(self.config, place_m)
-        hardest = hardest_attitudes(self.config, self.options, place_m, 1.0, rng)
-        fewest = total_information(place_m, hardest, *camera_geometry(self.config))[
-            :, 6
-        ].min()
-        ambiguous = float(np.mean(ambiguity.fraction > self.options.max_overlap))
+        hardest = hardest_attitudes(self.config, place_m, geometry, rng)
+        fewest = total_information(place_m, hardest, *geometry)[:, 6].min()
+        ambiguous = float(np.mean(ambiguity.fraction > MAX_OVERLAP))
         return tail > 1, bool(fewest < 2), tail * (1 + ambiguous)
 
 
@@ -194,7 +147,6 @@ def optimize_places(
     sites_m: Floats,
     starts_m: Sequence[Floats],
     rng: np.random.Generator,
-    options: PlacementOptions,
 ) -> Floats:
     """(N, 3) sites in m at which config.count LEDs make the worst attitudes within the tilt as good as possible.
 
@@ -211,7 +163,7 @@ def optimize_places(
     ----------
     sites_m
         (K, 3) allowed places in the lab, on the surface within its rim and cap;
-        options.sites_per_led times the count
+        SITES_PER_LED times the count
     starts_m
         (N, 3) each, layouts to start from; a Poisson-disk sample of the sites, as even as possible, is added
 
@@ -221,16 +173,14 @@ def optimize_places(
         If not all LEDs find room at the spacing.
     """
     # 1. Even layouts that keep the spacing.
-    few_sites_m = sites_m[: options.even_sites_per_led * config.count]
-    even = even_layouts(config, few_sites_m, starts_m, options.bisections)
+    few_sites_m = sites_m[: EVEN_SITES_PER_LED * config.count]
+    even = even_layouts(config, few_sites_m, starts_m)
     visible = visible_fraction(config, few_sites_m, rng)
-    scorer = PlacementScore(
-        config, options, sample_attitudes(config, options.score_attitudes, rng)
-    )
+    scorer = PlacementScore(config, sample_attitudes(config, SCORE_ATTITUDES, rng))
     # The best of them is the reference; contracted layouts are further starts.
     even_m = min(even, key=scorer.tail_variance)
     scorer = scorer._replace(reference=scorer.tail_variance(even_m))
-    contracted = [contract(even_m, sites_m, fraction) for fraction in options.contractions]
+    contracted = [contract(even_m, sites_m, fraction) for fraction in CONTRACTIONS]
     roomy = [layout_m for layout_m in contracted if spacing_ok(layout_m, config.spacing_m)]
     start_m = min([even_m, *roomy], key=scorer.tail_variance)
 
@@ -238,20 +188,14 @@ def optimize_places(
         return min(layouts_m, key=lambda layout_m: scorer.score(layout_m, rng))
 
     best_m = best([even_m, start_m])
-    # 2.
-    search = LocalSearch.of(config, options, sites_m, visible * config.count)
-    views = options.views_per_site / max(visible, 1e-9)
-    count = np.clip(views, options.min_attitudes, options.max_attitudes)
-    # 3. and 4.
-    best_m = best([best_m, *descend(search, start_m, int(count), rng)])
+    # 2. and 3.
+    best_m = best([best_m, *descend(config, start_m, sites_m, visible, rng)])
+    # 4.
     return best([reduce_ambiguity(scorer, best_m, sites_m, rng), best_m])
 
 
 def even_layouts(
-    config: layouts.OptimizedConfig,
-    sites_m: Floats,
-    starts_m: Sequence[Floats],
-    bisections: int,
+    config: layouts.OptimizedConfig, sites_m: Floats, starts_m: Sequence[Floats]
 ) -> list[Floats]:
     """The starts that keep the spacing, and a Poisson-disk sample of the sites if there is room for it.
 
@@ -261,7 +205,7 @@ def even_layouts(
         If there is none.
     """
     even = [start_m for start_m in starts_m if spacing_ok(start_m, config.spacing_m)]
-    chosen = spread(sites_m, config.spacing_m, config.count, bisections)
+    chosen = spread(sites_m, config.spacing_m, config.count, BISECTIONS)
     if len(chosen) == config.count:
         even.append(sites_m[chosen])
     if not even:
@@ -274,87 +218,48 @@ def even_layouts(
     return even
 
 
-class LocalSearch(NamedTuple):
-    """Local search.
-
-    Attributes
-    ----------
-    sites_m, tree
-        (K, 3) candidate sites in m, and a k-d tree of them
-    steps
-        Least and greatest step in units of the LEDs' spacing
-    field_fraction
-        Fraction of the field that is used
-    """
-
-    config: layouts.OptimizedConfig
-    options: PlacementOptions
-    sites_m: Floats
-    tree: cKDTree
-    steps: tuple[float, float]
-    field_fraction: float
-
-    @classmethod
-    def of(
-        cls,
-        config: layouts.OptimizedConfig,
-        options: PlacementOptions,
-        sites_m: Floats,
-        field_leds: float,
-    ) -> LocalSearch:
-        """The search with the settings for a mean number of LEDs in a field."""
-        steps = options.dense_steps
-        field_fraction = options.dense_field
-        if field_leds < options.sparse_below:
-            steps = options.sparse_steps
-            field_fraction = options.sparse_field
-        return cls(config, options, sites_m, cKDTree(sites_m), steps, field_fraction)
-
-    def propose(self, place_m: Floats, rng: np.random.Generator) -> Floats:
-        """(N, 3) one site for each LED, a random step away; the length is log-uniform between the limits in `steps`."""
-        # Steps are relative to the LEDs' present spacing.
-        spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
-        low, high = np.log(self.steps)
-        step_m = spacing_m * np.exp(rng.uniform(low, high, (len(place_m), 1)))
-        target_m = place_m + step_m * rng.standard_normal(place_m.shape)
-        return self.sites_m[self.tree.query(target_m)[1]]
-
-
 def descend(
-    search: LocalSearch, place_m: Floats, attitude_count: int, rng: np.random.Generator
+    config: layouts.OptimizedConfig,
+    place_m: Floats,
+    sites_m: Floats,
+    visible: float,
+    rng: np.random.Generator,
 ) -> list[Floats]:
-    """Layouts reached by descent from place_m, (N, 3) sites each: one per `keep_every` generations, and the last.
+    """Layouts reached by descent from place_m, (N, 3) sites each: one per KEEP_EVERY generations, and the last.
 
     In each round one move is proposed to each LED and tried in random order:
 
     1. At the end of a generation keep a candidate, and add the hardest attitudes of a fresh sample.
-    2. Propose a site to each LED, and compute what the attitudes see of the present and of the proposed places.
+    2. Propose a site to each LED, a random step away; the step's length is log-uniform between its limits. Compute what
+       the attitudes see of the present and of the proposed places.
     3. Try the moves.
 
     Parameters
     ----------
-    attitude_count
-        Number of attitudes in the first generation's cost
+    visible
+        Fraction of the LEDs in a field, from `visible_fraction`
     """
-    config = search.config
-    options = search.options
-    field_fraction = search.field_fraction
+    steps, field_fraction = SPARSE if visible * config.count < SPARSE_BELOW else DENSE
+    geometry = camera_geometry(config, field_fraction)
+    tree = cKDTree(sites_m)
     candidates = []
-    R_body_from_lab = sample_attitudes(config, attitude_count, rng)
-    last_rounds = (
-        np.linspace(0, config.rounds, options.generations + 1).round().astype(int)[1:-1]
-    )
+    attitude_count = np.clip(VIEWS_PER_SITE / max(visible, 1e-9), *ATTITUDES)
+    R_body_from_lab = sample_attitudes(config, int(attitude_count), rng)
+    last_rounds = np.linspace(0, config.rounds, GENERATIONS + 1).round().astype(int)[1:-1]
     for n in range(config.rounds):
-        if n in last_rounds[options.keep_every - 1 :: options.keep_every]:
+        if n in last_rounds[KEEP_EVERY - 1 :: KEEP_EVERY]:
             candidates.append(place_m)
         # 1. The descent improves the sampled attitudes at the expense of those between them. Adding the worst of a
         # fresh sample closes these gaps.
         if n in last_rounds:
-            hardest = hardest_attitudes(config, options, place_m, field_fraction, rng)
+            hardest = hardest_attitudes(config, place_m, geometry, rng)
             R_body_from_lab = np.concatenate([R_body_from_lab, hardest])
         # 2. Sites 0 to count - 1 are the present places, site count + n is the one proposed to LED n.
-        both_m = np.concatenate([place_m, search.propose(place_m, rng)])
-        geometry = camera_geometry(config, field_fraction)
+        spacing_m = np.median(cKDTree(place_m).query(place_m, k=2)[0][:, 1])
+        low, high = np.log(steps)
+        step_m = spacing_m * np.exp(rng.uniform(low, high, (config.count, 1)))
+        target_m = place_m + step_m * rng.standard_normal(place_m.shape)
+        both_m = np.concatenate([place_m, sites_m[tree.query(target_m)[1]]])
         visibility = Visibility(*visible_from(both_m, R_body_from_lab, *geometry))
         # 3.
         chosen = np.arange(config.count)
@@ -389,12 +294,11 @@ def visible_fraction(
 
 def hardest_attitudes(
     config: layouts.OptimizedConfig,
-    options: PlacementOptions,
     place_m: Floats,
-    field_fraction: float,
+    geometry: tuple[Floats, Floats],
     rng: np.random.Generator,
 ) -> Floats:
-    """(H, 3, 3) attitudes R_body_from_lab with the highest costs for these LEDs.
+    """(H, 3, 3) attitudes R_body_from_lab with the highest costs for these LEDs, seen with this `camera_geometry`.
 
     1. The worst of a fresh sample.
     2. Perturb each by random rotations, and keep those that raise its cost. Rotations about the boresight are larger,
@@ -403,21 +307,18 @@ def hardest_attitudes(
     """
 
     def attitude_costs(R_body_from_lab: Floats) -> Floats:
-        geometry = camera_geometry(config, field_fraction)
         return costs(total_information(place_m, R_body_from_lab, *geometry), config.min_leds)
 
     # 1.
-    sample = sample_attitudes(config, options.fresh_attitudes, rng)
+    sample = sample_attitudes(config, FRESH_ATTITUDES, rng)
     sample_cost = attitude_costs(sample)
-    worst = np.argsort(sample_cost)[-options.hardest_attitudes :]
+    worst = np.argsort(sample_cost)[-HARDEST_ATTITUDES:]
     hardest = sample[worst]
     cost = sample_cost[worst]
     # 2. Size of the rotations across the boresight and about it.
     half = tan_half(config)
-    step_rad = (
-        options.perturbation_size * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
-    )
-    for _ in range(options.perturbations):
+    step_rad = PERTURBATION_SIZE * half.min() * np.array([1, 1, 1 / math.hypot(*half)])
+    for _ in range(PERTURBATIONS):
         perturbation = Rotation.from_rotvec(step_rad * rng.standard_normal((len(hardest), 3)))
         perturbed = perturbation.as_matrix() @ hardest
         new_cost = attitude_costs(perturbed)
@@ -473,7 +374,7 @@ def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
         camera_m = lab_from_body.apply(np.array(config.camera_m))
         met_m = surface.meet(camera_m, lab_from_body.apply(cone))
         met_m = met_m[np.isfinite(met_m[:, 0])]
-        reach = max(reach, *np.arctan2(np.hypot(*met_m.T[:2]), met_m[:, 2]), 0.0)
+        reach = max(reach, *tilts_rad(met_m), 0.0)
     return min(reach, math.radians(config.cap_deg)) or math.radians(config.cap_deg)
 
 
@@ -547,32 +448,29 @@ def reduce_ambiguity(
 ) -> Floats:
     """Move LEDs in ambiguous fields to free sites nearby, where that reduces `excess_overlap`; return the layout.
 
-    A field is ambiguous if more than `max_overlap` of its LEDs coincide with another field's. The worst variances may
-    rise by `variance_slack` in total, but not beyond those of the best even layout. Ambiguity that remains after
-    `ambiguity_trials` is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
+    A field is ambiguous if more than MAX_OVERLAP of its LEDs coincide with another field's. The worst variances may
+    rise by VARIANCE_SLACK in total, but not beyond those of the best even layout. Ambiguity that remains after
+    AMBIGUITY_TRIALS is accepted: with three LEDs in a field, two of them have a similar pair almost anywhere.
 
     1. Choose an LED near the center of an ambiguous field, and a site near it that keeps the spacing.
     2. The move must reduce the ambiguity and must not leave more attitudes with fewer than two LEDs.
     3. It must not raise the worst variances beyond the limit.
     """
     config = scorer.config
-    options = scorer.options
     tree = cKDTree(sites_m)
     ambiguity = layout_ambiguity(config, place_m)
     tail = scorer.tail_variance(place_m)
     under_two = scorer.under_two(place_m)
-    max_tail = max(tail, min(1.0, tail * (1 + options.variance_slack)))
-    for _ in range(options.ambiguity_trials):
-        ambiguous = np.flatnonzero(ambiguity.fraction > options.max_overlap)
+    max_tail = max(tail, min(1.0, tail * (1 + VARIANCE_SLACK)))
+    for _ in range(AMBIGUITY_TRIALS):
+        ambiguous = np.flatnonzero(ambiguity.fraction > MAX_OVERLAP)
         if not len(ambiguous):
             break
         # 1.
         center_m = place_m[ambiguity.led[rng.choice(ambiguous)]]
-        central = cKDTree(place_m).query(center_m, k=min(options.central_leds, config.count))[
-            1
-        ]
+        central = cKDTree(place_m).query(center_m, k=min(CENTRAL_LEDS, config.count))[1]
         moved = rng.choice(central)
-        nearby = tree.query(place_m[moved], k=min(options.nearby_sites, len(sites_m)))[1]
+        nearby = tree.query(place_m[moved], k=min(NEARBY_SITES, len(sites_m)))[1]
         trial_m = place_m.copy()
         trial_m[moved] = sites_m[rng.choice(nearby)]
         distance_m = np.linalg.norm(place_m - trial_m[moved], axis=1)
@@ -580,9 +478,7 @@ def reduce_ambiguity(
             continue
         # 2.
         trial_ambiguity = layout_ambiguity(config, trial_m)
-        less_excess = excess_overlap(trial_ambiguity, options) < excess_overlap(
-            ambiguity, options
-        )
+        less_excess = excess_overlap(trial_ambiguity) < excess_overlap(ambiguity)
         if not less_excess or scorer.under_two(trial_m) > under_two:
             continue
         # 3.
@@ -592,6 +488,6 @@ def reduce_ambiguity(
     return place_m
 
 
-def excess_overlap(ambiguity: Ambiguity, options: PlacementOptions) -> float:
-    """Sum over the fields of the overlap in excess of `max_overlap`."""
-    return float(np.maximum(ambiguity.fraction - options.max_overlap, 0).sum())
+def excess_overlap(ambiguity: Ambiguity) -> float:
+    """Sum over the fields of the overlap in excess of MAX_OVERLAP."""
+    return float(np.maximum(ambiguity.fraction - MAX_OVERLAP, 0).sum())

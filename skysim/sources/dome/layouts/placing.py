@@ -91,11 +91,7 @@ def led_sources(
         place=np.column_stack([placed.place_m, np.ones(count)]),
         normal=placed.normal,
         radius_m=np.full(count, led.disk_diameter_m / 2),
-        strength=strength * pulses.strength,
-        period_s=pulses.period_s,
-        start_s=pulses.start_s,
-        on_s=pulses.on_s,
-        clock=pulses.clock,
+        **pulses._replace(strength=strength * pulses.strength)._asdict(),
         magnitude=placed.magnitude,
         chromatic=chromatic if band.chromatic is not None else None,
     )
@@ -163,12 +159,16 @@ def directions_from_angles(directions_deg: Any) -> Floats:
     return directions(tilt, azimuth)
 
 
+def tilts_rad(place: Floats) -> Floats:
+    """(N,) angles of places or directions (N, 3) from the zenith, seen from the bearing; accurate near it too."""
+    return np.arctan2(np.hypot(*place.T[:2]), place[:, 2])
+
+
 def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
     """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
     # Written so that NaN is outside.
     length = np.linalg.norm(directions, axis=1)
-    # Angle from the zenith, accurate near it too.
-    tilt_deg = np.degrees(np.arctan2(np.hypot(*directions.T[:2]), directions[:, 2]))
+    tilt_deg = np.degrees(tilts_rad(directions))
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
     if len(beyond):
         raise InputError(

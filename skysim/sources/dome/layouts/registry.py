@@ -30,6 +30,7 @@ from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
 from skysim.sources.dome.layouts.spreads import (
+    dimmed,
     fibonacci,
     geodesic,
     optimized,
@@ -81,12 +82,12 @@ def projector(
 # Arguments: the layout's section of the scene, the surface, the LED section, the chip's band. Returns all LEDs.
 LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
     "patch_boards": patch_boards,
-    "fibonacci": fibonacci,
-    "poisson_disk": poisson_disk,
-    "random": random_places,
+    "fibonacci": dimmed(fibonacci),
+    "poisson_disk": dimmed(poisson_disk),
+    "random": dimmed(random_places),
     "geodesic": geodesic,
     "string": string,
-    "optimized": optimized,
+    "optimized": dimmed(optimized),
     "celestial": celestial,
     "listed": listed,
     "fibers": fibers,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -28,6 +28,7 @@ from skysim.sources.dome.layouts.placing import (
     scattered_cap,
     spread,
     thin,
+    tilts_rad,
 )
 from skysim.sources.dome.surface import Surface, directions
 from skysim.sources.photometry import Band
@@ -41,29 +42,40 @@ UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
-def fibonacci(
-    config: FibonacciConfig, surface: Surface, led: LedConfig, band: Band
-) -> Sources:
+# Spreads whose LEDs all have random levels: `dimmed` makes their layouts. Arguments: the layout's section of the scene,
+# the surface, and the hardware's random stream. They return (N, 3) places.
+
+
+def dimmed(
+    places: Callable[[Any, Surface, np.random.Generator], Floats],
+) -> Callable[[Any, Surface, LedConfig, Band], Sources]:
+    """The layout of LEDs at a spread's places, each with a random level of the layout's `dimming`."""
+
+    def layout(config: Any, surface: Surface, led: LedConfig, band: Band) -> Sources:
+        rng = random_stream(config.hardware_seed)
+        place_m = places(config, surface, rng)
+        return dimmed_sources(config, surface, place_m, led, band, rng)
+
+    return layout
+
+
+def fibonacci(config: FibonacciConfig, surface: Surface, _rng: np.random.Generator) -> Floats:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
-    rng = random_stream(config.hardware_seed)
-    place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
-    return dimmed_sources(config, surface, place_m, led, band, rng)
+    return project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
 
 
 def random_places(
-    config: RandomPlacesConfig, surface: Surface, led: LedConfig, band: Band
-) -> Sources:
+    config: RandomPlacesConfig, surface: Surface, rng: np.random.Generator
+) -> Floats:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
-    rng = random_stream(config.hardware_seed)
-    place_m = project_from_bearing(
+    return project_from_bearing(
         surface, scattered_cap(config.count, np.radians(config.cap_deg), rng)
     )
-    return dimmed_sources(config, surface, place_m, led, band, rng)
 
 
 def poisson_disk(
-    config: PoissonDiskConfig, surface: Surface, led: LedConfig, band: Band
-) -> Sources:
+    config: PoissonDiskConfig, surface: Surface, rng: np.random.Generator
+) -> Floats:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -78,7 +90,6 @@ def poisson_disk(
     InputError
         For a spacing that makes more LEDs than fit into memory.
     """
-    rng = random_stream(config.hardware_seed)
     half = np.radians(config.cap_deg)
     # A count: the widest spacing by bisection.
     if config.spacing_m is None:
@@ -86,8 +97,7 @@ def poisson_disk(
         darts_m = project_from_bearing(
             surface, scattered_cap(DARTS_PER_LED * count, half, rng)
         )
-        place_m = darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
-        return dimmed_sources(config, surface, place_m, led, band, rng)
+        return darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
     # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
@@ -106,23 +116,19 @@ def poisson_disk(
             f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
-    place_m = darts_m[thin(darts_m, config.spacing_m)]
-    return dimmed_sources(config, surface, place_m, led, band, rng)
+    return darts_m[thin(darts_m, config.spacing_m)]
 
 
-def optimized(
-    config: OptimizedConfig, surface: Surface, led: LedConfig, band: Band
-) -> Sources:
+def optimized(config: OptimizedConfig, surface: Surface, rng: np.random.Generator) -> Floats:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
     config_of_places = config.model_copy(update=UNDIMMED)
-    rng = random_stream(config.hardware_seed)
     reach = optimize.field_reach_rad(config, surface)
     sites = project_from_bearing(
-        surface, scattered_cap(optimize.OPTIONS.sites_per_led * config.count, reach, rng)
+        surface, scattered_cap(optimize.SITES_PER_LED * config.count, reach, rng)
     )
     spirals = [
         project_from_bearing(surface, cap(config.count, half))
@@ -132,7 +138,7 @@ def optimized(
     place_m, state = optimized_places(config_of_places, *points)
     # The random stream goes on as if the search had not been cached.
     rng.bit_generator.state = state
-    return dimmed_sources(config, surface, place_m, led, band, rng)
+    return place_m
 
 
 # A search takes seconds; a study's trials, its costs and its report ask for the same places.
@@ -150,7 +156,7 @@ def optimized_places(
     rng = random_stream(config.hardware_seed)
     points = [np.frombuffer(text).reshape(-1, 3) for text in (sites, *spirals)]
     rng.random(2 * len(points[0]))  # the numbers that the sites were drawn with
-    place_m = optimize.optimize_places(config, points[0], points[1:], rng, optimize.OPTIONS)
+    place_m = optimize.optimize_places(config, points[0], points[1:], rng)
     place_m.flags.writeable = False
     return place_m, rng.bit_generator.state
 
@@ -174,7 +180,7 @@ CAP_SLACK = 1e-12  # relative rounding error of a vertex on the rim of the cap
 def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
     vertices = geodesic_vertices(config.frequency, config.class_)
-    tilt_rad = np.arctan2(np.hypot(*vertices.T[:2]), vertices[:, 2])
+    tilt_rad = tilts_rad(vertices)
     azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
     # Rounded, so that vertices of equal tilt are in the order of their azimuths.
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
