@@ -89,11 +89,6 @@ class HomeCatalog:
     def __len__(self) -> int:
         return len(self.id)
 
-    @property
-    def epsilon_pos_rad(self) -> float:
-        """The angle of epsilon_pos_m about the bearing, at the mean distance of the lights."""
-        return self.epsilon_pos_m / float(np.linalg.norm(self.position_m, axis=1).mean())
-
 
 def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     """Return the (N,) brightness of a frame's blobs: mean value times area over the frame's median area.

@@ -172,8 +172,6 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(
     # All LEDs share the IMU's 300 errors of x and of y; their yaw moves an LED 13 mm out by a hundredth of that.
     low, high = greatest_sd(2, 299)
     assert low < found.epsilon_pos_m / np.hypot(R_M * IMU_RAD, SIGMA_M) < high
-    # Places are off by .2 mm.
-    np.testing.assert_allclose(found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3)
     # An angle between LEDs needs no IMU: as at one place.
     sigma = np.sqrt(2) * SIGMA_M / R_M
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]

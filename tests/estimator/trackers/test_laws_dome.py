@@ -17,7 +17,7 @@ from estimator.attitude import dome_map, nearfield, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
-from estimator.calibration.home_position import HomeCatalog, Sighting
+from estimator.calibration.home_position import Sighting
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
@@ -535,7 +535,7 @@ def test_positions_of_lights_are_those_of_equations_43_to_45(
     assert np.cos(angle) == pytest.approx(first @ second, abs=1e-12)
 
 
-@law(home_position.calibrate, home_position.led_map, HomeCatalog.epsilon_pos_rad)
+@law(home_position.calibrate, home_position.led_map)
 @given(
     rng=SEEDS,
     frames=some.integers(2, 6),
@@ -565,7 +565,7 @@ def test_a_home_catalog_holds_exactly_the_lights_shown(
     assert (home.samples == frames).all()
     for covariance in home.covariance_m2:
         assert_covariance(covariance)
-    assert 0 < home.epsilon_pos_rad < 0.01
+    assert 0 < home.epsilon_pos_m < 0.012
     on = home_position.led_map(home, SPHERE)
     np.testing.assert_allclose(np.linalg.norm(on.position_m, axis=1), 1.2, rtol=1e-9, atol=0)
     np.testing.assert_allclose(np.cross(on.position_m, home.vectors), 0, rtol=0, atol=1e-9)
