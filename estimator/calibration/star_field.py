@@ -273,26 +273,6 @@ def self_calibrate(
     return best
 
 
-def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
-    """Return the rms distance over the sensor between the projections of two cameras, after the best rotation, px.
-
-    The rotation is removed because it is not a property of the lens: every attitude absorbs it.
-
-    Parameters
-    ----------
-    nodes
-        Number of points along each side of the sensor
-    """
-    x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
-    y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
-    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    checks.of_type("other", other, Camera)
-    rays = camera.rays(xy)
-    R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
-    shift_px = other.pixels(rays @ R_other_from_camera.T) - xy
-    return float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1))))
-
-
 class _Problem(NamedTuple):
     """Bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
 
