@@ -362,11 +362,6 @@ OTHERS: list[Case] = [
         "sightings: number 0 is 5",
     ),
     (
-        "home by",
-        lambda: home_position.calibrate([], CAMERA, LEDS, LEVER, statistic="x"),
-        "statistic: 'x' is unknown",
-    ),
-    (
         "zero",
         lambda: zero_point.magnitude_zero(SIGMA, SIGMA[:3], UNITS),
         r"v_mag has shape \(3,\)",

@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.attitude.dome_map import LedMap, Lever, on_sphere, project
 from estimator.calibration.home_position import (
-    DEVIATIONS,
     HomeCatalog,
     Sighting,
     _covariance,
     calibrate,
     instrument_brightness,
     led_map,
+    pooled,
 )
 from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
@@ -177,17 +177,6 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
 
 
-def test_the_averaged_spread_excludes_the_imu_error_between_stops(
-    stops: list[Sighting],
-) -> None:
-    # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
-    found = calibrate(stops, CAMERA, SPHERE, LEVER, statistic="averaged")
-    # The deviation of two frames has the mean sqrt(2 / pi) and, by that, the spread sqrt(pi / 2 - 1); 24 coordinates.
-    scatter = np.sqrt((np.pi / 2 - 1) / 300)
-    low, high = 1 + scatter * stats.norm.ppf(np.array([RARE / 2, 1 - RARE / 2]) ** (1 / 24))
-    assert low < found.epsilon_pos_m / (np.sqrt(2 / np.pi) * SIGMA_M) < high
-
-
 def test_different_stops_show_the_geometric_error_without_noise() -> None:
     # Five of AFIT's stops (Table 6) and no noise: what spread is left is eq. 44's on a dome seen from M.
     stops = np.radians(
@@ -220,17 +209,12 @@ def test_different_stops_show_the_geometric_error_without_noise() -> None:
     assert spread[True] < spread[False]
 
 
-def test_the_spreads_match_a_hand_calculation() -> None:
+def test_the_spread_matches_a_hand_calculation() -> None:
     value = np.array([1.0, 3, 11, 13, 5, 5, 7])
     group = np.array([0, 0, 0, 0, 2, 2, 1])
-    stop = np.array([7, 7, 9, 9, 7, 9, 9])
-    root = np.sqrt(2)
-    # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3; at either stop sqrt(2).
-    by_hand = {"pooled": [np.sqrt(104 / 3), np.nan, 0], "averaged": [root, np.nan, np.nan]}
-    for name, expected in by_hand.items():
-        np.testing.assert_allclose(
-            DEVIATIONS[name](value, group, stop), expected, rtol=1e-15, atol=0
-        )
+    # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3.
+    expected = [np.sqrt(104 / 3), np.nan, 0]
+    np.testing.assert_allclose(pooled(value, group), expected, rtol=1e-15, atol=0)
 
 
 # ---- the catalog -------------------------------------------------------------------------------------------------
@@ -284,24 +268,6 @@ def test_the_sample_covariance_matches_numpy_and_is_absent_for_one_sample() -> N
     assert np.isnan(covariance[1]).all()
 
 
-def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> None:
-    rng = np.random.default_rng(65)
-    wrong = Rotation.from_rotvec([2e-3, 0, 0])
-    seen = at_home(rng, 20) + [
-        sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)
-    ]
-    home, both = (
-        calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False)
-    )
-    assert home.samples.tolist() == [20] * 12
-    assert both.samples.tolist() == [40] * 12
-    # Half of the frames are turned back by 2e-3 too much: y moves by R 1e-3 (z is up, x the axis: + y).
-    moved = (both.position_m - home.position_m)[:, 1].mean()
-    # The difference of a mean of 40 and of 20, of which 20 are shared, over 12 LEDs.
-    sigma = SIGMA_M * np.sqrt(1 / 80 + 1 / 80) / np.sqrt(12)
-    assert abs(moved - R_M * 1e-3) < stats.norm.isf(RARE / 2) * sigma + R_M * 1e-3 * 1e-4
-
-
 def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
     rng = np.random.default_rng(66)
     level = Rotation.identity()
@@ -311,7 +277,6 @@ def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
         *(sighting(rng, dome(), level, level, 1) for _ in range(3)),
     ]
     assert sorted(calibrate(seen, CAMERA, SPHERE, LEVER).id) == [100, 101, 102, 103]
-    assert len(calibrate(seen, CAMERA, SPHERE, LEVER, home_only=False)) == 12
 
 
 def test_a_camera_mounted_askew_gives_the_same_positions() -> None:
