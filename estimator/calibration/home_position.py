@@ -100,22 +100,15 @@ def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     return mean_dn * area_px / np.median(area_px)
 
 
-def body_positions(
-    xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever, sine: bool = False
-) -> Floats:
+def body_positions(xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever) -> Floats:
     """Return the (N, 3) positions of lights in body axes, m: eqs 43-44, then from the camera to the bearing.
-
-    Parameters
-    ----------
-    sine
-        See `calibrate`
 
     Raises
     ------
     ValueError
         If eq. 44 has no root.
     """
-    point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever, sine)
+    point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever)
     return lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
 
 
@@ -162,7 +155,6 @@ def calibrate(
     camera: Camera,
     surface: LedMap,
     lever: Lever,
-    sine: bool = False,
 ) -> HomeCatalog:
     """Return the catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
@@ -176,8 +168,6 @@ def calibrate(
         Calibrated camera, and its position and orientation
     surface
         Dome model, which gives R; its LEDs are not used
-    sine
-        Correct eqs 43-44, which have tan instead of sin (reference 1.2, item 11)
 
     Raises
     ------
@@ -189,7 +179,7 @@ def calibrate(
     checks.of_type("surface", surface, LedMap)
     checks.of_type("lever", lever, Lever)
     # 1. Positions in the lab
-    id_, samples = _lab_positions(sightings, camera, surface, lever, sine)
+    id_, samples = _lab_positions(sightings, camera, surface, lever)
     # 2. Repeatability
     coordinates = [pooled(column, samples.led) for column in samples.lab_m.T]
     epsilons = (
@@ -223,7 +213,7 @@ def _brightest_first(samples: _Samples, selected: Bools) -> tuple[Ints, Floats, 
 
 
 def _lab_positions(
-    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever, sine: bool
+    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever
 ) -> tuple[Ints, _Samples]:
     """Return the ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
     if not len(sightings):
@@ -233,7 +223,7 @@ def _lab_positions(
     body_m = []
     lab_m = []
     for sighting in sightings:
-        point_body = body_positions(sighting.xy_px, camera, surface, lever, sine)
+        point_body = body_positions(sighting.xy_px, camera, surface, lever)
         body_m.append(point_body)
         lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]

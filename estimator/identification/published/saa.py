@@ -253,8 +253,8 @@ def saa(
     tolerance_rad
         Tolerance of a direction, 3 epsilon_position
     options
-        Keywords of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is sqrt(2) / 3 of the
-        tolerance if None; max_triangles is the limit of observed pairs
+        Keywords of `Options`: magnitudes are used if the index has them too; max_triangles is the limit of
+        observed pairs
 
     Returns
     -------
@@ -271,15 +271,14 @@ def saa(
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    sep_rad = settings.epsilon_sep_rad
-    if sep_rad is None:
-        sep_rad = np.sqrt(2) / 3 * tolerance_rad
-    if not min(sep_rad, tolerance_rad, settings.epsilon_mag) > 0:
+    if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
-            f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"
+            f"saa: tolerance {tolerance_rad}, epsilon {settings.epsilon_mag}; allowed: more than 0"
         )
-    # The tolerance of a direction is three standard deviations.
-    gates = Gates(float(sep_rad), tolerance_rad / 3, settings.epsilon_mag, settings.stretch)
+    # The tolerance of a direction is three standard deviations; an angle has the errors of two.
+    position_rad = tolerance_rad / 3
+    sep_rad = float(np.sqrt(2) * position_rad)
+    gates = Gates(sep_rad, position_rad, settings.epsilon_mag, settings.stretch)
     stars = SearchInput(
         np.ascontiguousarray(vectors_cam),
         settings.magnitudes(count),

@@ -95,11 +95,11 @@ def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
 # ---- the vectors: eqs 43-45 ----------------------------------------------------------------------------------------
 
 
-def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
+def pair_error_arcsec(wide_rad: float) -> float:
     """Excess angle of a pair centered on the boresight about the bearing, on a perfect centered sphere."""
     half = wide_rad / 2
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
-    point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
+    point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER)
     np.testing.assert_allclose(reach_m, R_M - M_M, rtol=0, atol=1e-15)
     read = unit(point + LEVER.camera_body_m)
     true = unit(on_sphere(rays, LEVER.camera_body_m, R_M))
@@ -108,28 +108,7 @@ def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
 
 def test_the_thesis_s_formula_error_widens_an_eight_degree_pair_by_44_arcsec() -> None:
     # Reference 1.2, item 11: + 44 arcsec. Half a unit of its last digit.
-    assert abs(pair_error_arcsec(np.radians(8), sine=False) - 44) < 0.5
-
-
-def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
-    # By plane trigonometry: the ray meets the sphere `along` from the camera; the thesis stops at R - M.
-    half = np.radians(4)
-    along = -M_M * np.cos(half) + np.sqrt(R_M**2 - (M_M * np.sin(half)) ** 2)
-    true = np.arctan2(along * np.sin(half), M_M + along * np.cos(half))
-    near = np.arctan2((R_M - M_M) * np.sin(half), M_M + (R_M - M_M) * np.cos(half))
-    expected = 2 * (near - true) / ARCSEC
-    found = pair_error_arcsec(2 * half, sine=True)
-    np.testing.assert_allclose(
-        found, expected, rtol=0, atol=1e-6
-    )  # the arc cosine's rounding
-    assert -5 < found < -4
-
-
-def test_with_the_sine_a_point_is_on_its_ray_at_distance_r_minus_m() -> None:
-    rng = np.random.default_rng(60)
-    rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (50, 2)))
-    point, _ = nearfield.thesis_points(rays, SPHERE, LEVER, sine=True)
-    np.testing.assert_allclose(point, (R_M - M_M) * rays, rtol=0, atol=1e-15)  # rounding
+    assert abs(pair_error_arcsec(np.radians(8)) - 44) < 0.5
 
 
 # ---- the epsilons --------------------------------------------------------------------------------------------------
@@ -189,24 +168,18 @@ def test_different_stops_show_the_geometric_error_without_noise() -> None:
         ]
     )
     rng = np.random.default_rng(63)
-    spread = {}
-    for sine in (False, True):
-        seen = [
-            sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
-            for stop, attitude in enumerate(Rotation.from_euler("ZYX", stops[:, ::-1]))
-        ]
-        spread[sine] = calibrate(seen, CAMERA, SPHERE, LEVER, sine).epsilon_pos_m
+    seen = [
+        sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
+        for stop, attitude in enumerate(Rotation.from_euler("ZYX", stops[:, ::-1]))
+    ]
+    spread = calibrate(seen, CAMERA, SPHERE, LEVER).epsilon_pos_m
     # The greatest lateral error, of an LED at the greatest tilt, bounds a deviation from above: eq. 44's point less
     # where the ray meets the sphere, at the ray of an apex LED leaning 3.3 degrees and half a board.
     tilt = np.radians(3.3) + 0.0125 / R_M
     ray = unit(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
     true = on_sphere(ray, LEVER.camera_body_m, R_M)
-    for sine, found in spread.items():
-        off = (
-            nearfield.thesis_points(ray, SPHERE, LEVER, sine)[0] + LEVER.camera_body_m - true
-        )
-        assert 0 < found < np.linalg.norm(off)
-    assert spread[True] < spread[False]
+    off = nearfield.thesis_points(ray, SPHERE, LEVER)[0] + LEVER.camera_body_m - true
+    assert 0 < spread < np.linalg.norm(off)
 
 
 def test_the_spread_matches_a_hand_calculation() -> None:

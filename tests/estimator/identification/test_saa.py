@@ -47,7 +47,6 @@ PITCH_RAD = 8e-3 / 1.2192
 MAGNITUDE = np.array([150.0, 35, 110, 70, 130, 50, 90, 20, 145, 60, 100, 40])
 SIGMA_RAD = 5 * ARCSEC_RAD
 EPSILON_MAG = 5.0
-EPSILON_SEP = np.sqrt(2) * SIGMA_RAD
 
 
 def patch(places: Floats) -> Floats:
@@ -96,7 +95,6 @@ def found(
         3 * SIGMA_RAD,
         magnitude=light,
         epsilon_mag=epsilon_mag,
-        epsilon_sep_rad=EPSILON_SEP,
     )
 
 
@@ -219,14 +217,14 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
         )
 
     home = calibrate(
-        [frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever, sine=True
+        [frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever
     )
     known = pairs_of(home.vectors, home.brightness)
     named = 0
     for stop in np.repeat(np.arange(5), 8):
         seen = frame(stop)
         order = np.argsort(-seen.brightness)
-        point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever, sine=True)
+        point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever)
         rays = unit(point + lever.camera_body_m)
         match = saa(
             rays,
@@ -234,7 +232,6 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
             3 * home.epsilon_pos_m / 1.2192,
             magnitude=seen.brightness[order],
             epsilon_mag=home.epsilon_mag,
-            epsilon_sep_rad=home.epsilon_sep_rad,
         )
         if match is not None:
             assert (home.id[match.star] == order[match.observed]).all()

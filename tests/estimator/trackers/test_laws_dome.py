@@ -507,18 +507,16 @@ def test_a_spread_scales_with_its_data_and_ignores_shifts(
 
 
 @law(home_position.body_positions, home_position.separation_rad)
-@given(rng=SEEDS, sine=some.booleans())
+@given(rng=SEEDS)
 def test_positions_of_lights_are_those_of_equations_43_to_45(
-    rng: np.random.Generator, sine: bool
+    rng: np.random.Generator,
 ) -> None:
-    """A camera level at height M below a sphere of radius R: across (R - M) tan a, or sin a, and (R - M) in all."""
+    """A camera level at height M below a sphere of radius R: across (R - M) tan a, and (R - M) in all."""
     surface = LedMap(np.arange(1), np.array([[0.0, 0.0, 1.2]]), np.zeros(3), np.full(3, 1.2))
     arm = Lever(np.array([0.0, 0.0, 0.3]), Rotation.identity())
     xy_px = rng.uniform(100, 400, (5, 2))
     tangent = (xy_px - CAMERA.center_px) / CAMERA.focal_px
-    if sine:
-        tangent /= np.sqrt(1 + np.sum(tangent**2, axis=1, keepdims=True))
-    found = home_position.body_positions(xy_px, CAMERA, surface, arm, sine) - [0, 0, 0.3]
+    found = home_position.body_positions(xy_px, CAMERA, surface, arm) - [0, 0, 0.3]
     np.testing.assert_allclose(found[:, :2], 0.9 * tangent, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 0.9, rtol=1e-12, atol=0)
     first, second = unit(rng.standard_normal((2, 3)))
@@ -530,10 +528,9 @@ def test_positions_of_lights_are_those_of_equations_43_to_45(
 @given(
     rng=SEEDS,
     frames=some.integers(2, 6),
-    sine=some.booleans(),
 )
 def test_a_home_catalog_holds_exactly_the_lights_shown(
-    rng: np.random.Generator, frames: int, sine: bool
+    rng: np.random.Generator, frames: int
 ) -> None:
     arm = Lever(np.array([0, 0, 0.3]), Rotation.identity())
     leds, _ = seen_through(rng, SPHERE, arm, Rotation.identity(), 8)
@@ -549,7 +546,7 @@ def test_a_home_catalog_holds_exactly_the_lights_shown(
         )
         for _ in range(frames)
     ]
-    home = home_position.calibrate(shown, CAMERA, SPHERE, arm, sine)
+    home = home_position.calibrate(shown, CAMERA, SPHERE, arm)
     assert sorted(home.id) == sorted(leds.id)
     assert (np.diff(home.brightness) <= 0).all()
     assert (home.samples == frames).all()
