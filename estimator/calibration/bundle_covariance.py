@@ -19,6 +19,7 @@ from estimator.calibration.bundle_adjustment import (
     free_gauge,
     gauge_freedoms,
 )
+from estimator.calibration.gauge import constraints
 from estimator.core.checks import Floats
 
 COMMON = 3  # number of errors common to all lights, besides those of lever and lens
@@ -92,10 +93,8 @@ def common_errors(terms: NormalEquations, bundle: Bundle) -> tuple[Floats, Float
     return position_m.T.reshape(-1, len(along), 3), change[shared].T
 
 
-def covariance_in_gauge(
-    terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
-) -> Covariances:
-    """Return the covariance in a given gauge, without the error of the gauge itself.
+def covariance_in_gauge(terms: NormalEquations, bundle: Bundle) -> Covariances:
+    """Return the covariance in the gauge of the start map, without the error of the gauge itself.
 
     With the gauge freedoms Z and the linear gauge constraints H^T d = 0, any generalized inverse Q of the normal matrix
     becomes T Q T^T, T = I - Z (H^T Z)^-1 H^T (Baarda's S-transformation). Written out, with K = Q H (H^T Z)^-T and
@@ -106,11 +105,6 @@ def covariance_in_gauge(
     3. Compute K and P.
     4. Add the terms of the gauge to each diagonal block.
 
-    Parameters
-    ----------
-    fixed_led, fixed_rest
-        (3 N, 4) and (R, 4) parts of the matrix H of the four constraints
-
     Raises
     ------
     LinAlgError
@@ -120,15 +114,15 @@ def covariance_in_gauge(
     led_free, rest_free = gauge_freedoms(bundle)
     reduced, rest = _inverse(terms, bundle)
     blocks = _blocks(reduced, rest, bundle)
-    # 2. Q H
-    through = fixed_rest - reduced.elimination.T @ fixed_led
-    rest_fixed = rest @ through
+    # 2. Q H; the constraints fix positions of lights alone
+    fixed_led = constraints(bundle)
+    rest_fixed = -rest @ (reduced.elimination.T @ fixed_led)
     led_fixed = reduced.inverse_led @ fixed_led - reduced.elimination @ rest_fixed
     # 3. K and P
-    transform = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H^T Z)^-T
+    transform = np.linalg.inv(led_free.T @ fixed_led)  # (H^T Z)^-T
     k_led = led_fixed @ transform
     k_rest = rest_fixed @ transform
-    outer = transform.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ transform
+    outer = transform.T @ fixed_led.T @ led_fixed @ transform
     # 4. Diagonal blocks of lights, rotations, and lever and lens
     rotated = slice(3 * len(bundle.R_body_from_lab))
     shared = slice(rotated.stop, None)
