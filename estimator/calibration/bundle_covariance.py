@@ -19,7 +19,6 @@ from estimator.calibration.bundle_adjustment import (
     free_gauge,
     gauge_freedoms,
 )
-from estimator.calibration.gauge import constraints
 from estimator.core.checks import Floats
 
 COMMON = 3  # number of errors common to all lights, besides those of lever and lens
@@ -115,7 +114,7 @@ def covariance_in_gauge(terms: NormalEquations, bundle: Bundle) -> Covariances:
     reduced, rest = _inverse(terms, bundle)
     blocks = _blocks(reduced, rest, bundle)
     # 2. Q H; the constraints fix positions of lights alone
-    fixed_led = constraints(bundle)
+    fixed_led = gauge_constraints(bundle)
     rest_fixed = -rest @ (reduced.elimination.T @ fixed_led)
     led_fixed = reduced.inverse_led @ fixed_led - reduced.elimination @ rest_fixed
     # 3. K and P
@@ -134,6 +133,18 @@ def covariance_in_gauge(terms: NormalEquations, bundle: Bundle) -> Covariances:
         blocks.by_rotation + _gauge_terms(k_rotated, rotated_free, outer),
         blocks.shared + _gauge_terms(k_rest[None, shared], rest_free[None, shared], outer)[0],
     )
+
+
+def gauge_constraints(bundle: Bundle) -> Floats:
+    """Return the (3 N, 4) matrix H of the four constraints H^T dx = 0 on the positions, linearized."""
+    start_m = bundle.map_m
+    by_led = np.zeros((len(start_m), 3, 4))
+    # Rotation: sum((e x x_0) . dx) = 0 about each axis e.
+    for axis, e in enumerate(np.eye(3)):
+        by_led[:, :, axis] = np.cross(e, start_m)
+    # Scale: sum(x_0 . dx) = 0.
+    by_led[:, :, 3] = start_m
+    return by_led.reshape(-1, 4)
 
 
 def _inverse(terms: NormalEquations, bundle: Bundle) -> tuple[ReducedSystem, Floats]:

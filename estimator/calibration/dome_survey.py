@@ -5,7 +5,7 @@ The method is bundle adjustment (`bundle_adjustment`) from an approximate map an
 1. Improve the start attitudes, and reject wrong identifications (`_reject_misidentified`).
 2. Select the connected subset: lights and frames that the sightings determine (`survey_subset`).
 3. Adjust all unknowns by least squares (`bundle_adjustment.adjust`).
-4. Transform the solution to the gauge (`gauge.transform`).
+4. Transform the solution to the gauge (`in_gauge`).
 5. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
    the misfit and repeat from step 3 (`_fit`).
 
@@ -40,7 +40,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance, gauge
+from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.bundle_covariance import Covariances
 from estimator.calibration.survey_subset import Subset, connected_subset
@@ -268,7 +268,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
             # 4. Gauge. If the map as a measurement fixes it, the fit is in that gauge already.
             if np.isinf(fitted.map_sigma_m):
-                fitted = gauge.transform(fitted)
+                fitted = in_gauge(fitted)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 5. Covariances, misfit, and noise
             covariances = _covariances(subset)
@@ -288,6 +288,29 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
     return _Fit(subset, keep, converged, covariances, misfit, scale, common)
+
+
+def in_gauge(fitted: Bundle) -> Bundle:
+    """Return the bundle rotated and scaled onto its start map; its pixels do not change.
+
+    1. Find the rotation G of the lab frame onto the start map.
+    2. Find the scale s onto the start map.
+    3. Apply them: x <- s G x, A <- A G^T, r <- s r.
+    """
+    # 1. Rotation
+    position_m = fitted.position_m
+    start_m = fitted.map_m
+    rotation = Rotation.align_vectors(start_m, position_m)[0].as_matrix()
+    # 2. Scale. It makes the survey's projection on the start map equal to the start map's own sum of squares,
+    # sum(x_0 . s G x) = sum(x_0 . x_0): the linear constraint of `bundle_covariance.gauge_constraints`.
+    scale = np.sum(start_m**2) / np.sum(start_m * (position_m @ rotation.T))
+    # 3. Transformed bundle
+    return replace(
+        fitted,
+        position_m=scale * position_m @ rotation.T,
+        R_body_from_lab=fitted.R_body_from_lab @ rotation.T,
+        camera_body_m=scale * fitted.camera_body_m,
+    )
 
 
 def _terms(subset: Subset) -> ba.NormalEquations:

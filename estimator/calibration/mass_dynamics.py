@@ -182,14 +182,11 @@ class MassEstimate:
         (P,) parameters and their (P, P) covariance, in the order of `Prior`
     misfit
         Chi-square of the residuals over their number; 1 if noise and torques are as assumed
-    attitude_factor
-        Factor by which the attitudes' noise was scaled
     """
 
     values: Floats
     covariance: Floats
     misfit: float
-    attitude_factor: float = 1.0
 
     @property
     def inertia_kg_m2(self) -> Floats:

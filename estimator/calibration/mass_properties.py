@@ -146,7 +146,7 @@ def estimate_with_noise(
         if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
             break
         factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
-    return replace(estimate, attitude_factor=factor)
+    return estimate
 
 
 def considered(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance, dome_survey, gauge, star_field
+from estimator.calibration import bundle_covariance, dome_survey, star_field
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.star_field import LensPrior, StarFrame
@@ -296,21 +296,21 @@ def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatc
         assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
 
 
-@law(gauge.transform, gauge.constraints, Subset.insert_into)
+@law(dome_survey.in_gauge, bundle_covariance.gauge_constraints, Subset.insert_into)
 @given(rng=SEEDS)
 def test_a_gauge_freedom_moves_no_pixel(rng: np.random.Generator) -> None:
     true, seen = dome(rng)
     part = Subset(true, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     found = replace(nudged(rng, true, 0.01), map_m=true.position_m)
-    once = gauge.transform(found)
+    once = dome_survey.in_gauge(found)
     np.testing.assert_allclose(
         ba.residuals(once, seen), ba.residuals(found, seen), rtol=0, atol=1e-6
     )
     np.testing.assert_allclose(
-        gauge.transform(once).position_m, once.position_m, rtol=0, atol=1e-9
+        dome_survey.in_gauge(once).position_m, once.position_m, rtol=0, atol=1e-9
     )
     np.testing.assert_array_equal(part.insert_into(true, once).position_m, once.position_m)
-    by_led = gauge.constraints(once)
+    by_led = bundle_covariance.gauge_constraints(once)
     assert by_led.shape == (3 * LIGHTS, 4)
     led_free, _ = ba.gauge_freedoms(once)
     # It leaves nothing free.
