@@ -50,6 +50,7 @@ from estimator.core.checks import Floats, Ints
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
+LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 # Least number of redundant coordinates of a survey that estimates its noise from them.
@@ -176,13 +177,12 @@ def survey(
     lever_start: Lever,
     camera_start: Camera,
     fit_distortion: bool = False,
+    loss: str = "linear",
     leds_sigma_m: float = np.inf,
     fit_noise: bool = False,
     assumed: Assumed | None = None,
 ) -> DomeSurvey:
     """Survey the dome: least squares over all lights and attitudes, the lever and the lens.
-
-    Wrong identifications are rejected first; those of a light seen only twice hardly show.
 
     Parameters
     ----------
@@ -192,6 +192,8 @@ def survey(
         Start values of the map, the lever and the camera
     fit_distortion
         Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
+    loss
+        "linear", or "cauchy": wrong identifications are rejected first; those of a light seen only twice hardly show
     leds_sigma_m
         Standard deviation of the start map per axis, used as a measurement; inf: it is only a start value
     fit_noise
@@ -209,6 +211,8 @@ def survey(
     Unconnected
         If the frames form several groups.
     """
+    if loss not in LOSSES:
+        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
     if not leds_sigma_m > 0:
         raise ValueError(
             f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
@@ -225,7 +229,7 @@ def survey(
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
     start = Bundle.start(leds_start, lever_start, camera_start, attitudes, fit_distortion)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
-    fit = _fit(start, sightings, fit_noise)
+    fit = _fit(start, sightings, LOSSES[loss], fit_noise)
     # The frame, and the row in it, of each rejected sighting.
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
     outliers = np.column_stack([sightings.frame, row])[~fit.keep]
@@ -244,7 +248,7 @@ class _Fit(NamedTuple):
     common: tuple[Floats, Floats] | None
 
 
-def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
+def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> _Fit:
     """Fit the connected subset of the observations: the numbered steps of the module.
 
     Raises
@@ -257,7 +261,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
     scale = 1.0
     try:
         # 1. Wrong identifications
-        start, keep = _reject_misidentified(start, sightings)
+        start, keep = _reject_misidentified(start, sightings, width)
         # 2. Connected subset
         subset = connected_subset(start, sightings, keep)
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
@@ -390,10 +394,12 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
     )
 
 
-def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, np.ndarray]:
+def _reject_misidentified(
+    full: Bundle, sightings: Sightings, width: float
+) -> tuple[Bundle, np.ndarray]:
     """Improve the start values and reject wrong identifications; return the bundle and the (M,) mask of those kept.
 
-    a. Fit the attitudes only.
+    a. Fit the attitudes only. With an infinite width (least squares) this is all.
     b. Reject gross outliers: residuals beyond GROSS_GATE robust sigmas.
     c. Fit the whole bundle with Cauchy's loss, for a noise that shrinks with the residuals until it settles.
     d. Reject residuals beyond GATE robust sigmas.
@@ -408,6 +414,8 @@ def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, n
     subset = connected_subset(full, sightings, keep)
     fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
     full = subset.insert_into(full, fitted)
+    if np.isinf(width):
+        return full, keep
     # b. Gross outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
     subset = connected_subset(full, sightings, keep)
@@ -416,7 +424,7 @@ def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, n
     previous = np.inf
     while (scale := ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
         noisy = replace(subset.sightings, sigma_px=scale * subset.sightings.sigma_px)
-        fitted = ba.adjust(fitted, noisy, CAUCHY, decrement=0.1)[0]
+        fitted = ba.adjust(fitted, noisy, width, decrement=0.1)[0]
         previous = scale
     # d. Outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GATE)

@@ -337,13 +337,14 @@ def adjust_connected(
     selected = largest_connected_group(led_visibility(pairs, prior), MIN_SHARED_LEDS)
     while True:
         try:
-            # The values assumed before the survey are measurements.
+            # The loss is robust, and the values assumed before the survey are measurements.
             survey = dome_survey.survey(
                 [dome_frame(*pairs[k]) for k in selected],
                 prior.leds,
                 prior.lever,
                 prior.camera,
                 fit_distortion=uncertainty.fit_distortion,
+                loss="cauchy",
                 leds_sigma_m=uncertainty.led_sigma_m,
                 fit_noise=True,
                 assumed=before,

@@ -54,7 +54,7 @@ def simulated(
 
     sigma_factor : factor by which the noise is smaller than assumed
     uses_assumed : whether lever and focal length are measurements; the focal length then errs at random, else by 1 %
-    change       : applied to each frame
+    change       : applied to each frame; the survey then uses a robust loss
     """
     frames = []
     for attitude, seen in zip(held, true.visible(held), strict=True):
@@ -83,11 +83,13 @@ def simulated(
         if uses_assumed
         else None
     )
+    loss = "cauchy" if change else "linear"
     return survey(
         frames,
         listed,
         lever,
         camera,
+        loss=loss,
         leds_sigma_m=LIST_SIGMA_M,
         fit_noise=True,
         assumed=assumed,
