@@ -149,9 +149,7 @@ def infinity(
     )
 
 
-def thesis_points(
-    rays_cam: Floats, leds: LedMap, lever: Lever, sine: bool = False
-) -> tuple[Floats, float]:
+def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever) -> tuple[Floats, float]:
     """Return AFIT's vectors to the LEDs (Padro 2012, eqs 43-44): (N, 3) points in camera axes, m, and R - M, m.
 
     R is the height of the believed surface above the bearing, M the camera's distance from the bearing along the
@@ -159,11 +157,7 @@ def thesis_points(
 
         (x, y) = (R - M) tan a (eq. 43),    z = sqrt((R - M)^2 - x^2 - y^2) (eq. 44).
 
-    Parameters
-    ----------
-    sine
-        Correct the error in eq. 43 to (x, y) = (R - M) sin a: the point is then on its ray, at the
-        distance R - M from the camera
+    With the sine in eq. 43 the point would be on its ray, R - M from the camera (reference 1.2, item 11).
 
     Raises
     ------
@@ -174,8 +168,7 @@ def thesis_points(
     height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]  # R
     distance_m = float(height_m - lever.camera_body_m @ boresight_body)  # R - M
     # Eq. 43: across the boresight
-    across = rays_cam[:, :2] if sine else rays_cam[:, :2] / rays_cam[:, 2:]
-    across_m = distance_m * across
+    across_m = distance_m * rays_cam[:, :2] / rays_cam[:, 2:]
     # Eq. 44: along the boresight
     along2_m2 = distance_m**2 - np.sum(across_m**2, axis=1)
     if not (distance_m > 0 and np.all(along2_m2 > 0)):

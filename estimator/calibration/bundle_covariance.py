@@ -92,10 +92,8 @@ def common_errors(terms: NormalEquations, bundle: Bundle) -> tuple[Floats, Float
     return position_m.T.reshape(-1, len(along), 3), change[shared].T
 
 
-def covariance_in_gauge(
-    terms: NormalEquations, bundle: Bundle, fixed_led: Floats, fixed_rest: Floats
-) -> Covariances:
-    """Return the covariance in a given gauge, without the error of the gauge itself.
+def covariance_in_gauge(terms: NormalEquations, bundle: Bundle) -> Covariances:
+    """Return the covariance in the gauge of the start map, without the error of the gauge itself.
 
     With the gauge freedoms Z and the linear gauge constraints H^T d = 0, any generalized inverse Q of the normal matrix
     becomes T Q T^T, T = I - Z (H^T Z)^-1 H^T (Baarda's S-transformation). Written out, with K = Q H (H^T Z)^-T and
@@ -106,11 +104,6 @@ def covariance_in_gauge(
     3. Compute K and P.
     4. Add the terms of the gauge to each diagonal block.
 
-    Parameters
-    ----------
-    fixed_led, fixed_rest
-        (3 N, 4) and (R, 4) parts of the matrix H of the four constraints
-
     Raises
     ------
     LinAlgError
@@ -120,15 +113,15 @@ def covariance_in_gauge(
     led_free, rest_free = gauge_freedoms(bundle)
     reduced, rest = _inverse(terms, bundle)
     blocks = _blocks(reduced, rest, bundle)
-    # 2. Q H
-    through = fixed_rest - reduced.elimination.T @ fixed_led
-    rest_fixed = rest @ through
+    # 2. Q H; the constraints fix positions of lights alone
+    fixed_led = gauge_constraints(bundle)
+    rest_fixed = -rest @ (reduced.elimination.T @ fixed_led)
     led_fixed = reduced.inverse_led @ fixed_led - reduced.elimination @ rest_fixed
     # 3. K and P
-    transform = np.linalg.inv(led_free.T @ fixed_led + rest_free.T @ fixed_rest)  # (H^T Z)^-T
+    transform = np.linalg.inv(led_free.T @ fixed_led)  # (H^T Z)^-T
     k_led = led_fixed @ transform
     k_rest = rest_fixed @ transform
-    outer = transform.T @ (fixed_led.T @ led_fixed + fixed_rest.T @ rest_fixed) @ transform
+    outer = transform.T @ fixed_led.T @ led_fixed @ transform
     # 4. Diagonal blocks of lights, rotations, and lever and lens
     rotated = slice(3 * len(bundle.R_body_from_lab))
     shared = slice(rotated.stop, None)
@@ -140,6 +133,18 @@ def covariance_in_gauge(
         blocks.by_rotation + _gauge_terms(k_rotated, rotated_free, outer),
         blocks.shared + _gauge_terms(k_rest[None, shared], rest_free[None, shared], outer)[0],
     )
+
+
+def gauge_constraints(bundle: Bundle) -> Floats:
+    """Return the (3 N, 4) matrix H of the four constraints H^T dx = 0 on the positions, linearized."""
+    start_m = bundle.map_m
+    by_led = np.zeros((len(start_m), 3, 4))
+    # Rotation: sum((e x x_0) . dx) = 0 about each axis e.
+    for axis, e in enumerate(np.eye(3)):
+        by_led[:, :, axis] = np.cross(e, start_m)
+    # Scale: sum(x_0 . dx) = 0.
+    by_led[:, :, 3] = start_m
+    return by_led.reshape(-1, 4)
 
 
 def _inverse(terms: NormalEquations, bundle: Bundle) -> tuple[ReducedSystem, Floats]:

@@ -5,20 +5,18 @@ The method is bundle adjustment (`bundle_adjustment`) from an approximate map an
 1. Improve the start attitudes, and reject wrong identifications (`_reject_misidentified`).
 2. Select the connected subset: lights and frames that the sightings determine (`survey_subset`).
 3. Adjust all unknowns by least squares (`bundle_adjustment.adjust`).
-4. Transform the solution to the gauge (`Gauge.transform`).
+4. Transform the solution to the gauge (`in_gauge`).
 5. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
    the misfit and repeat from step 3 (`_fit`).
 
 Gauge freedoms, which no pixel can determine, and the constraints that fix them here:
 
-* rotation of the lab frame (3): every light rotates by G, every body_from_lab by G^-1. Fixed by the start map (the
-  survey is rotated onto it in the least-squares sense), or by the attitude of one reference frame.
+* rotation of the lab frame (3): every light rotates by G, every body_from_lab by G^-1. Fixed by the start map: the
+  survey is rotated onto it in the least-squares sense.
 * rotation of the body frame against the camera (3): body_from_lab <- B body_from_lab, lever <- B lever,
-  cam_from_body <- cam_from_body B^-1. cam_from_body is therefore fixed at its start value. External attitudes, such as
-  an IMU's, define both frames: `gauge.align_attitudes` computes B and G between two sets of attitudes.
+  cam_from_body <- cam_from_body B^-1. cam_from_body is therefore fixed at its start value.
 * scale (1): lights and lever scale together. A known lens does not help, because a camera that rotates about the
-  bearing measures only directions. One known distance between two lights fixes it, or else the mean size of the start
-  map. The attitude does not depend on it.
+  bearing measures only directions. The mean size of the start map fixes it. The attitude does not depend on it.
 
 The focal length is observable (yaw closes at 360 degrees). The principal point is observable weakly: its effect differs
 from a rotation of the camera only by the square of the field angle.
@@ -45,7 +43,6 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.bundle_covariance import Covariances
-from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_subset import Subset, connected_subset
 from estimator.core import checks
 from estimator.core.camera import Camera
@@ -90,8 +87,8 @@ class DomeFrame:
 class DomeSurvey:
     """Result of a dome survey.
 
-    The covariances are of errors against the truth if the start map is used as a measurement. Otherwise, or with a
-    known length or a reference frame, they are relative to the gauge and do not include its error.
+    The covariances are of errors against the truth if the start map is used as a measurement. Otherwise they are
+    relative to the gauge and do not include its error.
 
     Attributes
     ----------
@@ -179,10 +176,8 @@ def survey(
     leds_start: LedMap,
     lever_start: Lever,
     camera_start: Camera,
-    known_length: tuple[int, int, float] | None = None,
     fit_distortion: bool = False,
     loss: str = "linear",
-    reference_frame: int | None = None,
     leds_sigma_m: float = np.inf,
     fit_noise: bool = False,
     assumed: Assumed | None = None,
@@ -195,9 +190,6 @@ def survey(
         Identified LEDs, centroids and start attitude of each frame
     leds_start, lever_start, camera_start
         Start values of the map, the lever and the camera
-    known_length, reference_frame
-        Rows of two lights and the distance between them in m, which fixes the scale; row of the frame whose start
-        attitude fixes the lab frame, instead of the start map
     fit_distortion
         Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
     loss
@@ -219,7 +211,16 @@ def survey(
     Unconnected
         If the frames form several groups.
     """
-    _check_options(loss, leds_sigma_m, assumed, known_length, reference_frame)
+    if loss not in LOSSES:
+        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
+    if not leds_sigma_m > 0:
+        raise ValueError(
+            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
+        )
+    if assumed and np.isinf(leds_sigma_m):
+        raise ValueError(
+            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m"
+        )
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
@@ -228,32 +229,11 @@ def survey(
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
     start = Bundle.start(leds_start, lever_start, camera_start, attitudes, fit_distortion)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
-    gauge = Gauge(known_length, reference_frame, start.map_m, start.R_body_from_lab)
-    fit = _fit(start, sightings, gauge, LOSSES[loss], fit_noise)
+    fit = _fit(start, sightings, LOSSES[loss], fit_noise)
     # The frame, and the row in it, of each rejected sighting.
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
     outliers = np.column_stack([sightings.frame, row])[~fit.keep]
     return _report(fit, start, outliers, leds_start, camera_start)
-
-
-def _check_options(
-    loss: str,
-    leds_sigma_m: float,
-    assumed: Assumed | None,
-    known_length: tuple[int, int, float] | None,
-    reference_frame: int | None,
-) -> None:
-    """Raise ValueError for an unknown loss, a map error that is not above 0, or an assumed lever without a map."""
-    if loss not in LOSSES:
-        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
-    if not leds_sigma_m > 0:
-        raise ValueError(
-            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
-        )
-    if assumed and (np.isinf(leds_sigma_m) or known_length or reference_frame is not None):
-        raise ValueError(
-            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m alone"
-        )
 
 
 class _Fit(NamedTuple):
@@ -268,10 +248,8 @@ class _Fit(NamedTuple):
     common: tuple[Floats, Floats] | None
 
 
-def _fit(
-    start: Bundle, sightings: Sightings, gauge: Gauge, width: float, fit_noise: bool
-) -> _Fit:
-    """Fit the connected subset of the observations in the given gauge: the numbered steps of the module.
+def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> _Fit:
+    """Fit the connected subset of the observations: the numbered steps of the module.
 
     Raises
     ------
@@ -286,7 +264,6 @@ def _fit(
         start, keep = _reject_misidentified(start, sightings, width)
         # 2. Connected subset
         subset = connected_subset(start, sightings, keep)
-        gauge.check(subset)
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
             # 3. Least squares
             scaled = replace(
@@ -294,18 +271,18 @@ def _fit(
             )
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
             # 4. Gauge. If the map as a measurement fixes it, the fit is in that gauge already.
-            if not _has_prior_gauge(fitted, gauge):
-                fitted = gauge.transform(fitted, subset)
+            if np.isinf(fitted.map_sigma_m):
+                fitted = in_gauge(fitted)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 5. Covariances, misfit, and noise
-            covariances = _covariances(subset, gauge)
+            covariances = _covariances(subset)
             if fit_noise:
                 check_redundancy(subset, covariances)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
-        if _has_prior_gauge(subset.bundle, gauge):
+        if np.isfinite(subset.bundle.map_sigma_m):
             common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     except LinAlgError:
         # A singular matrix raises the same ValueError as a nearly singular one
@@ -317,9 +294,27 @@ def _fit(
     return _Fit(subset, keep, converged, covariances, misfit, scale, common)
 
 
-def _has_prior_gauge(bundle: Bundle, gauge: Gauge) -> bool:
-    """Return whether the map, as a measurement, fixes rotation and scale."""
-    return gauge.is_map and bool(np.isfinite(bundle.map_sigma_m))
+def in_gauge(fitted: Bundle) -> Bundle:
+    """Return the bundle rotated and scaled onto its start map; its pixels do not change.
+
+    1. Find the rotation G of the lab frame onto the start map.
+    2. Find the scale s onto the start map.
+    3. Apply them: x <- s G x, A <- A G^T, r <- s r.
+    """
+    # 1. Rotation
+    position_m = fitted.position_m
+    start_m = fitted.map_m
+    rotation = Rotation.align_vectors(start_m, position_m)[0].as_matrix()
+    # 2. Scale. It makes the survey's projection on the start map equal to the start map's own sum of squares,
+    # sum(x_0 . s G x) = sum(x_0 . x_0): the linear constraint of `bundle_covariance.gauge_constraints`.
+    scale = np.sum(start_m**2) / np.sum(start_m * (position_m @ rotation.T))
+    # 3. Transformed bundle
+    return replace(
+        fitted,
+        position_m=scale * position_m @ rotation.T,
+        R_body_from_lab=fitted.R_body_from_lab @ rotation.T,
+        camera_body_m=scale * fitted.camera_body_m,
+    )
 
 
 def _terms(subset: Subset) -> ba.NormalEquations:
@@ -327,14 +322,13 @@ def _terms(subset: Subset) -> ba.NormalEquations:
     return ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
 
 
-def _covariances(subset: Subset, gauge: Gauge) -> Covariances:
-    """Return the covariances of a fitted subset: of total errors if its map fixes the gauge, else relative to it."""
+def _covariances(subset: Subset) -> Covariances:
+    """Return the covariances of a fitted subset: of total errors with a measured map, else relative to the gauge."""
     bundle = subset.bundle
     terms = _terms(subset)
-    if _has_prior_gauge(bundle, gauge):
+    if np.isfinite(bundle.map_sigma_m):
         return bundle_covariance.covariance(terms, bundle)
-    fixed = gauge.constraints(bundle, subset)
-    return bundle_covariance.covariance_in_gauge(terms, bundle, *fixed)
+    return bundle_covariance.covariance_in_gauge(terms, bundle)
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:

@@ -12,7 +12,7 @@ takes these steps:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -89,11 +89,6 @@ class HomeCatalog:
     def __len__(self) -> int:
         return len(self.id)
 
-    @property
-    def epsilon_pos_rad(self) -> float:
-        """The angle of epsilon_pos_m about the bearing, at the mean distance of the lights."""
-        return self.epsilon_pos_m / float(np.linalg.norm(self.position_m, axis=1).mean())
-
 
 def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     """Return the (N,) brightness of a frame's blobs: mean value times area over the frame's median area.
@@ -105,22 +100,15 @@ def instrument_brightness(mean_dn: Floats, area_px: Floats) -> Floats:
     return mean_dn * area_px / np.median(area_px)
 
 
-def body_positions(
-    xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever, sine: bool = False
-) -> Floats:
+def body_positions(xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever) -> Floats:
     """Return the (N, 3) positions of lights in body axes, m: eqs 43-44, then from the camera to the bearing.
-
-    Parameters
-    ----------
-    sine
-        See `calibrate`
 
     Raises
     ------
     ValueError
         If eq. 44 has no root.
     """
-    point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever, sine)
+    point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever)
     return lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
 
 
@@ -133,45 +121,22 @@ def separation_rad(first: Floats, second: Floats) -> Floats:
     return 2 * np.arcsin(np.linalg.norm(first - second, axis=-1) / 2)
 
 
-def pooled(value: Floats, group: Ints, stop: Ints) -> Floats:
+def pooled(value: Floats, group: Ints) -> Floats:
     """Return the (G,) sample standard deviation (n - 1) of each group's values over all frames; NaN for a single value.
 
-    Differences between stops count. Section 3.6.3: "across the total number of recorded observations".
+    Differences between stops count. Section 3.6.3: "across the total number of recorded observations". The "averaged
+    multi-positional standard deviation values" of section 4.4.1 would be too small for the position value of Table 9
+    (data/published/afit.yaml).
 
     Parameters
     ----------
-    value, group, stop
-        (S,) samples, the group of each (a light or a pair of lights), and the stop of its frame
+    value, group
+        (S,) samples, and the group of each: a light or a pair of lights
     """
     count = np.bincount(group)
     difference = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
     squares = np.bincount(group, difference**2)
     return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
-
-
-def averaged(value: Floats, group: Ints, stop: Ints) -> Floats:
-    """Return the (G,) mean over the stops of the standard deviation at each stop; NaN if no stop has two frames.
-
-    Differences between stops, such as errors of the IMU's angles, have no effect. Section 4.4.1: "the averaged
-    multi-positional standard deviation values". The parameters are those of `pooled`.
-    """
-    # Standard deviation of each group at each stop: (G, stops)
-    _, row = np.unique(stop, return_inverse=True)
-    stops = row.max() + 1
-    at_stop = np.full((group.max() + 1) * stops, np.nan)
-    deviation = pooled(value, group * stops + row, stop)
-    at_stop[: len(deviation)] = deviation
-    table = at_stop.reshape(-1, stops)
-    # Mean over the stops that have one
-    finite = np.isfinite(table)
-    total = np.where(finite, table, 0.0).sum(axis=1)
-    return np.where(finite.any(axis=1), total / np.maximum(finite.sum(axis=1), 1), np.nan)
-
-
-# The thesis describes both statistics. Table 4 has a pooled value under "Avg"; the position value of Table 9 is too
-# small for a pooled one if the IMU's angles were those of Tables 10-14 (reference 1.2, items 3 and 15).
-Deviation = Callable[[Floats, Ints, Ints], Floats]
-DEVIATIONS: dict[str, Deviation] = {"pooled": pooled, "averaged": averaged}
 
 
 class _Samples(NamedTuple):
@@ -190,13 +155,10 @@ def calibrate(
     camera: Camera,
     surface: LedMap,
     lever: Lever,
-    sine: bool = False,
-    statistic: str = "pooled",
-    home_only: bool = True,
 ) -> HomeCatalog:
     """Return the catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
-    The numbered steps are those of the module.
+    The numbered steps are those of the module. The catalog is from the frames at home, the epsilons from all frames.
 
     Parameters
     ----------
@@ -206,14 +168,6 @@ def calibrate(
         Calibrated camera, and its position and orientation
     surface
         Dome model, which gives R; its LEDs are not used
-    sine
-        Correct eqs 43-44, which have tan instead of sin (reference 1.2, item 11)
-    statistic
-        A name in DEVIATIONS: the standard deviation whose maximum is an epsilon
-    home_only
-        Take the catalog from the frames at home, as in the thesis; otherwise from the mean over
-        all frames (the black marks of the thesis's Fig. 79), which contains the IMU's errors at
-        the stops. The epsilons are from all frames in both cases
 
     Raises
     ------
@@ -224,23 +178,18 @@ def calibrate(
     checks.of_type("camera", camera, Camera)
     checks.of_type("surface", surface, LedMap)
     checks.of_type("lever", lever, Lever)
-    checks.known("statistic", statistic, DEVIATIONS)
     # 1. Positions in the lab
-    id_, samples = _lab_positions(sightings, camera, surface, lever, sine)
+    id_, samples = _lab_positions(sightings, camera, surface, lever)
     # 2. Repeatability
-    deviation = DEVIATIONS[statistic]
-    coordinates = [deviation(column, samples.led, samples.stop) for column in samples.lab_m.T]
-    angle, pair, stop = _separations(samples)
+    coordinates = [pooled(column, samples.led) for column in samples.lab_m.T]
     epsilons = (
-        _maximum(deviation(samples.brightness, samples.led, samples.stop), "light"),
+        _maximum(pooled(samples.brightness, samples.led), "light"),
         _maximum(np.concatenate(coordinates), "light"),
-        _maximum(deviation(angle, pair, stop), "pair of lights"),
+        _maximum(pooled(*_separations(samples)), "pair of lights"),
     )
     # 3. Catalog
-    selected = (
-        samples.stop == sightings[0].stop if home_only else np.ones(len(samples.led), bool)
-    )
-    order, mean_m, brightness, count = _brightest_first(samples, selected)
+    at_home = samples.stop == sightings[0].stop
+    order, mean_m, brightness, count = _brightest_first(samples, at_home)
     covariance = _covariance(samples.lab_m, samples.led)[order]
     return HomeCatalog(
         id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons
@@ -264,7 +213,7 @@ def _brightest_first(samples: _Samples, selected: Bools) -> tuple[Ints, Floats, 
 
 
 def _lab_positions(
-    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever, sine: bool
+    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever
 ) -> tuple[Ints, _Samples]:
     """Return the ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
     if not len(sightings):
@@ -274,7 +223,7 @@ def _lab_positions(
     body_m = []
     lab_m = []
     for sighting in sightings:
-        point_body = body_positions(sighting.xy_px, camera, surface, lever, sine)
+        point_body = body_positions(sighting.xy_px, camera, surface, lever)
         body_m.append(point_body)
         lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
@@ -304,8 +253,8 @@ def _check(index: int, sighting: Sighting) -> None:
         raise ImageError(f"sighting {index}: a centroid or a brightness is not finite")
 
 
-def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
-    """Return the angle about the bearing of every pair in every frame (eq. 45), its pair's number, its frame's stop."""
+def _separations(samples: _Samples) -> tuple[Floats, Ints]:
+    """Return the angle about the bearing of every pair in every frame (eq. 45), and its pair's number."""
     # All pairs of each frame
     direction = unit(samples.body_m)
     first = []
@@ -326,7 +275,7 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints, Ints]:
     # One number for each pair of lights, in whichever order they occur
     low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
     _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)
-    return angle, pair, samples.stop[a]
+    return angle, pair
 
 
 def _maximum(deviation: Floats, source: str) -> float:

@@ -182,17 +182,11 @@ class MassEstimate:
         (P,) parameters and their (P, P) covariance, in the order of `Prior`
     misfit
         Chi-square of the residuals over their number; 1 if noise and torques are as assumed
-    iterations
-        Number of iterations; 0 for a recursive estimate
-    attitude_factor
-        Factor by which the attitudes' noise was scaled
     """
 
     values: Floats
     covariance: Floats
     misfit: float
-    iterations: int = 0
-    attitude_factor: float = 1.0
 
     @property
     def inertia_kg_m2(self) -> Floats:

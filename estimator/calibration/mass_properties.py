@@ -100,7 +100,7 @@ def estimate_mass(
     motions = [first_states(record, lab, values) for record in records]
     information = np.diag(prior.sigma**-2)
     attitudes = sum(len(record.t_s) for record in records)
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    for _ in range(MAX_ITERATIONS):
         # 1. Linearization and elimination
         parts = [
             reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)
@@ -124,7 +124,7 @@ def estimate_mass(
             chi2 = sum(part.chi2 for part in parts) + from_prior
             # Three numbers an attitude, less attitude and momentum at the start of each record.
             misfit = float(chi2 / (3 * attitudes - 6 * len(records)))
-            return MassEstimate(values, covariance, misfit, iteration)
+            return MassEstimate(values, covariance, misfit)
         if not np.all(np.isfinite(values)):
             break
     raise ImageError(
@@ -146,7 +146,7 @@ def estimate_with_noise(
         if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
             break
         factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
-    return replace(estimate, attitude_factor=factor)
+    return estimate
 
 
 def considered(

@@ -47,6 +47,7 @@ LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 # In a frame: two determine its attitude and leave only one coordinate for the lens
 LEAST_STARS = 3
 START_ROUNDS = 30  # iterations of the robust start attitude
+CALIBRATION_ROUNDS = 8  # greatest number of rounds of self_calibrate
 # self_calibrate stops at a round with fewer than this fraction of the most stars so far.
 MIN_STAR_FRACTION = 0.9
 
@@ -216,7 +217,6 @@ def self_calibrate(
     camera: Camera,
     focal_uncertainty: float = 0.05,
     exposure_s: float = 1.0,
-    rounds: int = 8,
 ) -> Calibration:
     """Calibrate a camera from centroids alone.
 
@@ -251,7 +251,7 @@ def self_calibrate(
     most = 0
     previous_stars = np.empty((0, 3))
     estimate = camera
-    for _ in range(rounds):
+    for _ in range(CALIBRATION_ROUNDS):
         # 1. Identification
         identified = _identified(frames, tracker(estimate, focal_uncertainty), exposure_s)
         stars = np.concatenate(
@@ -271,26 +271,6 @@ def self_calibrate(
             f"self_calibrate: no star identified in any of {len(frames)} frames; check the camera"
         )
     return best
-
-
-def disagreement_px(camera: Camera, other: Camera, nodes: int = 41) -> float:
-    """Return the rms distance over the sensor between the projections of two cameras, after the best rotation, px.
-
-    The rotation is removed because it is not a property of the lens: every attitude absorbs it.
-
-    Parameters
-    ----------
-    nodes
-        Number of points along each side of the sensor
-    """
-    x = np.linspace(-0.5, camera.width_px - 0.5, nodes)
-    y = np.linspace(-0.5, camera.height_px - 0.5, nodes)
-    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    checks.of_type("other", other, Camera)
-    rays = camera.rays(xy)
-    R_other_from_camera, _ = kernel.wahba(other.rays(xy), rays, np.ones(len(xy)))
-    shift_px = other.pixels(rays @ R_other_from_camera.T) - xy
-    return float(np.sqrt(np.mean(np.sum(shift_px**2, axis=1))))
 
 
 class _Problem(NamedTuple):

@@ -1,4 +1,4 @@
-"""Pair indexes of the on-board catalog: a k-vector with neighbor lists, and Boeing's buckets.
+"""The pair index of the on-board catalog: a k-vector with neighbor lists.
 
 `PairIndex` sorts star pairs by separation. The k-vector (Mortari 1997) finds all pairs with a separation in [low, high]
 without a search:
@@ -11,12 +11,6 @@ without a search:
 The separations are nearly enough linear in their rank that the range holds only a few pairs too many. The neighbor
 lists give the stars at a given separation from one star: for each star they hold the other stars of its pairs,
 sorted by separation, and are searched by bisection (`first_neighbor`).
-
-`PairCatalog` groups the pairs into buckets of equal width in angle (Needelman, Li & Wu 2005, as described by Padro
-2012, section 2.4.6). Pairs within a bucket are unsorted, and a table gives the first pair of each bucket. A look-up
-computes the bucket numbers of the two ends of the range, without a search. Leaving out the separations halves the
-memory. The price: the range is rounded outward to whole buckets, so that the caller has to check a few pairs too
-many.
 """
 
 from __future__ import annotations
@@ -29,8 +23,7 @@ from scipy.spatial import cKDTree
 
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
-from estimator.core.checks import Floats, Ints
-from estimator.core.constants import ARCSEC_RAD
+from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -112,7 +105,11 @@ def build(
             f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
         )
     # All pairs, sorted by angle.
-    pair, angle = _pairs_within(vectors, 2 * np.sin(min(max_angle_rad, np.pi) / 2))
+    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    angle = 2 * np.arcsin(half_chord)
     order = np.argsort(angle, kind="stable")
     pair = np.ascontiguousarray(pair[order])
     angle = angle[order]
@@ -140,14 +137,6 @@ def build(
         magnitudes,
         sky_index.build_grid(vectors),
     )
-
-
-def _pairs_within(vectors: Floats, chord: float) -> tuple[NDArray[np.int32], Floats]:
-    """(P, 2) rows of all pairs of (N, 3) unit vectors up to a chord, and their (P,) angles, rad."""
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
-    return pair, 2 * np.arcsin(half_chord)
 
 
 def _neighbor_lists(
@@ -240,118 +229,3 @@ def first_from(values: Floats, begin: int, end: int, least: float) -> int:
         else:
             end = middle
     return begin
-
-
-# Boeing's pair catalog: star pairs grouped into buckets of separation, without storing the separations.
-
-BUCKET_WIDTH_RAD = 100 * ARCSEC_RAD  # from the thesis (Padro 2012, section 3.7.3)
-
-
-class PairCatalog(NamedTuple):
-    """Stars, and their pairs in buckets of separation.
-
-    Attributes
-    ----------
-    vectors
-        (N, 3) unit vectors
-    magnitude
-        (N,) magnitudes, on any scale
-    pair
-        (P, 2) star rows, bucket after bucket, unsorted within a bucket
-    table
-        (M + 1,) first pair of each bucket; the last entry is P
-    max_rad
-        Upper end of the last bucket; bucket i of 0 .. M - 1 begins at max_rad - (M - i) width_rad
-    width_rad
-        Width of a bucket
-    cells
-        Spatial grid of the stars' directions; Boeing sorts the stars by declination instead
-    """
-
-    vectors: Floats
-    magnitude: Floats
-    pair: NDArray[np.int32]
-    table: Ints
-    max_rad: float
-    width_rad: float
-    cells: Cells
-
-
-def build_pair_catalog(
-    vectors: Floats,
-    magnitude: Floats,
-    width_rad: float = BUCKET_WIDTH_RAD,
-    range_rad: tuple[float, float] | None = None,
-    magnitudes: tuple[float, float] = (-np.inf, np.inf),
-) -> PairCatalog:
-    """Build the catalog of the pairs of (N, 3) unit vectors whose angle and magnitudes are in range (section 2.4.6).
-
-    Buckets are counted back from the largest angle.
-
-    Parameters
-    ----------
-    magnitude
-        (N,) magnitudes
-    width_rad
-        Width of a bucket
-    range_rad
-        Range of angles, both ends included; if omitted, that of the pairs found
-    magnitudes
-        Range of magnitudes, both ends included
-
-    Raises
-    ------
-    ImageError
-        If there is no pair.
-    """
-    vectors = np.ascontiguousarray(vectors, dtype=float)
-    if not width_rad > 0:
-        raise ImageError(f"bucket width {width_rad} rad; allowed: more than 0")
-    low, high = range_rad or (0.0, np.pi)
-    # Search slightly beyond the range, then select by the exact angles.
-    pair, angle = _pairs_within(vectors, 2 * np.sin(min(high, np.pi) / 2) + 1e-12)
-    in_magnitude_range = (magnitude >= magnitudes[0]) & (magnitude <= magnitudes[1])
-    selected = (angle >= low) & (angle <= high) & in_magnitude_range[pair].all(axis=1)
-    pair = pair[selected]
-    angle = angle[selected]
-    if not len(pair):
-        raise ImageError(
-            f"no pair of stars from {np.degrees(low):.3f} to {np.degrees(high):.3f} deg"
-        )
-    if range_rad is None:
-        low = float(angle.min())
-        high = float(angle.max())
-    # The 1e-9 keeps rounding from adding a bucket where the range is a whole number of buckets.
-    buckets = max(int(np.ceil((high - low) / width_rad - 1e-9)), 1)
-    bucket = bucket_of(angle, high, width_rad, buckets)
-    table = np.concatenate([[0], np.cumsum(np.bincount(bucket, minlength=buckets))])
-    pair = np.ascontiguousarray(pair[np.argsort(bucket, kind="stable")])
-    magnitude = np.ascontiguousarray(magnitude, dtype=float)
-    return PairCatalog(
-        vectors, magnitude, pair, table, float(high), width_rad, sky_index.build_grid(vectors)
-    )
-
-
-@jit
-def bucket_of(angle_rad: Floats, max_rad: float, width_rad: float, buckets: int) -> Ints:
-    """The bucket, 0 .. buckets - 1, of each angle; angles outside go to the first or the last bucket.
-
-        bucket = floor(buckets - (max - angle) / width)
-
-    Each operation is monotonic in the angle, in floating point too. An angle between two limits is therefore always in
-    a bucket between those of the limits, whatever the rounding.
-    """
-    number = np.floor(buckets - (max_rad - angle_rad) / width_rad)
-    return np.clip(number, 0, buckets - 1).astype(np.int64)
-
-
-@jit
-def candidates(catalog: PairCatalog, low_rad: float, high_rad: float) -> tuple[int, int]:
-    """The half-open range of pairs that holds every angle in [low, high], rounded outward to whole buckets.
-
-    It begins at the last bucket whose lower end is below `low` and ends before the first one above `high` (eq. 12).
-    """
-    buckets = len(catalog.table) - 1
-    limits = np.array([low_rad, high_rad])
-    first, last = bucket_of(limits, catalog.max_rad, catalog.width_rad, buckets)
-    return catalog.table[first], catalog.table[last + 1]

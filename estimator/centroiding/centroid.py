@@ -104,7 +104,7 @@ def streak(
     """Fit a line segment blurred by a Gaussian; its center is the star's position at mid-exposure.
 
     Center, flux and sky are free. Length, direction and width have Gaussian priors around the streak of `priors`,
-    otherwise around the streak that the frame's blobs share. `streak_ends` returns the ends. The covariance is the
+    otherwise around the streak that the frame's blobs share. The covariance is the
     Cramer-Rao bound, larger along than across, plus the error of a faint streak's ends (see `streak_fit`).
 
     1. Fit the streaks. If none converges (a frame that is not smeared), all blobs are fitted by `gaussian_fit`.
@@ -139,16 +139,6 @@ def streak(
         x, y = _frame_streaks(image, blobs, priors).T
         rows[:, :2] -= blobs.turn_rad / 24 * np.column_stack([-y, x])
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
-
-
-def streak_ends(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
-) -> tuple[Floats, Floats]:
-    """Return the two ends of each streak, (N, 2) each, in arbitrary order; NaN for a blob that is not a streak."""
-    image = prepare(image, blobs, gain_e_dn, priors)
-    rows = _fit_streaks(image, blobs, gain_e_dn, priors)
-    # Center minus and plus half the streak
-    return rows[:, :2] - rows[:, 3:5] / 2, rows[:, :2] + rows[:, 3:5] / 2
 
 
 def disk(

@@ -41,8 +41,6 @@ class Options:
         (N,) magnitudes of the observed stars, on the index's scale; None if unknown
     epsilon_mag
         Standard deviation of a magnitude
-    epsilon_sep_rad
-        Standard deviation of an angle between two stars, for methods that use it; None: from the tolerance
     boresight_ref
         (3,) unit vector, prior direction of the optical axis in the catalog's frame
     within_rad
@@ -65,7 +63,6 @@ class Options:
     field_tan: tuple[float, float, float, float] = (-1.0, 1.0, -1.0, 1.0)
     magnitude: Floats | None = None
     epsilon_mag: float = np.inf
-    epsilon_sep_rad: float | None = None
     boresight_ref: Floats | None = None
     within_rad: float = np.pi
     acceptance: str = "evidence"

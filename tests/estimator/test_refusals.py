@@ -354,18 +354,12 @@ OTHERS: list[Case] = [
         lambda: star_field.self_calibrate([XY], lambda *_: TRACKER, CAMERA),
         "allowed: Centroids",
     ),
-    ("differ", lambda: star_field.disagreement_px(CAMERA, None), "other is None"),
     ("survey", lambda: dome_survey.survey([5], LEDS, LEVER, CAMERA), "frames: number 0 is 5"),
     ("survey map", lambda: dome_survey.survey([], None, LEVER, CAMERA), "leds is None"),
     (
         "home",
         lambda: home_position.calibrate([5], CAMERA, LEDS, LEVER),
         "sightings: number 0 is 5",
-    ),
-    (
-        "home by",
-        lambda: home_position.calibrate([], CAMERA, LEDS, LEVER, statistic="x"),
-        "statistic: 'x' is unknown",
     ),
     (
         "zero",

@@ -46,8 +46,6 @@ class MasterStarOptions(NamedTuple):
         Tolerance of a direction, and relative tolerance of an angle (see `Options`)
     gate_mag
         Greatest difference of the magnitudes of the master and a candidate
-    masters
-        Number of brightest stars to try as master
     checks
         Greatest number of angles compared
     by_paper
@@ -57,7 +55,6 @@ class MasterStarOptions(NamedTuple):
     tolerance_rad: float
     stretch: float
     gate_mag: float
-    masters: int
     checks: int
     by_paper: bool = False
 
@@ -66,10 +63,11 @@ def master_star(
     vectors_cam: Floats,
     index: PairIndex,
     tolerance_rad: float,
-    masters: int = 1,
     **options: Any,
 ) -> StarMatch | None:
     """Identify stars by NPS's master-star method (see the module's steps).
+
+    It fails if the master is false or not in the catalog, or if another star is as bright (the thesis's criticism).
 
     Parameters
     ----------
@@ -79,9 +77,6 @@ def master_star(
         Catalog of the stars and pairs
     tolerance_rad
         Tolerance of a direction
-    masters
-        Number of brightest stars to try as master. NPS's single master fails if it is false or not in the catalog,
-        or if another star is as bright (the thesis's criticism)
     options
         Keywords of `Options`; with magnitudes, candidates are within the magnitude gate of the master
 
@@ -105,7 +100,6 @@ def master_star(
         tolerance_rad,
         settings.stretch,
         3 * settings.epsilon_mag,
-        min(masters, count),
         settings.max_checks,
         settings.by_paper,
     )
@@ -131,31 +125,31 @@ def search(
         Empty if no match is accepted
     """
     tried = np.zeros(2, np.int64)  # assumed pairs, angles compared
-    for master in range(options.masters):
-        # 1. Candidates of the master's brightness.
-        begin, end = magnitude_range(index, magnitudes[master], options.gate_mag)
-        # 2. The number of the master's angles that each of them has.
-        angle_counts = np.zeros(end - begin, np.int64)
-        for candidate in range(begin, end):
-            angle_counts[candidate - begin] = _count_angles(
-                rays, index, master, candidate, options, tried
-            )
-        if len(angle_counts) == 0 or angle_counts.max() < MIN_MATCHES - 1:
-            continue
-        # 3. Test the best candidates by direct match.
-        best = no_match()
-        rival = np.zeros(1)
-        # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
-        for candidate in np.flatnonzero(angle_counts >= angle_counts.max() - 1) + begin:
-            best = _best_match(rays, index, master, candidate, options, tried, best, rival)
-            if tried[1] >= options.checks:
-                break
-        if options.by_paper and len(best.observed):
-            return best
-        if best.log10_chance <= ACCEPT_LOG10_CHANCE:
-            # 4. A repetitive pattern has another match as good: the best must be 1e5 times less likely by chance.
-            return best if rival[0] > best.log10_chance - ACCEPT_LOG10_CHANCE else no_match()
-    return no_match()
+    # 1. Candidates of the master's brightness.
+    begin, end = magnitude_range(index, magnitudes[0], options.gate_mag)
+    # 2. The number of the master's angles that each of them has.
+    angle_counts = np.zeros(end - begin, np.int64)
+    for candidate in range(begin, end):
+        angle_counts[candidate - begin] = _count_angles(
+            rays, index, candidate, options, tried
+        )
+    if len(angle_counts) == 0 or angle_counts.max() < MIN_MATCHES - 1:
+        return no_match()
+    # 3. Test the best candidates by direct match.
+    best = no_match()
+    rival = np.zeros(1)
+    # One angle less than the best is allowed: a false candidate can have an additional angle by chance.
+    for candidate in np.flatnonzero(angle_counts >= angle_counts.max() - 1) + begin:
+        best = _best_match(rays, index, candidate, options, tried, best, rival)
+        if tried[1] >= options.checks:
+            break
+    if options.by_paper:
+        return best
+    # 4. A repetitive pattern has another match as good: the best must be 1e5 times less likely by chance.
+    chance = best.log10_chance
+    if chance > ACCEPT_LOG10_CHANCE or rival[0] <= chance - ACCEPT_LOG10_CHANCE:
+        return no_match()
+    return best
 
 
 @jit
@@ -172,17 +166,14 @@ def contradict(first: DirectMatch, second: DirectMatch) -> bool:
 def _count_angles(
     rays: Floats,
     index: PairIndex,
-    master: int,
     candidate: int,
     options: MasterStarOptions,
     tried: NDArray,
 ) -> int:
     """Number of the master's angles that the candidate has to any of its neighbors."""
     count = 0
-    for n in range(len(rays)):
-        if n == master:
-            continue
-        side = angle(rays[master], rays[n])
+    for n in range(1, len(rays)):
+        side = angle(rays[0], rays[n])
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * side
         # Catalog stars at this angle from the candidate; one is enough.
         begin, end = neighbor_range(index, candidate, side - tolerance, side + tolerance)
@@ -195,7 +186,6 @@ def _count_angles(
 def _best_match(
     rays: Floats,
     index: PairIndex,
-    master: int,
     candidate: int,
     options: MasterStarOptions,
     tried: NDArray,
@@ -209,8 +199,8 @@ def _best_match(
 
     Parameters
     ----------
-    master, candidate
-        Row of the observed star and of the catalog star
+    candidate
+        Row of the catalog star that is taken for the master
     tried
         (2,) assumed pairs and angles compared so far, increased in place
     best
@@ -218,7 +208,7 @@ def _best_match(
     rival
         (1,) least chance of a match that contradicts the best, updated in place
     """
-    sides = np.array([angle(rays[master], rays[n]) for n in range(len(rays))])
+    sides = np.array([angle(rays[0], rays[n]) for n in range(len(rays))])
     # Stars at the angle of the second star from the candidate.
     for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
@@ -230,7 +220,7 @@ def _best_match(
             tried[0] += 1
             tried[1] += len(rays)
             # The attitude of the master and the second star, matched to the whole field.
-            pair = np.array([master, n])
+            pair = np.array([0, n])
             match = match_field(
                 rays, index, pair, stars, options.tolerance_rad, options.stretch, tried[0]
             )

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.attitude.solvers import quest
-from estimator.catalog.pair_index import PairCatalog, PairIndex, candidates, pair_range
+from estimator.catalog.pair_index import PairIndex, pair_range
 from estimator.catalog.sky_index import within
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
@@ -79,8 +79,7 @@ def match_assumptions(
     Parameters
     ----------
     pairs
-        (P, 2) rows of the primary pair candidates; those outside of the gate, at the ends of a bucket or of a k-vector
-        step, are skipped
+        (P, 2) rows of the primary pair candidates; those outside of the gate are skipped
 
     Returns
     -------
@@ -102,7 +101,7 @@ def match_assumptions(
     partner = np.empty(len(primary.others), np.int64)
     partner_cost = np.empty(len(primary.others))
     for p in range(len(pairs)):
-        # Skip pairs outside of the gate, which whole buckets include.
+        # Skip pairs outside of the gate, which whole steps of the k-vector include.
         misfit = abs(
             angle(stars.vectors[pairs[p, 0]], stars.vectors[pairs[p, 1]]) - separation_rad
         )
@@ -239,7 +238,7 @@ def add_contradictions(
 
 
 def saa(
-    vectors_cam: Floats, index: PairIndex | PairCatalog, tolerance_rad: float, **options: Any
+    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
 ) -> StarMatch | None:
     """Identify stars by SAA (Needelman, Li & Wu 2005; Padro 2012, 2.4.2; see the module's steps).
 
@@ -250,12 +249,12 @@ def saa(
     vectors_cam
         (N, 3) observed unit vectors, brightest first
     index
-        Pairs in buckets, or a k-vector index
+        Its magnitudes may be in any order
     tolerance_rad
         Tolerance of a direction, 3 epsilon_position
     options
-        Keywords of `Options`: magnitudes are used if the index has them too; epsilon_sep_rad is sqrt(2) / 3 of the
-        tolerance if None; max_triangles is the limit of observed pairs
+        Keywords of `Options`: magnitudes are used if the index has them too; max_triangles is the limit of
+        observed pairs
 
     Returns
     -------
@@ -272,15 +271,14 @@ def saa(
     count = len(vectors_cam)
     if count < MIN_MATCHES:
         return None
-    sep_rad = settings.epsilon_sep_rad
-    if sep_rad is None:
-        sep_rad = np.sqrt(2) / 3 * tolerance_rad
-    if not min(sep_rad, tolerance_rad, settings.epsilon_mag) > 0:
+    if not min(tolerance_rad, settings.epsilon_mag) > 0:
         raise ImageError(
-            f"saa: tolerance {tolerance_rad}, epsilons {sep_rad} and {settings.epsilon_mag}; allowed: more than 0"
+            f"saa: tolerance {tolerance_rad}, epsilon {settings.epsilon_mag}; allowed: more than 0"
         )
-    # The tolerance of a direction is three standard deviations.
-    gates = Gates(float(sep_rad), tolerance_rad / 3, settings.epsilon_mag, settings.stretch)
+    # The tolerance of a direction is three standard deviations; an angle has the errors of two.
+    position_rad = tolerance_rad / 3
+    sep_rad = float(np.sqrt(2) * position_rad)
+    gates = Gates(sep_rad, position_rad, settings.epsilon_mag, settings.stretch)
     stars = SearchInput(
         np.ascontiguousarray(vectors_cam),
         settings.magnitudes(count),
@@ -401,9 +399,7 @@ class AssumptionPool:
         return StarMatch(observed, star, cam_from_ref, chance)
 
 
-def _test_pairs(
-    pool: AssumptionPool, index: PairIndex | PairCatalog, settings: Options
-) -> None:
+def _test_pairs(pool: AssumptionPool, index: PairIndex, settings: Options) -> None:
     """Steps 2 to 8: add the assumptions of pair after pair to the pool.
 
     One pair is not enough: if noise moves A or B out of a gate, the truth is not among its assumptions. The search ends
@@ -412,12 +408,10 @@ def _test_pairs(
     stars = pool.stars
     remaining = settings.max_triangles
     budget = min(settings.max_checks // len(stars.vectors_cam), MAX_ASSUMPTIONS)
-    max_rad = index.max_rad if isinstance(index, PairCatalog) else index.max_angle_rad
-    find_pairs = candidates if isinstance(index, PairCatalog) else pair_range
     # 2. Primary pairs; 3. their candidates.
-    for a, b, angle_rad in _primary_pairs(stars, settings.base_stars, max_rad):
+    for a, b, angle_rad in _primary_pairs(stars, settings.base_stars, index.max_angle_rad):
         gate = gate_rad(stars.gates, angle_rad)
-        begin, end = find_pairs(index, angle_rad - gate, angle_rad + gate)
+        begin, end = pair_range(index, angle_rad - gate, angle_rad + gate)
         if remaining == 0 or pool.count + end - begin > budget:
             break
         remaining -= 1

@@ -14,7 +14,6 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import dome_survey
 from estimator.calibration.bundle_adjustment import Assumed, Bundle
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
-from estimator.calibration.gauge import align_attitudes
 from estimator.calibration.survey_subset import connected_subset
 from estimator.core.camera import Camera
 
@@ -148,6 +147,25 @@ def size_and_turn(found: np.ndarray, truth: np.ndarray) -> tuple[float, Rotation
     return float(np.sum(truth * turn.apply(found)) / np.sum(found**2)), turn
 
 
+def align_attitudes(ours: Rotation, theirs: Rotation) -> tuple[Rotation, Rotation]:
+    """Constant rotations of body and lab between attitudes: theirs = left * ours * right, by Gauss-Newton.
+
+    If all attitudes rotate about one axis, a rotation can be divided between the two; the step is of minimum norm.
+    """
+    left = Rotation.identity()
+    right = (ours.inv() * theirs).mean()
+    for _ in range(50):
+        residual = (theirs * (left * ours * right).inv()).as_rotvec()
+        by_left = np.tile(np.eye(3), (len(residual), 1, 1))
+        jacobian = np.concatenate([by_left, (left * ours).as_matrix()], axis=2)
+        step = np.linalg.lstsq(jacobian.reshape(-1, 6), residual.ravel(), rcond=1e-9)[0]
+        left = Rotation.from_rotvec(step[:3]) * left
+        right = Rotation.from_rotvec(step[3:]) * right
+        if np.linalg.norm(step) < 1e-14:
+            break
+    return left, right
+
+
 def errors_rad(found: Rotation, truth: Rotation) -> np.ndarray:
     """(F, 3) attitude errors in body axes, without the unobservable rotations of lab and body."""
     left, right = align_attitudes(found, truth)
@@ -199,9 +217,7 @@ def test_the_gauge_freedoms_change_no_pixel() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "how", [{}, {"loss": "cauchy"}, {"known_length": (0, 7, 0.5)}, {"reference_frame": 4}]
-)
+@pytest.mark.parametrize("how", [{}, {"loss": "cauchy"}])
 def test_noise_free_frames_recover_every_parameter(how: dict) -> None:
     found, place, turned, lever = small_survey(0.0, 5, **how)
     assert found.status == "converged"
@@ -226,26 +242,6 @@ def test_noise_free_frames_recover_every_parameter(how: dict) -> None:
     np.testing.assert_allclose(found.camera.distortion, SMALL.distortion, rtol=0, atol=1e-9)
 
 
-def test_a_known_length_scales_lights_and_lever_alone() -> None:
-    by_map, *_ = small_survey(0.01, 6)
-    place = by_map.leds.position_m
-    half = np.linalg.norm(place[2] - place[9]) / 2
-    by_length, *_ = small_survey(0.01, 6, known_length=(2, 9, half))
-    kept = by_map.surveyed
-    assert np.linalg.norm(
-        by_length.leds.position_m[2] - by_length.leds.position_m[9]
-    ) == pytest.approx(half)
-    # Both end at one minimum; the steps stop below 1e-6 of a standard deviation, 1e-9 of a meter here.
-    np.testing.assert_allclose(
-        by_length.leds.position_m[kept], place[kept] / 2, rtol=0, atol=1e-8
-    )
-    np.testing.assert_allclose(
-        by_length.lever.camera_body_m, by_map.lever.camera_body_m / 2, rtol=0, atol=1e-8
-    )
-    assert (by_length.body_from_lab * by_map.body_from_lab.inv()).magnitude().max() < 1e-8
-    assert by_length.camera.focal_px == pytest.approx(by_map.camera.focal_px, rel=1e-8)
-
-
 def test_the_misfit_counts_the_redundant_coordinates() -> None:
     """Three for each light and frame, three of the lever, seven of the lens; less four that change no pixel."""
     noise_px = 0.01
@@ -261,58 +257,31 @@ def test_the_misfit_counts_the_redundant_coordinates() -> None:
     assert found.misfit == pytest.approx(wanted, rel=1e-9)
 
 
-def test_a_reference_frame_keeps_its_attitude() -> None:
-    found, place, turned, lever = small_survey(0.02, 9, reference_frame=4)
-    frames = filmed(np.random.default_rng(9), turned, place, lever, SMALL, 0.02)
-    assert (found.body_from_lab[4] * frames[4].body_from_lab.inv()).magnitude() < 1e-14
-    # Held, it has no variance; the others have.
-    # Rounding about none.
-    sigma = np.sqrt(np.maximum(np.einsum("fii->fi", found.attitude_covariance_rad2), 0))
-    assert sigma[4].max() < 1e-3 * np.delete(sigma, 4, axis=0).min()
-
-
 def gauged(
     start: np.ndarray,
     kept: np.ndarray,
-    length_known: bool,
     place: np.ndarray,
     turned: Rotation,
     lever: Lever,
 ) -> tuple[np.ndarray, Rotation, np.ndarray]:
     """The truth rotated and scaled to the survey's gauge: least squares onto the initial map."""
     turn = Rotation.align_vectors(start[kept], place[kept])[0]
-    size = (
-        1.0
-        if length_known
-        else np.sum(start[kept] ** 2) / np.sum(start[kept] * turn.apply(place[kept]))
-    )
+    size = np.sum(start[kept] ** 2) / np.sum(start[kept] * turn.apply(place[kept]))
     return size * turn.apply(place), turned * turn.inv(), size * lever.camera_body_m
 
 
-@pytest.mark.parametrize(
-    ("sigma_m", "length_known"),
-    [
-        pytest.param(np.inf, False, marks=pytest.mark.slow),
-        pytest.param(0.002, True, marks=pytest.mark.long),
-    ],
-    ids=["start and its size", "measured and length"],
-)
-def test_the_covariance_matches_the_scatter_of_surveys(
-    sigma_m: float, length_known: bool
-) -> None:
+@pytest.mark.slow
+def test_the_covariance_matches_the_scatter_of_surveys() -> None:
     place, turned, lever = small_dome(21)
     rng = np.random.default_rng(22)
-    length = (0, 7, float(np.linalg.norm(place[0] - place[7]))) if length_known else None
     runs = 20
     distance = []
     for _ in range(runs):
         start = place + rng.normal(0, 0.002, place.shape)
         frames = filmed(rng, turned, place, lever, SMALL, 0.01, imu_deg=0.1)
-        found = survey(frames, leds_of(start), lever, SMALL, length, leds_sigma_m=sigma_m)
+        found = survey(frames, leds_of(start), lever, SMALL)
         kept = found.surveyed
-        true_place, true_turned, true_lever = gauged(
-            start, kept, length_known, place, turned, lever
-        )
+        true_place, true_turned, true_lever = gauged(start, kept, place, turned, lever)
         lens = [found.camera.focal_px, *found.camera.center_px]
         both = [
             ([found.lever.camera_body_m - true_lever], [found.lever_covariance_m2]),
@@ -453,16 +422,6 @@ def test_frames_in_two_groups_are_refused() -> None:
     ("change", "message"),
     [
         ({"loss": "huber"}, r"unknown loss 'huber'; allowed: linear, cauchy"),
-        (
-            {"known_length": (3, 3, 0.1)},
-            r"known_length is \(3, 3, 0.1\); allowed: two different rows below 60",
-        ),
-        ({"known_length": (3, 4, 0.0)}, r"known_length is \(3, 4, 0.0\)"),
-        (
-            {"known_length": (59, 3, 0.1)},
-            r"known_length ends at LED row 59, which is not surveyed",
-        ),
-        ({"reference_frame": 40}, r"reference_frame is 40; allowed: 0 to 39"),
         ({"leds_sigma_m": 0.0}, r"leds_sigma_m is 0.0; allowed: above 0"),
         (
             {"assumed": Assumed(np.zeros(3), 0.005, 900.0, 9.0)},
@@ -502,26 +461,6 @@ def test_malformed_frames_are_refused_by_number() -> None:
         match=r"^survey: \d+ usable coordinates for \d+ unknowns; take more frames",
     ):
         survey(frames[:3], *asked)
-
-
-def test_the_rotations_between_two_sets_of_attitudes_are_found() -> None:
-    rng = np.random.default_rng(41)
-    ours = attitudes(rng, 30, 25)
-    left = Rotation.from_rotvec([0.3, -0.2, 2.0])
-    right = Rotation.from_rotvec([-0.1, 0.4, -1.5])
-    found_left, found_right = align_attitudes(ours, left * ours * right)
-    # Rounding of thirty attitudes.
-    assert (found_left * left.inv()).magnitude() < 1e-13
-    assert (found_right * right.inv()).magnitude() < 1e-13
-    # An IMU of one degree an axis tells them to that over the root of the attitudes, at half as well about the
-    # vertical, where all yaws share; chance of 5 sigma.
-    many = attitudes(rng, 600, 25)
-    imu = Rotation.from_rotvec(np.radians(1) * rng.normal(size=(600, 3))) * (
-        left * many * right
-    )
-    found_left, _ = align_attitudes(many, imu)
-    errors = (found_left * left.inv()).as_rotvec()
-    assert np.degrees(np.abs((left.inv().apply(errors))[:2])).max() < 5 * np.sqrt(2 / 600)
 
 
 def afit_errors_deg(

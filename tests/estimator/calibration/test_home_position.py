@@ -10,13 +10,13 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import nearfield
 from estimator.attitude.dome_map import LedMap, Lever, on_sphere, project
 from estimator.calibration.home_position import (
-    DEVIATIONS,
     HomeCatalog,
     Sighting,
     _covariance,
     calibrate,
     instrument_brightness,
     led_map,
+    pooled,
 )
 from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
@@ -95,11 +95,11 @@ def greatest_sd(count: int, freedom: int) -> tuple[float, float]:
 # ---- the vectors: eqs 43-45 ----------------------------------------------------------------------------------------
 
 
-def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
+def pair_error_arcsec(wide_rad: float) -> float:
     """Excess angle of a pair centered on the boresight about the bearing, on a perfect centered sphere."""
     half = wide_rad / 2
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
-    point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER, sine)
+    point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER)
     np.testing.assert_allclose(reach_m, R_M - M_M, rtol=0, atol=1e-15)
     read = unit(point + LEVER.camera_body_m)
     true = unit(on_sphere(rays, LEVER.camera_body_m, R_M))
@@ -108,28 +108,7 @@ def pair_error_arcsec(wide_rad: float, sine: bool) -> float:
 
 def test_the_thesis_s_formula_error_widens_an_eight_degree_pair_by_44_arcsec() -> None:
     # Reference 1.2, item 11: + 44 arcsec. Half a unit of its last digit.
-    assert abs(pair_error_arcsec(np.radians(8), sine=False) - 44) < 0.5
-
-
-def test_with_the_corrected_sine_a_tenth_of_the_error_is_left() -> None:
-    # By plane trigonometry: the ray meets the sphere `along` from the camera; the thesis stops at R - M.
-    half = np.radians(4)
-    along = -M_M * np.cos(half) + np.sqrt(R_M**2 - (M_M * np.sin(half)) ** 2)
-    true = np.arctan2(along * np.sin(half), M_M + along * np.cos(half))
-    near = np.arctan2((R_M - M_M) * np.sin(half), M_M + (R_M - M_M) * np.cos(half))
-    expected = 2 * (near - true) / ARCSEC
-    found = pair_error_arcsec(2 * half, sine=True)
-    np.testing.assert_allclose(
-        found, expected, rtol=0, atol=1e-6
-    )  # the arc cosine's rounding
-    assert -5 < found < -4
-
-
-def test_with_the_sine_a_point_is_on_its_ray_at_distance_r_minus_m() -> None:
-    rng = np.random.default_rng(60)
-    rays = CAMERA.rays(rng.uniform(0, [1599, 1199], (50, 2)))
-    point, _ = nearfield.thesis_points(rays, SPHERE, LEVER, sine=True)
-    np.testing.assert_allclose(point, (R_M - M_M) * rays, rtol=0, atol=1e-15)  # rounding
+    assert abs(pair_error_arcsec(np.radians(8)) - 44) < 0.5
 
 
 # ---- the epsilons --------------------------------------------------------------------------------------------------
@@ -172,22 +151,9 @@ def test_an_imu_s_error_between_stops_is_r_sigma_in_the_pooled_spread(
     # All LEDs share the IMU's 300 errors of x and of y; their yaw moves an LED 13 mm out by a hundredth of that.
     low, high = greatest_sd(2, 299)
     assert low < found.epsilon_pos_m / np.hypot(R_M * IMU_RAD, SIGMA_M) < high
-    # Places are off by .2 mm.
-    np.testing.assert_allclose(found.epsilon_pos_rad, found.epsilon_pos_m / R_M, rtol=1e-3)
     # An angle between LEDs needs no IMU: as at one place.
     sigma = np.sqrt(2) * SIGMA_M / R_M
     assert greatest_sd(1, 599)[0] < found.epsilon_sep_rad / sigma < greatest_sd(66, 599)[1]
-
-
-def test_the_averaged_spread_excludes_the_imu_error_between_stops(
-    stops: list[Sighting],
-) -> None:
-    # This is how .72 degree of Table 15 and 1.99 mm of Table 9 can both be (reference 1.2, item 15).
-    found = calibrate(stops, CAMERA, SPHERE, LEVER, statistic="averaged")
-    # The deviation of two frames has the mean sqrt(2 / pi) and, by that, the spread sqrt(pi / 2 - 1); 24 coordinates.
-    scatter = np.sqrt((np.pi / 2 - 1) / 300)
-    low, high = 1 + scatter * stats.norm.ppf(np.array([RARE / 2, 1 - RARE / 2]) ** (1 / 24))
-    assert low < found.epsilon_pos_m / (np.sqrt(2 / np.pi) * SIGMA_M) < high
 
 
 def test_different_stops_show_the_geometric_error_without_noise() -> None:
@@ -202,37 +168,26 @@ def test_different_stops_show_the_geometric_error_without_noise() -> None:
         ]
     )
     rng = np.random.default_rng(63)
-    spread = {}
-    for sine in (False, True):
-        seen = [
-            sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
-            for stop, attitude in enumerate(Rotation.from_euler("ZYX", stops[:, ::-1]))
-        ]
-        spread[sine] = calibrate(seen, CAMERA, SPHERE, LEVER, sine).epsilon_pos_m
+    seen = [
+        sighting(rng, dome(), attitude, attitude, stop, noise_px=0.0)
+        for stop, attitude in enumerate(Rotation.from_euler("ZYX", stops[:, ::-1]))
+    ]
+    spread = calibrate(seen, CAMERA, SPHERE, LEVER).epsilon_pos_m
     # The greatest lateral error, of an LED at the greatest tilt, bounds a deviation from above: eq. 44's point less
     # where the ray meets the sphere, at the ray of an apex LED leaning 3.3 degrees and half a board.
     tilt = np.radians(3.3) + 0.0125 / R_M
     ray = unit(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
     true = on_sphere(ray, LEVER.camera_body_m, R_M)
-    for sine, found in spread.items():
-        off = (
-            nearfield.thesis_points(ray, SPHERE, LEVER, sine)[0] + LEVER.camera_body_m - true
-        )
-        assert 0 < found < np.linalg.norm(off)
-    assert spread[True] < spread[False]
+    off = nearfield.thesis_points(ray, SPHERE, LEVER)[0] + LEVER.camera_body_m - true
+    assert 0 < spread < np.linalg.norm(off)
 
 
-def test_the_spreads_match_a_hand_calculation() -> None:
+def test_the_spread_matches_a_hand_calculation() -> None:
     value = np.array([1.0, 3, 11, 13, 5, 5, 7])
     group = np.array([0, 0, 0, 0, 2, 2, 1])
-    stop = np.array([7, 7, 9, 9, 7, 9, 9])
-    root = np.sqrt(2)
-    # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3; at either stop sqrt(2).
-    by_hand = {"pooled": [np.sqrt(104 / 3), np.nan, 0], "averaged": [root, np.nan, np.nan]}
-    for name, expected in by_hand.items():
-        np.testing.assert_allclose(
-            DEVIATIONS[name](value, group, stop), expected, rtol=1e-15, atol=0
-        )
+    # 1, 3, 11, 13: mean 7, squares 36 + 16 + 16 + 36 over 3.
+    expected = [np.sqrt(104 / 3), np.nan, 0]
+    np.testing.assert_allclose(pooled(value, group), expected, rtol=1e-15, atol=0)
 
 
 # ---- the catalog -------------------------------------------------------------------------------------------------
@@ -286,24 +241,6 @@ def test_the_sample_covariance_matches_numpy_and_is_absent_for_one_sample() -> N
     assert np.isnan(covariance[1]).all()
 
 
-def test_the_mean_over_all_stops_keeps_their_imu_error_and_home_does_not() -> None:
-    rng = np.random.default_rng(65)
-    wrong = Rotation.from_rotvec([2e-3, 0, 0])
-    seen = at_home(rng, 20) + [
-        sighting(rng, dome(), Rotation.identity(), wrong, 1) for _ in range(20)
-    ]
-    home, both = (
-        calibrate(seen, CAMERA, SPHERE, LEVER, home_only=only) for only in (True, False)
-    )
-    assert home.samples.tolist() == [20] * 12
-    assert both.samples.tolist() == [40] * 12
-    # Half of the frames are turned back by 2e-3 too much: y moves by R 1e-3 (z is up, x the axis: + y).
-    moved = (both.position_m - home.position_m)[:, 1].mean()
-    # The difference of a mean of 40 and of 20, of which 20 are shared, over 12 LEDs.
-    sigma = SIGMA_M * np.sqrt(1 / 80 + 1 / 80) / np.sqrt(12)
-    assert abs(moved - R_M * 1e-3) < stats.norm.isf(RARE / 2) * sigma + R_M * 1e-3 * 1e-4
-
-
 def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
     rng = np.random.default_rng(66)
     level = Rotation.identity()
@@ -313,7 +250,6 @@ def test_leds_unseen_at_home_are_left_out_of_its_catalog() -> None:
         *(sighting(rng, dome(), level, level, 1) for _ in range(3)),
     ]
     assert sorted(calibrate(seen, CAMERA, SPHERE, LEVER).id) == [100, 101, 102, 103]
-    assert len(calibrate(seen, CAMERA, SPHERE, LEVER, home_only=False)) == 12
 
 
 def test_a_camera_mounted_askew_gives_the_same_positions() -> None:

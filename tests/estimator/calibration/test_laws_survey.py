@@ -19,8 +19,8 @@ from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance, dome_survey, star_field
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
-from estimator.calibration.gauge import Gauge, Subset, align_attitudes
 from estimator.calibration.star_field import LensPrior, StarFrame
+from estimator.calibration.survey_subset import Subset
 from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -35,6 +35,7 @@ from tests.helpers.laws import (
     turn,
     units,
 )
+from tests.helpers.lens_and_streak import disagreement_px
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 LIGHTS = 14
@@ -267,11 +268,9 @@ def test_an_adjustment_converges_to_the_observed_pixels(
     found, at_rest = ba.adjust(turned, seen, np.inf)
     assert at_rest
     assert np.abs(ba.residuals(found, seen)).max() < 1e-5
-    gauge = Gauge(None, None, true.position_m, true.R_body_from_lab)
-    part = Subset(found, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
     terms = ba.normal_equations(found, seen, np.ones(len(seen.led)))
     by_led, by_rotation, shared = bundle_covariance.covariance_in_gauge(
-        terms, found, *gauge.constraints(found, part)
+        terms, replace(found, map_m=true.position_m)
     )
     for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
@@ -297,64 +296,25 @@ def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatc
         assert (np.diff(costs) <= 1e-9 * np.array(costs[:-1])).all()
 
 
-@law(Gauge.check, Gauge.transform, Gauge.constraints, Subset.insert_into)
-@given(
-    rng=SEEDS,
-    length=some.none()
-    | some.tuples(some.integers(-1, 15), some.integers(-1, 15), some.floats(0.1, 2)),
-    frame=some.none() | some.integers(-1, 7),
-)
-def test_a_gauge_freedom_moves_no_pixel(
-    rng: np.random.Generator, length: tuple[int, int, float] | None, frame: int | None
-) -> None:
+@law(dome_survey.in_gauge, bundle_covariance.gauge_constraints, Subset.insert_into)
+@given(rng=SEEDS)
+def test_a_gauge_freedom_moves_no_pixel(rng: np.random.Generator) -> None:
     true, seen = dome(rng)
-    asked = answered(lambda: Gauge(length, frame, true.position_m, true.R_body_from_lab))
-    rows = length is None or (
-        length[0] != length[1] and all(0 <= end < LIGHTS for end in length[:2])
-    )
-    assert (asked is not None) == (rows and (frame is None or 0 <= frame < FRAMES))
-    gauge = asked or Gauge((0, 1, 0.5), 2, true.position_m, true.R_body_from_lab)
     part = Subset(true, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(len(seen.led)))
-    gauge.check(part)
-    found = nudged(rng, true, 0.01)
-    once = gauge.transform(found, part)
+    found = replace(nudged(rng, true, 0.01), map_m=true.position_m)
+    once = dome_survey.in_gauge(found)
     np.testing.assert_allclose(
         ba.residuals(once, seen), ba.residuals(found, seen), rtol=0, atol=1e-6
     )
     np.testing.assert_allclose(
-        gauge.transform(once, part).position_m, once.position_m, rtol=0, atol=1e-9
+        dome_survey.in_gauge(once).position_m, once.position_m, rtol=0, atol=1e-9
     )
     np.testing.assert_array_equal(part.insert_into(true, once).position_m, once.position_m)
-    by_led, by_rest = gauge.constraints(once, part)
+    by_led = bundle_covariance.gauge_constraints(once)
     assert by_led.shape == (3 * LIGHTS, 4)
-    led_free, rest_free = ba.gauge_freedoms(once)
+    led_free, _ = ba.gauge_freedoms(once)
     # It leaves nothing free.
-    assert np.linalg.matrix_rank(led_free.T @ by_led + rest_free.T @ by_rest) == 4
-    if gauge.length is not None:  # its constraint is the known length's slope
-        ends = list(gauge.length[:2])
-        moved = rng.normal(0, 1e-6, once.position_m.shape)
-        change_m = np.diff(
-            [
-                np.linalg.norm(at[ends[0]] - at[ends[1]])
-                for at in (once.position_m, once.position_m + moved)
-            ]
-        )
-        np.testing.assert_allclose(
-            moved.ravel() @ by_led[:, 3], change_m[0], rtol=0, atol=1e-10
-        )
-
-
-@law(align_attitudes)
-@given(rng=SEEDS, count=some.integers(3, 12))
-def test_two_rotations_between_attitudes_are_found(
-    rng: np.random.Generator, count: int
-) -> None:
-    ours = Rotation.random(count, rng=rng)
-    left = turn(rng, 0.5)
-    right = turn(rng, 3)
-    theirs = left * ours * right
-    found_left, found_right = align_attitudes(ours, theirs)
-    assert ((found_left * ours * found_right) * theirs.inv()).magnitude().max() < 1e-9
+    assert np.linalg.matrix_rank(led_free.T @ by_led) == 4
 
 
 # The dome's survey
@@ -484,7 +444,7 @@ def filmed(rng: np.random.Generator, count: int) -> tuple[list[StarFrame], Rotat
 
 
 @pytest.mark.slow
-@law(star_field.calibrate, star_field.disagreement_px, LensPrior.sigma)
+@law(star_field.calibrate, LensPrior.sigma)
 @given(rng=SEEDS, longer=some.floats(-0.03, 0.03))
 def test_star_fields_determine_the_lens(rng: np.random.Generator, longer: float) -> None:
     frames, truths = filmed(rng, 8)
@@ -494,8 +454,8 @@ def test_star_fields_determine_the_lens(rng: np.random.Generator, longer: float)
     result = star_field.calibrate(frames, sheet)
     assert result.report.status == "converged"
     assert_covariance(result.covariance)
-    assert star_field.disagreement_px(CAMERA, CAMERA) < 1e-9
-    assert star_field.disagreement_px(result.camera, CAMERA) < 0.3
+    assert disagreement_px(CAMERA, CAMERA) < 1e-9
+    assert disagreement_px(result.camera, CAMERA) < 0.3
     assert (result.report.cam_from_ref * truths.inv()).magnitude().max() < 0.01
     assert (LensPrior().sigma(sheet) > 0).all()
 
@@ -550,4 +510,4 @@ def test_a_camera_is_calibrated_by_identified_stars(
         lambda: star_field.self_calibrate(lights, lambda *_: namer, CAMERA.zoomed(1.01))
     )
     assert (result is not None) == seen
-    assert result is None or star_field.disagreement_px(result.camera, CAMERA) < 0.5
+    assert result is None or disagreement_px(result.camera, CAMERA) < 0.5

@@ -18,7 +18,6 @@ from estimator.calibration import (
     survey_plan,
     survey_subset,
 )
-from estimator.calibration.gauge import Gauge
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.core.camera import Camera
@@ -299,18 +298,6 @@ def test_exchanged_lights_are_found_at_any_gain(
     assert ([(one.led, one.shows) for one in found] == [(2, 9), (9, 2)]) or not far_apart
     alike, share = survey_faults.exchanged(LightTable(light, shown, np.ones((10, 12))))
     assert (alike, share) == ([], 0.0)
-
-
-@law(Gauge.is_map)
-@given(rng=SEEDS)
-def test_the_gauge_follows_the_map_unless_a_length_or_a_frame_is_given(
-    rng: np.random.Generator,
-) -> None:
-    place_m = rng.normal(0, 1, (4, 3))
-    held = attitudes(rng, 2).as_matrix()
-    assert Gauge(None, None, place_m, held).is_map
-    assert not Gauge((0, 1, 1.0), None, place_m, held).is_map
-    assert not Gauge(None, 1, place_m, held).is_map
 
 
 def test_a_model_of_no_noise_is_refused() -> None:

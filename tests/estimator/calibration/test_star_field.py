@@ -15,7 +15,6 @@ from estimator.calibration.star_field import (
     Calibration,
     StarFrame,
     calibrate,
-    disagreement_px,
     self_calibrate,
 )
 from estimator.calibration.zero_point import magnitude_zero
@@ -28,6 +27,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.paths import ROOT
 from skysim.sources import star_archives
+from tests.helpers.lens_and_streak import disagreement_px
 
 # SHEFEX-2's chip behind an uncalibrated 25 mm lens, and what its data sheet says: 1.5 % off, no distortion.
 TRUE = Camera(659, 493, 2520.0, (336.5, 241.0), (-0.11, 0.35, 8e-4, -6e-4, -1.5))

@@ -8,12 +8,13 @@ from scipy import ndimage, optimize, stats
 from scipy.special import erf
 
 from estimator.centroiding import streak_fit
-from estimator.centroiding.centroid import cog, gaussian_fit, streak, streak_ends
+from estimator.centroiding.centroid import cog, gaussian_fit, streak
 from estimator.core.types import FramePriors
 from estimator.detection import background as frame_background
 from estimator.detection import detect
 from estimator.detection.components import runs_above
 from tests.helpers.interpreted import interpreted
+from tests.helpers.lens_and_streak import streak_ends
 
 BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 SIGMA_PX = 0.7

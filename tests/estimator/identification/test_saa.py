@@ -11,9 +11,10 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.home_position import Sighting, calibrate
 from estimator.catalog import pair_index
 from estimator.catalog.catalog import unit
-from estimator.catalog.pair_index import ARCSEC_RAD, PairCatalog, build_pair_catalog
+from estimator.catalog.pair_index import PairIndex
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
+from estimator.core.constants import ARCSEC_RAD
 from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.identification.published.saa import saa
@@ -46,11 +47,15 @@ PITCH_RAD = 8e-3 / 1.2192
 MAGNITUDE = np.array([150.0, 35, 110, 70, 130, 50, 90, 20, 145, 60, 100, 40])
 SIGMA_RAD = 5 * ARCSEC_RAD
 EPSILON_MAG = 5.0
-EPSILON_SEP = np.sqrt(2) * SIGMA_RAD
 
 
 def patch(places: Floats) -> Floats:
     return unit(np.column_stack([places * PITCH_RAD, np.ones(len(places))]))
+
+
+def pairs_of(vectors: Floats, magnitude: Floats) -> PairIndex:
+    """All pairs of a patch whose lights are in no order of their magnitudes."""
+    return pair_index.build(vectors, 0.1)._replace(magnitude=np.asarray(magnitude, float))
 
 
 def observed(
@@ -82,7 +87,7 @@ def observed(
 
 
 def found(
-    seen: Floats, light: Floats, known: PairCatalog, epsilon_mag: float = EPSILON_MAG
+    seen: Floats, light: Floats, known: PairIndex, epsilon_mag: float = EPSILON_MAG
 ) -> StarMatch | None:
     return saa(
         seen,
@@ -90,14 +95,13 @@ def found(
         3 * SIGMA_RAD,
         magnitude=light,
         epsilon_mag=epsilon_mag,
-        epsilon_sep_rad=EPSILON_SEP,
     )
 
 
 @pytest.mark.parametrize("false", [0, 4])
 def test_a_patch_of_unequal_leds_is_identified_and_never_wrongly(false: int) -> None:
     rng = np.random.default_rng(74)
-    known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
+    known = pairs_of(patch(LATTICE), MAGNITUDE)
     right = 0
     z2 = []
     for _ in range(100):
@@ -124,7 +128,7 @@ SQUARE = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)])
 def test_a_symmetric_pattern_of_equal_leds_is_refused(places: Floats) -> None:
     rng = np.random.default_rng(75)
     equal = np.full(len(places), 100.0)
-    known = build_pair_catalog(patch(places), equal)
+    known = pairs_of(patch(places), equal)
     for _ in range(3):
         seen, light, _, _ = observed(rng, patch(places), equal)
         assert found(seen, light, known) is None
@@ -135,7 +139,7 @@ def test_a_square_of_unequal_leds_is_identified() -> None:
     # four a full square, on which false assumptions find partners too, is mostly refused.
     rng = np.random.default_rng(76)
     magnitude = 100.0 * np.random.default_rng(80).permutation(9) + 100
-    known = build_pair_catalog(patch(SQUARE), magnitude)
+    known = pairs_of(patch(SQUARE), magnitude)
     named = 0
     for _ in range(30):
         seen, light, row, _ = observed(rng, patch(SQUARE), magnitude)
@@ -146,19 +150,17 @@ def test_a_square_of_unequal_leds_is_identified() -> None:
     assert named > 25  # at 97 % expected, 25 or fewer of 30 come once in a thousand
 
 
-def test_without_magnitudes_an_irregular_pattern_is_identified_with_a_k_vector_too() -> None:
+def test_without_magnitudes_an_irregular_pattern_is_identified() -> None:
     rng = np.random.default_rng(77)
     places = rng.uniform(-3, 3, (14, 2))
-    known = build_pair_catalog(patch(places), np.zeros(14))
-    kvector = pair_index.build(patch(places), 0.1)
+    known = pair_index.build(patch(places), 0.1)
     right = 0
-    for _ in range(15):
+    for _ in range(30):
         seen, _, row, _ = observed(rng, patch(places), np.full(14, 100.0))
-        for pairs in (known, kvector):
-            match = saa(seen, pairs, 3 * SIGMA_RAD)
-            if match is not None:
-                assert (row[match.observed] == match.star).all()
-                right += 1
+        match = saa(seen, known, 3 * SIGMA_RAD)
+        if match is not None:
+            assert (row[match.observed] == match.star).all()
+            right += 1
     assert right > 26  # at 98 % expected, 26 or fewer of 30 come three times in a thousand
 
 
@@ -166,7 +168,7 @@ def test_a_mirror_image_and_pure_noise_are_refused() -> None:
     rng = np.random.default_rng(78)
     # Off the lattice: a lattice's mirror image has most of its places.
     places = LATTICE + rng.uniform(-0.3, 0.3, (12, 2))
-    known = build_pair_catalog(patch(places), MAGNITUDE)
+    known = pairs_of(patch(places), MAGNITUDE)
     for _ in range(5):
         seen, light, _, _ = observed(rng, patch(places), MAGNITUDE, mirrored=True)
         assert found(seen, light, known) is None
@@ -175,7 +177,7 @@ def test_a_mirror_image_and_pure_noise_are_refused() -> None:
 
 
 def test_saa_refuses_three_stars_and_an_uncertain_focal_length() -> None:
-    known = build_pair_catalog(patch(LATTICE), MAGNITUDE)
+    known = pairs_of(patch(LATTICE), MAGNITUDE)
     assert saa(patch(LATTICE[:3]), known, SIGMA_RAD) is None
     with pytest.raises(
         ImageError, match="saa: the focal length is uncertain; allowed: a calibrated camera"
@@ -215,22 +217,21 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
         )
 
     home = calibrate(
-        [frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever, sine=True
+        [frame(stop) for stop in range(5) for _ in range(20)], camera, ball, lever
     )
-    known = build_pair_catalog(home.vectors, home.brightness)
+    known = pairs_of(home.vectors, home.brightness)
     named = 0
     for stop in np.repeat(np.arange(5), 8):
         seen = frame(stop)
         order = np.argsort(-seen.brightness)
-        point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever, sine=True)
+        point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever)
         rays = unit(point + lever.camera_body_m)
         match = saa(
             rays,
             known,
-            3 * home.epsilon_pos_rad,
+            3 * home.epsilon_pos_m / 1.2192,
             magnitude=seen.brightness[order],
             epsilon_mag=home.epsilon_mag,
-            epsilon_sep_rad=home.epsilon_sep_rad,
         )
         if match is not None:
             assert (home.id[match.star] == order[match.observed]).all()

@@ -133,7 +133,7 @@ def test_nine_stars_on_a_screen_are_identified_by_their_master_star() -> None:
 def test_six_of_the_nine_are_enough_but_not_without_the_master() -> None:
     # NPS matched "about six stars out of the total nine". The thesis's criticism: all rests on the brightest.
     rng = np.random.default_rng(121)
-    found = np.zeros(3)
+    found = np.zeros(2)
     for _ in range(40):
         stars = screen(rng)
         seen, _ = observe(rng, stars, 20 * ARCSEC_RAD)
@@ -143,10 +143,8 @@ def test_six_of_the_nine_are_enough_but_not_without_the_master() -> None:
         headless = np.vstack([strays[:1], seen[1:]])
         found[0] += master_star(few, index, TOLERANCE_RAD) is not None
         found[1] += master_star(headless, index, TOLERANCE_RAD) is not None
-        found[2] += master_star(headless, index, TOLERANCE_RAD, masters=2) is not None
     assert found[0] >= 30
     assert found[1] <= 4
-    assert found[2] >= 34
 
 
 def test_nine_stars_of_another_screen_or_a_mirror_are_refused() -> None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration.star_field import disagreement_px
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Truth
@@ -25,6 +24,7 @@ from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import build_lab
 from skysim.tracking.onboard_model import calibration
+from tests.helpers.lens_and_streak import disagreement_px
 from tests.helpers.two_samples import histogram_p
 
 SIDE_PX = 700
