@@ -8,7 +8,9 @@ from setuptools.command.build_py import build_py
 
 CARRIED = ("scenes", "data")
 BUILT = "hipparcos_hp[7-9]*", "gaia_v[!8]*"  # catalogs that a user has built
-LEFT = shutil.ignore_patterns("__pycache__", "*.py", *BUILT)
+# Scripts that made some of the data.
+SCRIPTS = "build.py", "find_missing.py"
+LEFT = shutil.ignore_patterns("__pycache__", *SCRIPTS, *BUILT)
 
 
 class BuildWithData(build_py):

@@ -23,8 +23,6 @@ only. It includes neither errors of the believed positions nor the bias of the m
 raise ValueError if the rays do not determine an attitude.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import cv2

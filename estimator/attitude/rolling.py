@@ -7,8 +7,6 @@ of the rate. The Jacobian of a tangent is J_i exp(-[w] t_i) by a small rotation 
 error is that of `rate.error_gain`.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ minimize sum(w |cam - A ref|^2), w = 1 / sigma^2, over all stars. Their results 
 vectors (`wahba.refine`), so that they agree to the last digits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

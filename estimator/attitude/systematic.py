@@ -11,8 +11,6 @@ with G_i = S J_i^T / sigma_i^2 and S = [sum_i J_i^T J_i / sigma_i^2]^-1 (`respon
 - sum_m w_m w_m^T, w_m = sum_i G_i e_mi, for errors m that all rays share (`from_common`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

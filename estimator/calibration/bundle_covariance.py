@@ -3,8 +3,6 @@
 Only the diagonal blocks of lights and attitudes are computed, and the block of lever and lens.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

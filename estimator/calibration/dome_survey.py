@@ -28,8 +28,6 @@ then wrong by about 0.1 percent, whatever the number of lights. The start map co
 measurement (leds_sigma_m): each of its positions is inaccurate, but there are many.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

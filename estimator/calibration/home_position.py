@@ -10,8 +10,6 @@ takes these steps:
 3. Average positions and brightness for the catalog.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

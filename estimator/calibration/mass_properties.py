@@ -22,8 +22,6 @@ to the covariance of the parameters (`considered`).
 In flight `filter_mass` estimates the same parameters by an extended Kalman filter.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -20,8 +20,6 @@ by the square of the field angle, and k2 and k3 resemble k1 over a narrow field.
 (`LensPrior`) constrains them. Along such directions errors of the lens and of the attitudes can cancel in the pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol

@@ -10,8 +10,6 @@ A fault is reported only if chance would make it in fewer than FALSE_ALARMS surv
 together (Bonferroni: each of N LEDs is tested at FALSE_ALARMS / N).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

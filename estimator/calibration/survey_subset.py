@@ -1,7 +1,5 @@
 """Connected subset of a dome survey: the lights and frames that the sightings determine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its differe
 point plus the star's color term, which is unknown but constant.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

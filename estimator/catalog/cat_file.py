@@ -11,8 +11,6 @@ layout of PTASE's files is unpublished; this one has the same fields and cannot 
 The ten 16-bit words of an entry add up to 0 modulo 2^16. A unit of an angle is 0.3 milliarcseconds.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -7,8 +7,6 @@ This code is independent of the simulator's. It uses a two-term formula with the
 low-precision sidereal time and precession; the simulator integrates the refraction along the ray, and has nutation.
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, replace

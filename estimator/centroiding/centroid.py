@@ -7,8 +7,6 @@ blob that the model does not fit keeps its center of gravity.
 All centroiders have the parameters of `cog`, and raise ImageError for unusable ones (`prepare`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

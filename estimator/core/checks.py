@@ -5,8 +5,6 @@ arrays and numbers to the one type for which the loops are compiled: a Fortran-o
 array, or an int in place of a float, would cause a compilation of seconds.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Iterable, Mapping

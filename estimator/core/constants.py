@@ -3,8 +3,6 @@
 They are kept apart from the simulator's on purpose: an error in one is not hidden by the other.
 """
 
-from __future__ import annotations
-
 import datetime
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The error of the estimator's users."""
 
-from __future__ import annotations
-
 
 class ImageError(ValueError):
     """The image or the calibration cannot be used. The one printable line names the fault and what is allowed."""

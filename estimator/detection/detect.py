@@ -15,8 +15,6 @@ Every detector has the parameters
 and raises ImageError for an image that cannot be used (see `check_image`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

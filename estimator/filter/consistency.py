@@ -4,8 +4,6 @@ The checks cover standard deviations, gyro samples and covariances; every error 
 a jump: is the filter wrong, because the gyros missed a motion, or are the solutions that contradict it?
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -7,8 +7,6 @@
 A solution that the filter adopts after a jump replaces the attitude instead (`adopt`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Error models of the gyro, of the star tracker, and of jumps. A standard deviation of 0 removes its state."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

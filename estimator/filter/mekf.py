@@ -22,8 +22,6 @@ its discrete transition; Markley & Crassidis, Fundamentals of Spacecraft Attitud
 6.2, for scale factors and misalignments; Schmidt 1966 (Advances in Control Systems 3, 293) for considered states.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """What to change if an identifier refuses a field: each refusal names the setting that would help."""
 
-from __future__ import annotations
-
 from math import inf
 
 from estimator.identification.chance import MIN_MATCHES

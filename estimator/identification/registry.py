@@ -4,8 +4,6 @@ Each algorithm is a function of rays, a pair index, a tolerance and the keywords
 the match or None. The tracker verifies a match with the whole field (`trackers.refinement`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

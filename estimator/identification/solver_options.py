@@ -4,8 +4,6 @@ The published methods need different things: a magnitude, a prior direction, a t
 keywords, of which each method uses some, so that one method can replace another.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -11,8 +11,6 @@ For each frame:
 A frame without enough bits, or whose lights contradict each other, has no attitude.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

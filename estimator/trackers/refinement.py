@@ -11,8 +11,6 @@ From a candidate attitude, `FieldMatcher.refine` takes these steps:
 `misfits` uses the same predictions to find whether the camera model explains the whole field or only a part of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

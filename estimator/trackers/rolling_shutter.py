@@ -13,8 +13,6 @@ Every stage of the tracker therefore works on lights of one time, and its tests 
 valid.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Searches of the star tracker: error models and efforts, tried in turn until one gives an attitude."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from estimator.identification.star_search import WRONG_FOCAL

@@ -7,8 +7,6 @@
 4. If that fails, or the last attitude is too old, solve the whole frame lost in space.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from enum import IntFlag
 from math import log10, pi

@@ -6,8 +6,6 @@ detector's sums, a square that no model fits, too few lights, and a mirrored sky
 end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -10,8 +10,6 @@ A large disc (`disc_image`) is a star's image convolved with a map of the disc's
 4. `convolved` adds the s^2 discrete convolutions of image and map at equal phase.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 Each effect is linear in the difference dT from the reference temperature, at which the set-up was surveyed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

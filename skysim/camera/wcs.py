@@ -1,7 +1,5 @@
 """World coordinate system of the frames for FITS: gnomonic projection, lens distortion as SIP polynomials."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

@@ -4,8 +4,6 @@ The estimator has its own constants (`estimator/core/constants.py`), so that an 
 and epochs are in `skysim/core/time.py`. A number that only one formula uses is defined next to the formula.
 """
 
-from __future__ import annotations
-
 import math
 
 # Fundamental: exact by the definition of the SI (BIPM 2019; CODATA 2018).

@@ -6,8 +6,6 @@ decodes a WebP to open it, does not open TIFF files of 64-bit floats and uses th
 uses the first.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

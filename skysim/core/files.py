@@ -1,7 +1,5 @@
 """Atomic writes of files and folders, tables, images and JSON."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

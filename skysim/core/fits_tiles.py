@@ -3,8 +3,6 @@
 Arguments: the file, the number of the image's HDU or `raw`, and the .npy file to write.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 

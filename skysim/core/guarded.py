@@ -4,8 +4,6 @@ The child is `python -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`
 the script as a file, without the packages that contain it.
 """
 
-from __future__ import annotations
-
 import os
 import runpy
 import signal

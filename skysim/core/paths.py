@@ -3,8 +3,6 @@
 Commands that only list files need these and no library: the module imports neither NumPy nor OpenCV.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -10,8 +10,6 @@ of JSON:
 An entry point also runs in its own process, where `serve` answers; its output goes to standard error.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -5,8 +5,6 @@ stage. It is NumPy's `SeedSequence(seed, spawn_key=key)`: streams of different k
 earlier draws. Any frame therefore renders the same on its own, and a new kind of noise does not change the others.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 # First number of the key under a scene's seed; the second is the frame, if each frame has its own draws.

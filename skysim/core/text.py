@@ -3,8 +3,6 @@
 Errors name the line of the fault.
 """
 
-from __future__ import annotations
-
 import datetime
 import re
 import warnings

@@ -6,8 +6,6 @@ TT also serves as TDB: they differ by less than 2 ms, in which the Moon moves by
 by 0.01 mm/s. Sources: IERS Conventions 2010, chapter 10; IS-GPS-200.
 """
 
-from __future__ import annotations
-
 import datetime
 from functools import lru_cache
 

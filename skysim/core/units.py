@@ -5,8 +5,6 @@ is a bare number ends in its unit (`tilt_stop_deg: 30`). In Python the former ha
 (`camera.focal_length_m`), so every name shows its unit.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -8,8 +8,6 @@ duplicate keys are rejected (`reject_duplicate_keys`). `explain` makes the error
 3. Find the line of that key in the file that defines it (`where_of`).
 """
 
-from __future__ import annotations
-
 import copy
 import datetime
 import difflib

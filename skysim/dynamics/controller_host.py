@@ -3,8 +3,6 @@
 It speaks the protocol of docs/howto/controller.md.
 """
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from typing import IO, Any

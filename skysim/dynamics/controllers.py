@@ -9,8 +9,6 @@ names it and it runs in a process of its own. A program behind a pipe exchanges 
 docs/howto/controller.md has examples.
 """
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Callable, Mapping

@@ -8,8 +8,6 @@
 4. Return the torque that they can give to the law, for its anti-windup.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

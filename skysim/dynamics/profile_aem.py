@@ -18,8 +18,6 @@ recommends.
 4. `join` appends them to each other.
 """
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import replace
 from pathlib import Path

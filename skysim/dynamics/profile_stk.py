@@ -5,8 +5,6 @@ axes of CoordinateAxes into those of the body. It converts coordinates from body
 seconds from ScenarioEpoch (UTC). The interpolation that the file names is not used.
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Iterable
 from dataclasses import replace

@@ -10,8 +10,6 @@ attitude : a quaternion `A_from_B_qw`, `_qx`, `_qy`, `_qz` of one of the rotatio
            camera
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Mapping, Sequence
 from pathlib import Path

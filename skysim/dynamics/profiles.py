@@ -7,8 +7,6 @@
 5. `reference_curves.fit_spline` interpolates them.
 """
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import replace
 from pathlib import Path

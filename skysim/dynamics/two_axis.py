@@ -8,8 +8,6 @@ lock. There the azimuth does not move the boresight, and beside it a light's pat
 rate over sin(elevation).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

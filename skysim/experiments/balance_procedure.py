@@ -6,8 +6,6 @@ center. The gravity torque is at most g |m r|. The vehicle is balanced if this p
 bar.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import NamedTuple

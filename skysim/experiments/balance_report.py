@@ -1,7 +1,5 @@
 """Statistics, picture and report of a balance: the estimates by flight beside the simulated vehicle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

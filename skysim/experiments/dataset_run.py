@@ -5,8 +5,6 @@ A shard is complete when its index, the last of its files, exists. The workers w
 continues: frames that are made again have the same bytes.
 """
 
-from __future__ import annotations
-
 import json
 import tarfile
 import time

@@ -1,7 +1,5 @@
 """The files of one shard: a tar of frames and labels (WebDataset), COCO JSON, part of a Zarr array, Parquet tables."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

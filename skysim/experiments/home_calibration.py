@@ -14,8 +14,6 @@ The vehicle is held at several attitudes (stops), and each frame shows the same 
 LEDs are named by the predicted image of the assumed dome at the IMU's attitude, so the truth is not used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Compare trackers on the same frames, scored by the same code."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass

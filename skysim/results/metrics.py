@@ -7,8 +7,6 @@ quantiles. That of a mean NEES is of a chi-square variable. Clopper and Pearson'
 where a claim must hold: that an event never occurs (or always), or that a proportion is on one side of a limit.
 """
 
-from __future__ import annotations
-
 import bisect
 import math
 import re

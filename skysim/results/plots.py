@@ -1,7 +1,5 @@
 """Plot style shared by all figures (colors, lines, markers), and rendering of a figure to PNG."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

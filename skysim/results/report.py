@@ -3,8 +3,6 @@
 It prints as a self-contained HTML page, as Markdown with its figures beside it, and as text on a terminal.
 """
 
-from __future__ import annotations
-
 import base64
 import math
 import re

@@ -3,8 +3,6 @@
 Texts are plain, but for parts in `backticks`, which are code. They may come from outside: the writers escape them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

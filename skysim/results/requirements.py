@@ -13,8 +13,6 @@ without a miss show a 95 % quantile, 2,995 without an event a probability of 0.0
 or all points of a study, are met holds at 95 % if each does (Berger 1982).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

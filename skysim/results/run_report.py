@@ -1,7 +1,5 @@
 """The report of a run: what was solved and how well, pictures, the scene, and every frame."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

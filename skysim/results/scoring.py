@@ -1,7 +1,5 @@
 """Compare the tracker's solution of each shot with the truth, as rows and tables of numbers."""
 
-from __future__ import annotations
-
 import html
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Run a scene from Python: `simulate` is the equivalent of `skysim run` and `render` of `skysim render`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Summary, tables and plots of a run's telemetry: true motion, estimates, commands and actuator states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

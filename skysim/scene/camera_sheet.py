@@ -5,8 +5,6 @@ types; a number that the data sheet does not state is assumed. The file is a pre
 comment: [S1] if the data sheet states it, otherwise `assumed` with the reason.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping

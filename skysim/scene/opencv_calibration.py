@@ -1,7 +1,5 @@
 """Camera calibrations in OpenCV's YAML format: read them with checks, and write them for OpenCV."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

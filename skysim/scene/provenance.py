@@ -5,8 +5,6 @@
 3. Mark the keys that have no effect (unused.py).
 """
 
-from __future__ import annotations
-
 import datetime
 import functools
 import math

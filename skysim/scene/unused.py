@@ -7,8 +7,6 @@ are tolerated. So are keys of the file that only an override makes useless, and 
 Studies have further rules (experiments/study/unused_options.py), which `find` searches in the same way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any

@@ -5,8 +5,6 @@ Keys that have a use outside of a run have no rule: the time tags of frames and 
 results, and limits of actuators, which other controllers and the exported model obey.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -10,8 +10,6 @@ and estimator share no compiled function, so two processes can compile them at o
    from numba's cache.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence

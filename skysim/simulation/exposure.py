@@ -9,8 +9,6 @@
 6. Collect the truth of the frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace

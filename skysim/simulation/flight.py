@@ -8,8 +8,6 @@
 3. With a filter the solution updates the attitude that the controller may use in the next period.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ give. `Motion.advance` simulates a control period:
 6. The IMU samples the motion with its vibration, and the navigation takes the samples.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Timing of a scene's frames: exposure windows, trigger jitter, time tags, and the duration of the motion."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 

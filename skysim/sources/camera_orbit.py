@@ -1,7 +1,5 @@
 """The camera's place: its orbit or its site in GCRS axes at any time of a run, and what the Earth hides from it."""
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Callable
 from dataclasses import dataclass

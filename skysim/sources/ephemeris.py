@@ -4,8 +4,6 @@ Positions are Chebyshev series fitted to JPL's DE423, made by `data/ephemeris/bu
 as seen from the Earth, over 1972 to 2100.
 """
 
-from __future__ import annotations
-
 import datetime
 from functools import lru_cache
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Availability of a star tracker in orbit: exclusion angles of Sun, Earth and Moon, and stars in view."""
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Callable
 from typing import Literal, NamedTuple

@@ -6,8 +6,6 @@
 3. Its magnitude follows from range, phase angle and the fraction of the Sun that it sees (`magnitude`).
 """
 
-from __future__ import annotations
-
 import datetime
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Star catalog files from the archives: Hipparcos-2 at J1991.25 with a supplement, and Gaia DR3 at J2016.0."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable
 from pathlib import Path

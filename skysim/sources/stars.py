@@ -1,7 +1,5 @@
 """Catalog stars as sources: apparent directions at a date, and photo-electrons per square meter of the aperture."""
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import replace
 from typing import Any

@@ -6,8 +6,6 @@ The first two factors are the cycles that were counted here; cycles_factor is th
 the same work (fewer instructions at once, smaller caches, another language). Times differ from run to run.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

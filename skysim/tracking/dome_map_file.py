@@ -1,7 +1,5 @@
 """Read and write the dome map that `skysim survey` measures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ StarTracker under stars, ExternalTracker for an external tracker. Each gets the 
 the settings (`assumed_settings`) that the tracker assumes, which may differ from the simulated hardware.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any

@@ -7,8 +7,6 @@
 4. `attitude_wxyz` and `body_rate_rad_s` are the estimates that the controller gets.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Functions `assumed_...` return the model of a scene. `OrbitStarTracker` is the tracker in an orbit.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

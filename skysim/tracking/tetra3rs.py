@@ -12,8 +12,6 @@ limit_mag
     Limiting magnitude of its catalog; if left out, it takes as many stars as the field needs
 """
 
-from __future__ import annotations
-
 import datetime
 from typing import Any
 

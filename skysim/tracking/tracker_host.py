@@ -3,8 +3,6 @@
 It speaks the protocol of docs/howto/external_tracker.md.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ process, so a hang or a crash becomes a failed answer and does not end the run. 
 answers each frame with a line of JSON; no file can name a command. docs/howto/external_tracker.md has examples.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

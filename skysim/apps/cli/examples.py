@@ -1,7 +1,5 @@
 """Examples of every command, at the end of its `--help` and in docs/reference/command_line.md."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import typer

@@ -5,8 +5,6 @@ version), because an editor does not know which keys come from a `base` or a pre
 missing keys.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

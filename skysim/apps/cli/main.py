@@ -1,7 +1,5 @@
 """Entry point of the command line: registers the commands and turns user errors into one line on stderr."""
 
-from __future__ import annotations
-
 import gc
 import sys
 from typing import Annotated

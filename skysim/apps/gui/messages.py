@@ -2,8 +2,6 @@
 
 NiceGUI writes arrays as JSON, with null for NaN."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """HTTP server of the GUI: routes, and an access check in front of all of them."""
 
-from __future__ import annotations
-
 import asyncio
 import ctypes
 import gc

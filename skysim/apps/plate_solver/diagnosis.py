@@ -4,8 +4,6 @@ Causes are tested from the most certain to the vaguest. Two are tested by solvin
 view. Such a solution only shows the cause; it is never the answer.
 """
 
-from __future__ import annotations
-
 import datetime
 import functools
 import math

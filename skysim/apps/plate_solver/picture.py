@@ -1,7 +1,5 @@
 """Load a picture in the orientation of viewing, solve the hypotheses about it, and diagnose a refusal."""
 
-from __future__ import annotations
-
 import datetime
 import math
 import time

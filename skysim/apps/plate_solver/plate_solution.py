@@ -1,7 +1,5 @@
 """What a solved plate says: pointing, attitude, lens, matched stars; as fields, as a table, and as a FITS header."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any

@@ -7,8 +7,6 @@ found in binned pixels joins them. Each retry counts as EXTRA_TRIES tries, so al
 no more than two hundredths to the accepted chance of a false match. They use the quick searches.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from math import hypot

@@ -4,8 +4,6 @@ The simulation thread posts each packet to the `FrameHub`; each client has a thr
 variable and takes the newest packet. A slow client skips packets and does not delay the simulation or other clients.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import threading

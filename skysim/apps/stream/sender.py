@@ -1,7 +1,5 @@
 """Real-time sender: renders a scene's frames when they are due, drops late ones, and sends them to sinks."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Each is a surface brightness in nanolamberts by empirical laws: Krisciunas & Sch
 Schaefer 1998, Sky & Telescope 95, 57.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A black pixel gives 1 / contrast of a white one. The radiance of a white display
 kind of display; times that fraction and the etendue of a camera pixel it is the glow.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Earth's light as seen from an orbit: its lit side, the air above its limb, the airglow, and stray light."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -13,8 +13,6 @@ Glare is light that rough or dirty surfaces scatter over the chip (`add_glare`).
 that it scatters (`wall_glow`), and LEDs are mirrored in it (`mirror.mirrored`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import lru_cache

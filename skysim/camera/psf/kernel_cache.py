@@ -5,8 +5,6 @@ defocus disk) are the key of a kernel in the camera's cache. Disks that are visi
 in each exposure (psf/ellipse.py); they share the tables of their box.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ to Fourier Optics, ch. 6). Those of the lens are in PSFS, by the scene's `camera
 `skysim.camera.psf.kernel` multiplies them into an image that `skysim.camera.psf.splat` adds to a frame.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import lru_cache

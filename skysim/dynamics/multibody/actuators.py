@@ -4,8 +4,6 @@ A new kind is a file beside this one, an entry in `KINDS`, and its section in sc
 vehicle places the actuators by the names of joints and sites; the scene sets their limits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

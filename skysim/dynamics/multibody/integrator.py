@@ -8,8 +8,6 @@ MuJoCo computes the multibody dynamics and integrates them by the fourth-order R
 3. Raise an error if MuJoCo warned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import mujoco

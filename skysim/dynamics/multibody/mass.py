@@ -8,8 +8,6 @@
    joint, and the joint is removed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,6 @@ A file is not trusted, since MuJoCo itself would read any file that it names. `l
 3. MuJoCo reads it.
 """
 
-from __future__ import annotations
-
 import itertools
 import os.path
 from collections.abc import Iterator

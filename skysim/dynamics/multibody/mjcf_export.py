@@ -5,8 +5,6 @@ MuJoCo's viewer: 0 vehicle, floor and pedestal; 1 dome and LEDs or stars; 2 the 
 the tilt stop.
 """
 
-from __future__ import annotations
-
 import ctypes
 import re
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ error and reports it. After such an error it compiles again without joints, sinc
 MuJoCo rejects.
 """
 
-from __future__ import annotations
-
 import sys
 from contextlib import suppress
 from typing import Any

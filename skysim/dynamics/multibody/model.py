@@ -14,8 +14,6 @@
 angular rate in body axes.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures and animations of the laboratory, which MuJoCo renders without a screen."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -1,7 +1,5 @@
 """The geometry of an MJCF file as plain shapes, for drawing programs other than MuJoCo's."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import mujoco

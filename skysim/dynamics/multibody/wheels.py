@@ -9,8 +9,6 @@ Rotors do not follow the body's rotation about their axles, so the inertia that 
 J - sum inertia axle axle^T.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

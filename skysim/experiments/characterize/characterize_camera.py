@@ -1,7 +1,5 @@
 """Make a camera preset from folders of frames: read and check them, estimate its values, write preset and report."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from functools import partial

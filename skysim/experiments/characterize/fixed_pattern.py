@@ -12,8 +12,6 @@ includes the scatter of a chip's pixels (Rao 1973, Linear Statistical Inference,
 pixels H is not fitted, and h is their fraction, with the interval of Clopper & Pearson (1934).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

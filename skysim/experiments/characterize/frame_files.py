@@ -5,8 +5,6 @@ temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or
 `2s`, `-5C` between other words, as in `dark_100ms_-5C_03.tif`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A sensor from its levels of darks and flats: every parameter of the detector with its interval."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import compress

@@ -4,8 +4,6 @@ A field is a replicate: a random attitude, the same in all cells with the same `
 thermal state, attitude and noise by number, so that terms can be separated and causes compared on the same frames.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The report of a datasheet: its sections with their figures, which are also written as files."""
 
-from __future__ import annotations
-
 import csv
 import math
 import shlex

@@ -1,7 +1,5 @@
 """Fit the constants of the error model (`error_model`) to the frames of a datasheet, test the fit, and write it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from importlib.util import find_spec
@@ -14,6 +12,7 @@ from scipy import stats
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, to_json, write_text
+from skysim.core.paths import DATA
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet.cells import MIN_FIELDS, MODEL_FIELDS, MeasuredFrames
@@ -347,7 +346,7 @@ def write_fmu(folder: Path) -> Path:
     from pythonfmu3.builder import FmuBuilder
 
     script = folder / "fmu_slave.py"
-    write_text(script, (HERE / "fmu_slave.py").read_text(encoding="utf-8"))
+    write_text(script, (DATA / "fmu" / "fmu_slave.py").read_text(encoding="utf-8"))
     return Path(
         FmuBuilder.build_FMU(
             script, dest=folder, project_files=[folder / MODULE, folder / CONSTANTS]

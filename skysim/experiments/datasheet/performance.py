@@ -1,7 +1,5 @@
 """Performance of a tracker: probabilities with exact bounds, quantiles, and limits in rate, acceleration, magnitude."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import Any, NamedTuple

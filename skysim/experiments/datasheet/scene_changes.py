@@ -6,8 +6,6 @@ Each krad adds dark current and hot pixels and takes light. What a dose does dep
 glass, so the defaults are assumptions, which the sheet marks: give the numbers of a test.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any
 

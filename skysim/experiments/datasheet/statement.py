@@ -1,7 +1,5 @@
 """The statement of a datasheet: what was measured, as numbers for JSON and as sections of tables for pages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

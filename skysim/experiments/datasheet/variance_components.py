@@ -8,8 +8,6 @@ All terms are estimated without bias, and their sum is the mean square of the de
 slightly negative where it is smaller than its error.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -8,8 +8,6 @@ repeated with the improved values. LEDs that are found far from their place in t
 were found. The result is a `DomeMap`, the file that `tracker.map` reads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

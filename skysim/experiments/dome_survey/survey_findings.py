@@ -1,7 +1,5 @@
 """Findings of a survey: the LEDs measured and their errors, the attitudes to hold next, and faults of the dome."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Frames of a survey: the lights of each and the IMU's attitude, rendered at planned stops or read from files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ attitudes: columns file, roll_deg, pitch_deg, yaw_deg (the angles of `motion` in
 file are identified by the tracker with the list of LEDs, or with the survey of the other images.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The model that is assumed before a survey of the dome, and its uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The procedure of a survey: its plan with predicted errors, its simulation, and their comparison."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

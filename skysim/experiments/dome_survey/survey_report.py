@@ -1,7 +1,5 @@
 """The report of a survey: the dome from above, results with errors, faults, and the attitudes to hold next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """The report of repeated experiments: each published number beside ours, with a verdict."""
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Sequence

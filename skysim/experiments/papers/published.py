@@ -1,7 +1,5 @@
 """Published data: experiments as files that the user runs, their numbers with sources, and the papers' errors."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, Self

@@ -16,8 +16,6 @@ For a bound d is how far our number is beyond it, 0 on the allowed side, with t 
 where the bound is within 1.96 s of our number.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re

@@ -4,8 +4,6 @@ Misidentification (a light matched with a wrong star or LED) is separate from ro
 that the covariance allows). An event that was never seen has an upper bound instead of an interval.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ A study keeps a digest of each of them, so that trials of a changed function are
 the source code of the function, of what it calls in the user's own modules, and the values that it uses.
 """
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import io

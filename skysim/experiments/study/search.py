@@ -5,8 +5,6 @@ from rows in the store, so a resumed search proposes the same candidates again, 
 them. The result is the feasible candidate with the best objective or, with two objectives, the Pareto front.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

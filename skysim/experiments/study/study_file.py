@@ -1,7 +1,5 @@
 """Load a study file, validate it and make its plan."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Result tables of a study: one line per point with every response and its interval, and one row per trial."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -5,8 +5,6 @@ isotonic fit, linear between the levels, crosses the limit. The interval goes fr
 one side of the limit to the first level that is certainly on the other, so more levels between the two shorten it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from itertools import starmap

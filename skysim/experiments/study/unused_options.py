@@ -5,8 +5,6 @@ A key is refused if it has no effect at any level of any factor, each factor var
 bounds the exposure time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

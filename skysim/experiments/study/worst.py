@@ -1,7 +1,5 @@
 """The worst trials of a study by a response: where in the sky or in the dome they are, and which trials repeat them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple

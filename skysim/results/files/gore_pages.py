@@ -4,8 +4,6 @@ On sheets, a gore is no wider than a sheet, and as many sheets long as it takes.
 OVERLAP_MM with a registration mark at each side: lay one sheet's marks on the other's.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

@@ -7,8 +7,6 @@ controller lights one after another, or all the time, have a series resistor ins
 tape with a driver chip at each LED.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

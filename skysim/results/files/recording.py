@@ -1,7 +1,5 @@
 """Read the results folder of `skysim run` or `skysim render`, frame by frame."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import re

@@ -4,8 +4,6 @@ A part is a Parquet file of some hundred thousand trials, written once and never
 NaN or None in arrays. Trials are in the order of point and replicate, from which their numbers follow.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Export a finished run to the formats of other tools: CCSDS AEM, ECSV, Parquet, TIFF, Zarr, video."""
 
-from __future__ import annotations
-
 import datetime
 import itertools
 import os

@@ -12,8 +12,6 @@ along the directions that these equations give as seen from the bearing. At the 
 is longer than the surface by the factor 1 / cos(x / R), which `MAX_WIDTH_M` limits.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from html import escape

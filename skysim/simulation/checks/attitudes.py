@@ -4,8 +4,6 @@ The attitudes of the frames are those of the reference maneuver, or of a constan
 contain the run's jitter. The motion itself is not simulated.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

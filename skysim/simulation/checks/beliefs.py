@@ -4,8 +4,6 @@ The measured direction of a star differs from the believed one because of the ca
 the star's image, which displace its centroid (`response_px`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path

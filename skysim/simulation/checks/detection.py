@@ -6,8 +6,6 @@
 4. `centroid_variance` predicts the covariance of their centroids.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

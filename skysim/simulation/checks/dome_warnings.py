@@ -7,8 +7,6 @@ centroid); `layouts.ambiguity` tries the pairs and their rotations. The share of
 surveys of 0.05, 0.2 and 1 mm, under AFIT's camera (50 attitudes each).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -34,8 +34,6 @@ camera's position, so its J_i has three more columns. Errors of star places are 
    roll.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Each function in `FACTS` returns one fact from the plan, or None if the plan does not have it.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

@@ -4,8 +4,6 @@ Each function in `FINDINGS` returns one line, or an empty text if there is nothi
 another one explains the problem.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -8,8 +8,6 @@
 4. Do the same for each head, and combine the expected errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@
 only add light unknown to the tracker are left out.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Facts and warnings about a scene under the stars: refraction, bodies, errors, stray light, limiting magnitude."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Facts and warnings about the vehicle of a plan: mass properties, actuators, and the maneuver beside the exposures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from difflib import SequenceMatcher

@@ -4,8 +4,6 @@ Everything is computed for mid-exposure. The site rotates by 15" in a second, wh
 0.02" at an altitude of 15 deg.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Known lights: the LEDs of a dome or pixels of a panel, the stars of a collimated display, and stars of the sky."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple

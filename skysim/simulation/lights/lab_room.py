@@ -1,7 +1,5 @@
 """The laboratory around the lights: wall and floor that reflect them, and obstacles that hide them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial

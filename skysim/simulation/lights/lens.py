@@ -1,7 +1,5 @@
 """Effects of the lens and its baffle: stray light from outside the field, ghosts, and veiling glare."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ wall and lens change the lights before them. Lights are drawn in this order.
 package that an entry point of the group `skysim.lights` names (see scene/sections/light.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from typing import Any

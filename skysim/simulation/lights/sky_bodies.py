@@ -1,7 +1,5 @@
 """The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Stars of a catalog, as seen from the ground or from an orbit, and extended light of the scene's `background`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ display.py: stars on panels and projectors; interreflection.py and mirror.py: li
 survey_errors.py: what a survey of it all yields.
 """
 
-from __future__ import annotations
-
 from skysim.core.types import Sources
 from skysim.scene.sections import light
 from skysim.sources.dome.layouts.registry import LAYOUTS

@@ -25,8 +25,6 @@ References: Lin and Costello 2004, Error Control Coding, chapters 4 to 6; Gold 1
 Fredricksen and Maiorana 1978, Discrete Mathematics 23, 207 (De Bruijn sequences).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache, partial
 

@@ -5,8 +5,6 @@
    parallel beam, a source at infinity (`display_sources`); a projector lights a disk on the wall (`projector_sources`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 from typing import Any, NamedTuple

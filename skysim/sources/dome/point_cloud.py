@@ -8,8 +8,6 @@ The points are those of a measuring arm.
 3. `fit_ellipsoid` gives the nearest ellipsoid, for estimators that model no other surface.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ one, `thickness` outside. The rim and the apex are among the samples, and betwee
 shell bulges by 1.5e-4 of its radius at most.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ in closed form for planes and quadrics (`exit_distance`), by safeguarded Newton 
 direction (`Radial`). SURFACES maps the scene's `light.surface.kind` to the function that builds the surface.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The errors are drawn once, from their own seed (`tracker.survey.seed`), because 
 and not noise of a frame. Each kind of error has its own random stream, so adding one leaves the others unchanged.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

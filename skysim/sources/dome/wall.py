@@ -1,7 +1,5 @@
 """Area and volume of a dome's formed wall."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Command `skysim dataset`."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Commands `skysim scenes`, `new` and `export`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Command `skysim survey`: plan the survey of a dome, simulate it, or make it from images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """The modes of `skysim survey`: plan, repeat, simulate, and survey from images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace

@@ -4,8 +4,6 @@
 will show and how accurate its tracker will be.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 from pathlib import Path

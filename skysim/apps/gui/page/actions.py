@@ -1,7 +1,5 @@
 """Actions of the user, by keys or by a palette (Ctrl-K, F1) that lists all actions and filters them by typed text."""
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple

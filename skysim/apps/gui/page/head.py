@@ -1,7 +1,5 @@
 """The head of the page: its scene, the banner, messages, noise, identification, and export."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from nicegui import ui

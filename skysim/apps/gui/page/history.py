@@ -4,8 +4,6 @@ The browser's history serves for undo and redo: Ctrl-Z goes back, Ctrl-Shift-Z f
 shared link and undo all read a view from the address in the same way.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Awaitable, Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Log panel: the events of this session, and a table of the identifications as CSV."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

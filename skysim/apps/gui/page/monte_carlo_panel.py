@@ -1,7 +1,5 @@
 """Monte Carlo panel: start and stop studies, show statistics and histogram while they run, replay failed trials."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time

@@ -1,7 +1,5 @@
 """Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for a refusal."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The tracker's results on the frame: the card of its attitude, and the table of its lights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Run panel: computes the scene's flight in the worker, and plays, scrubs and steps through its frames."""
 
-from __future__ import annotations
-
 import asyncio
 import bisect
 import time

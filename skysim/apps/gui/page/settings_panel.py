@@ -1,7 +1,5 @@
 """Scene panel, a form of all keys of the scene; Tracker panel, a form of those of image processing and tracker."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

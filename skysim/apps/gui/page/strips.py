@@ -1,7 +1,5 @@
 """Strip charts of a flight: curves against a common time axis, one chart above the other, with a shared cursor."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The page of a browser tab: builds its parts, opens scenes, and shows frames in all views."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 import time

@@ -1,7 +1,5 @@
 """The interface of the page for its parts. The page implements it; no part imports the page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Protocol
 

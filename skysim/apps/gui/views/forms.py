@@ -1,7 +1,5 @@
 """A scene's keys as form fields, derived from the schema: value, unit and allowed values of each."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache

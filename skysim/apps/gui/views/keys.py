@@ -1,7 +1,5 @@
 """Keyboard map and its help, with the keys of PTASE where it has them (Fialho & Saotome 2005, section 3.1)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from nicegui import ui

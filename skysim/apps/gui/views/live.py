@@ -5,8 +5,6 @@ contents are sent with the frame's pixels, and the browser sets them when it dra
 are sent in a message.
 """
 
-from __future__ import annotations
-
 import asyncio
 import csv
 import io

@@ -1,7 +1,5 @@
 """Sensor view: the newest frame with its marks, its display settings, and data on the light under the mouse."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import functools

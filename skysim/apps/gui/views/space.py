@@ -3,8 +3,6 @@
 A drag pulls at a point of the vehicle; frames show the motion.
 """
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Colors and CSS of the page. Sizes are fixed where changing content would otherwise shift the layout."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

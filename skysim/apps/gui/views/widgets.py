@@ -1,7 +1,5 @@
 """Small elements in the style of the page that the panels share: rows, buttons, texts, lists, numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """3-D geometry of the laboratory, as numbers for the browser to draw."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Export of the image on the page as files: frame, truth, solution, scene."""
 
-from __future__ import annotations
-
 import tempfile
 import zipfile
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Solves images that are not of the current scene: uploaded files, a live camera's frames, a study's trials."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """A scene's flight: its motion and all its frames, computed piece by piece and kept for playback."""
 
-from __future__ import annotations
-
 import math
 import pickle
 import tempfile

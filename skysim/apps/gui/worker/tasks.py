@@ -1,7 +1,5 @@
 """Tasks of a worker process: methods of `Worker`, called by name, which keeps its state between them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

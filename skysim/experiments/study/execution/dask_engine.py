@@ -4,8 +4,6 @@ Scheduler and workers need this version of skysim. Each worker should be a proce
 `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 dask worker ADDRESS --nworkers 8 --nthreads 1`
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import time

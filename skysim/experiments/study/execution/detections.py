@@ -5,8 +5,6 @@ with the first frame that the tracker solves. Its result is that of its last fra
 follows from its code and from its drive's pulses in the exposure, with photon noise and FLUX_NOISE.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from typing import NamedTuple

@@ -4,8 +4,6 @@ All engines produce identical rows. What they run is a `Job`: trials of a study 
 that is divided into numbered items.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """Run the missing trials of a study: chunks of trials go to an engine, and rows are stored as they arrive."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import time

@@ -1,7 +1,5 @@
 """Prepared labs and trackers for trials, cached per worker; hashes and seeds that record a row's origin."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping

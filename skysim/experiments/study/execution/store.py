@@ -11,8 +11,6 @@ changed. They hold point and replicate, from which the trial's number follows, s
 grows. All methods of `Store` treat the rows of both as one table.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sqlite3

@@ -3,8 +3,6 @@
 A trial depends only on its specification, design point and seed, not on the order of trials or the worker.
 """
 
-from __future__ import annotations
-
 import math
 import time
 import traceback

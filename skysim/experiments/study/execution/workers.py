@@ -1,7 +1,5 @@
 """Fork server of the process pool: it imports everything a trial needs once, and workers are forked from it."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 from collections.abc import Iterator, Mapping

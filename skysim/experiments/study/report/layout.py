@@ -4,8 +4,6 @@
 no two share a level, so they are not grouped by level but shown as points, with running medians where there are many.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Maps of a study: a response over the directions of the random attitudes, in cells of about equal solid angle."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Sequence

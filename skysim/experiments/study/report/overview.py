@@ -1,7 +1,5 @@
 """The first part of a study's report: its scene as a table, and the findings of the scene's checks."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """Export a study's results for other tools: CSV, Parquet and Zarr, and as an xarray dataset."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 from collections.abc import Callable

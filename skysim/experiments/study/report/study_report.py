@@ -1,7 +1,5 @@
 """The report of a finished or unfinished study: answers, figures and tables, made from its plan and its store."""
 
-from __future__ import annotations
-
 import itertools
 import shlex
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Patch boards: 3x3 LED boards glued to the surface, spread evenly, on a grid, or listed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The list of a dome's LEDs for its builder, as a CSV file that `layout: {kind: listed, file: ...}` reads back."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

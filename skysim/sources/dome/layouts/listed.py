@@ -1,7 +1,5 @@
 """LEDs by list: places in the lab or directions from the bearing, from the scene or from a CSV file."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Parts that all layouts share: directions from the bearing, their places on the surface, LEDs as light sources."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

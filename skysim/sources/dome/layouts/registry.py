@@ -4,8 +4,6 @@ The real sky, and three kinds that take the points of another layout (fibers, pa
 the others in their own modules.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

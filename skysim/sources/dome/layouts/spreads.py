@@ -1,7 +1,5 @@
 """Spreads of single LEDs over the cap: Fibonacci spiral, random, Poisson disk, optimized, geodesic sphere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any

@@ -11,8 +11,6 @@ short by (2 pi / STEPS_PER_TURN)^2 / 24 of their length, 3e-6.
 3. An LED every pitch along each tape, with the errors of pitch and glue (`wind`, `aside`).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import NamedTuple
