@@ -4,8 +4,6 @@
 fits the focal length.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

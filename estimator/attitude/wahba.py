@@ -18,8 +18,6 @@ The tracker's own solution (`wahba`) takes three steps:
 3. Refine the rotation on the vectors, and compute its covariance (`refine`, `attitude_covariance`).
 """
 
-from __future__ import annotations
-
 from math import isfinite, sqrt
 
 import numpy as np

@@ -13,8 +13,6 @@ lists give the stars at a given separation from one star: for each star they hol
 sorted by separation, and are searched by bisection (`first_neighbor`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -19,8 +19,6 @@ gives 59,410 pairs within 18.57 deg, compared with their 54,804, and 183 stars b
 thinning).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

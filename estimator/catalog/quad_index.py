@@ -17,8 +17,6 @@ negative, and C is the one with the smaller first number.
 4. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

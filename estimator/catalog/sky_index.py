@@ -21,8 +21,6 @@ the box of that half-width about the direction. Cells adjacent in z are adjacent
 is one loop.
 """
 
-from __future__ import annotations
-
 from math import pi, sqrt
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ edge blurred by a Gaussian of width w. Gauss-Newton solves for center, R, w, A a
 edge determine the position, so saturated pixels inside can be left out.
 """
 
-from __future__ import annotations
-
 from math import erfc, exp, hypot, pi, sqrt
 
 import numpy as np

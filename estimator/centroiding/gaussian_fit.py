@@ -10,8 +10,6 @@ so they are updated in each iteration. The covariance is the inverse normal matr
 where the model does not fit.
 """
 
-from __future__ import annotations
-
 from math import erf, exp, pi, sqrt
 
 import numpy as np

@@ -10,8 +10,6 @@ The two weighted estimators also have a systematic error that depends on the pos
 (the S-curve), since they sample the profile at the pixel centers only; `sampling_variance` gives its mean square.
 """
 
-from __future__ import annotations
-
 from math import exp, pi, sqrt
 
 import numpy as np

@@ -14,8 +14,6 @@ For the angular rate, the streak's vector is also computed without its priors (`
 of the priors, so that its error would not average out.
 """
 
-from __future__ import annotations
-
 from math import cos, erf, exp, hypot, pi, sin, sqrt
 
 import numpy as np

@@ -4,8 +4,6 @@ Options that a callee leaves out are inherited from the caller that compiles it 
 them all, so that the results (division by zero, order of summation) do not depend on the order of calls.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numba

@@ -11,8 +11,6 @@ dp = N^-1 g, N = J^T W J, g = J^T W r. The functions compute
 `fit_soft_l1` is a robust fit by Levenberg-Marquardt, for models without derivatives.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import sqrt
 

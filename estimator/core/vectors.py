@@ -1,7 +1,5 @@
 """3-vectors and small rotations for compiled code, without allocating arrays."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np

@@ -12,8 +12,6 @@ Between the tile centers level and noise are interpolated bilinearly (`interpola
 The noise is measured on the filtered image. For white noise it is FILTERED_NOISE times the noise of a raw pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

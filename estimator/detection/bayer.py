@@ -9,8 +9,6 @@ the raw pixels with the weights 4 WR, 2 WG, 4 WB, so that it follows the light's
 correlated; the background's noise is measured after a filter, which includes most of it.
 """
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from numpy.typing import NDArray

@@ -15,8 +15,6 @@ and its reverse are equal, and lines are averaged and compared as plain vectors.
 6. Flag the pieces into which a faint track breaks (`_join_tracks`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from enum import IntFlag
 from math import atan2, cos, hypot, sin, sqrt

@@ -14,8 +14,6 @@ dominate the cost. So each row is first compared, in vector instructions, with a
 grid cell (the smallest of the cell's four corners); the exact threshold is computed only for pixels above the bound.
 """
 
-from __future__ import annotations
-
 from math import floor, sqrt
 
 import numpy as np

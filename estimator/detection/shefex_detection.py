@@ -6,8 +6,6 @@ brightness, which keeps the brightest. The maximum scan searches the largest pix
 object, and begins again: one pass for each object.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ It is used in tracking mode. For each window:
 2. Collect the connected pixels above 3 sigma around it by flood fill (`_grow`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -13,8 +13,6 @@ Each gyro sample is a rotation vector (`advance`):
 The equations are in the docstring of `mekf.AttitudeFilter`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ compute a Bayes factor instead: the probability of the detections at a candidate
 random places. Its common constants and terms are here. "dex" is the base-10 logarithm of a Bayes factor.
 """
 
-from __future__ import annotations
-
 from math import lgamma, log, log10, pi, sqrt
 
 import numpy as np

@@ -8,8 +8,6 @@ Common to the published identifiers, which find a few stars each in their own wa
 4. Compute the probability of such a match by chance (`log10_chance`), times the number of hypotheses tried.
 """
 
-from __future__ import annotations
-
 from math import pi
 from typing import NamedTuple
 

@@ -20,8 +20,6 @@ meet a sphere about the bearing turn rigidly with the vehicle, wherever the came
 5. End the tracks that have lost their light for too long, and begin tracks of new lights.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

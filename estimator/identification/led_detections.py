@@ -4,8 +4,6 @@ The brightness of a light is evidence for its LED, but a fraction STRAY of the l
 (`light_dex`).
 """
 
-from __future__ import annotations
-
 from math import exp, log10, pi, sqrt
 from typing import NamedTuple
 

@@ -22,8 +22,6 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 4. Compute the evidence (`_evidence`). Steps 2 to 4 are done twice.
 """
 
-from __future__ import annotations
-
 from math import exp, log, log10, pi
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ with a k-vector to find a range of angles. Directions are sorted into a square g
 that the question "is an LED near this direction" reads a few cells.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -14,8 +14,6 @@ A name is the LED that a light is taken for. Codes alone leave several names for
 One wrong name thus leads to a refusal, not to a wrong attitude.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

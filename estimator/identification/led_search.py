@@ -25,8 +25,6 @@ gives an attitude and a focal length, that is, the frame of a similarity in whic
 are invariants: the pair makes a triangle with each of them, whose angles the quick check compares with the LEDs'.
 """
 
-from __future__ import annotations
-
 from math import log10, pi, sqrt
 
 import numpy as np

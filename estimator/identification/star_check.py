@@ -5,8 +5,6 @@ attitude, and the number of matches without which the evidence cannot suffice. `
 after another, at each attitude of the pair.
 """
 
-from __future__ import annotations
-
 from math import pi, sqrt
 
 import numpy as np

@@ -4,8 +4,6 @@ A centroid in pixels becomes a tangent (x / z, y / z) in camera axes, with the i
 the fit and the error of its worst axis, which sets its matching radius.
 """
 
-from __future__ import annotations
-
 from math import hypot, log10, sqrt
 from typing import NamedTuple
 

@@ -25,8 +25,6 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 5. Compute the evidence (`_evidence`), and count the missing stars (`_count_missing`).
 """
 
-from __future__ import annotations
-
 from math import log, log10, pi, sqrt
 from typing import NamedTuple
 

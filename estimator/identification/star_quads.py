@@ -15,8 +15,6 @@ The steps; the same numbers return as comments in the code:
 7. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from estimator.catalog import quad_index

@@ -23,8 +23,6 @@ Steps 2 to 8 are repeated with more detections, or with less strict quick checks
 Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
-from __future__ import annotations
-
 from math import log10, sqrt
 
 import numpy as np

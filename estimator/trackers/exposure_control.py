@@ -11,8 +11,6 @@ exposure. `no_stars`: there are fewer than four objects, too few to identify. A 
 `saturated` has priority: glare also hides stars, and a longer exposure would make it worse.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ chi-square of the residuals, but only in part: matches beyond the gate are lost.
 `with_companions` increases the errors of catalog stars whose residuals indicate a companion.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import log, log10, sqrt
 from typing import NamedTuple

@@ -8,8 +8,6 @@ of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers. Every function 
 - `frame_transfer_smear`, `interline_smear`: charge that is moved under light collects it from every row it passes.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

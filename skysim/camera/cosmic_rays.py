@@ -1,7 +1,5 @@
 """Ionizing particles: straight tracks of charge through the chip, with or without light."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import erf, sqrt
 

@@ -17,8 +17,6 @@ drew, so the result does not depend on the order of the rows or the number of th
 integer; the functions take it and return its next value.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from math import exp, log, pi, sqrt
 from typing import Any, NamedTuple

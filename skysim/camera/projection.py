@@ -4,8 +4,6 @@ The camera rotates about the lab's origin, the bearing's center, so its poses fo
 places and have parallax on the camera's lever arm; stars are directions.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

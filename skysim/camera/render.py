@@ -17,8 +17,6 @@ of that image. Smear by body rate, jitter, pulsed LEDs and rolling shutters are 
 5. The patches are added to the frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ A callee inherits missing options from the caller that compiles it first, and th
 set here, so the results (division by zero, exceptions, order of additions) do not depend on the call order.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numba

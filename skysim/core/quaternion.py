@@ -4,8 +4,6 @@ A quaternion is (4,) w, x, y, z (scalar first, Hamilton's product), named a_from
 14-35 us to multiply or construct one, which would add up to a tenth of a control period of 10 ms.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The attitude control law (PID with feed-forward). Independent of the simulator and the actuators."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

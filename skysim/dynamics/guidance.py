@@ -10,8 +10,6 @@ Guidance is independent of the simulator and the controller. Attitudes are unit 
 scalar first; rates and accelerations are (3,) in the reference's own axes.
 """
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

@@ -5,8 +5,6 @@
 3. Attitude samples, interpolated by a C2 spline (`AttitudeSpline`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

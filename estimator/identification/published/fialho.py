@@ -27,8 +27,6 @@ the same handedness. As in the paper, the first triplet that passes is the solut
 lattice of LEDs, use `saa`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import sqrt

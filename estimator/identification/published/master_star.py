@@ -14,8 +14,6 @@ Steps 3 and 4 are therefore added:
    acceptance `thesis` takes it without this test.
 """
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Any, NamedTuple
 

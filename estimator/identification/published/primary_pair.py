@@ -1,7 +1,5 @@
 """Primary pair of SAA: two observed stars, the geometry of all others about them, and the gates of the direct match."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@
 6. Accept the first match with fewer than 1e-5 chance matches expected over all hypotheses tried.
 """
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Any, NamedTuple
 

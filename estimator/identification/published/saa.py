@@ -19,8 +19,6 @@ significant, and 1e5 times as likely as any contradicting assumption of this and
 with MIN_MATCHES stars, without these tests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

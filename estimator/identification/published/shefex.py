@@ -12,8 +12,6 @@ gate is wide for stars close together: for 5.5e-5 it is 0.090 deg at 2 deg, and 
    and so does the acceptance `thesis`.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

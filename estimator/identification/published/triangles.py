@@ -25,8 +25,6 @@ sigma across each axis gives, to first order in the planar triangle's sides, wit
    another triangle of observed stars.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from math import atan2, sqrt
 from typing import Any, NamedTuple

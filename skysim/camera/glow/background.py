@@ -8,8 +8,6 @@ Extended light varies smoothly over the frame:
 3. The frame is interpolated between the nodes (`fill`), which also initializes it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

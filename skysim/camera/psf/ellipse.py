@@ -15,8 +15,6 @@ with the matrix A of `kernel.DiskImages`:
 5. `add_ellipse` interpolates between the samples by Lagrange's cubic, for an image at any position.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from math import ceil, floor, sqrt
 from typing import Any, NamedTuple

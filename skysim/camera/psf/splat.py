@@ -6,8 +6,6 @@ the patch is left out; the rows of a rolling shutter add up to the total. The ta
 `skysim.camera.psf.kernel`. These loops set the rendering time, so they avoid divisions, branches and checks.
 """
 
-from __future__ import annotations
-
 from math import ceil, erf, floor, sqrt
 
 import numpy as np

@@ -11,8 +11,6 @@ Frames and signs are those of wheels.py. The steering of each control period:
 A is singular if all g x h are in a plane. Then no gimbal rate gives a torque along the plane's normal.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -8,8 +8,6 @@ Sources and pupil are points: a source is visible or not, at the pose of mid-exp
 initial angles.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

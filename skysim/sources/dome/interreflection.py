@@ -15,8 +15,6 @@ On a sphere K = 1 / (4 pi R^2) everywhere, so LEDs of the power P in a sphere of
 E = P / (A (1 - rho)), the law of the integrating sphere.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numba

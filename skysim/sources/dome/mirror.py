@@ -23,8 +23,6 @@ seen under the angle at which the light leaves the LED: |Q - C| + |P - Q| for a 
 image along one of two directions, at equal area; that is neglected.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, NamedTuple
 

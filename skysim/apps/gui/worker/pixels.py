@@ -5,8 +5,6 @@ numbers. Limits and histogram are those of the whole frame, so the picture does 
 pixels arrive.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Outcome of a trial: errors of its solution, whether the right lights were identified, and the attitude it had."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, fields
 from math import nan

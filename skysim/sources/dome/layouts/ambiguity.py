@@ -18,8 +18,6 @@ The ambiguity of field i is the maximum over j and over the rotations of
 where the 1 is the center LED.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

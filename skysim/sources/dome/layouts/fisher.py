@@ -16,8 +16,6 @@ the total variance sigma^2 tr(M^-1). `optimize` minimizes tr(M^-1), summed over 
 4. Moving an LED only adds and subtracts terms in the sums of the attitudes concerned (`add_led`, `update_costs`).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

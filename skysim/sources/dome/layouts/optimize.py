@@ -16,8 +16,6 @@ Layouts are compared by the mean variance of the worst 1 % of independent attitu
 `optimize_places` has the steps in order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
