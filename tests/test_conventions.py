@@ -269,7 +269,6 @@ def test_the_motion_of_an_apex_led_by_a_tilt_matches_a_hand_calculation():
 
 
 PICKLING = {
-    "own_code.py": "pickles for a digest, and reads nothing",
     "playback.py": "reads what the same process wrote to an unnamed temporary file",
 }
 

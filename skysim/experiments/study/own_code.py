@@ -1,21 +1,19 @@
 """Functions and objects that a user gives to a study in Python: their names, identity and way to other processes.
 
-A study keeps a digest of each of them, so that trials of a changed function are not mixed with earlier ones. It covers
-the source code of the function, of what it calls in the user's own modules, and the values that it uses.
+A study keeps a digest of each of them, so that trials of a changed function are not mixed with earlier ones.
 """
 
 import hashlib
-import inspect
-import io
-import marshal
-import pickle
 import sys
 import sysconfig
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
+from uuid import uuid4
+
+import numpy as np
 
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
@@ -32,104 +30,41 @@ from skysim.tracking.tracker_interface import OWN
 INSTALLED = (
     *(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib")),
     *(str(ROOT / package) for package in ("skysim", "estimator")),
-    "<frozen",
-)
-# What a tracker of the estimator is made from; the rest follows from it.
-TRACKER = (
-    "camera",
-    "settings",
-    "stars",
-    "focal_uncertainty",
-    "searches",
-    "air",
-    "leds",
-    "lever",
-    "code",
 )
 
 
-class SourcePickler(pickle.Pickler):
-    """Pickles functions and classes of the user's modules by their source code, others by name and version.
-
-    The result is not read again: it is the input of a digest.
-    """
-
-    def reducer_override(self, obj: Any) -> Any:
-        """See `pickle.Pickler`. The state, in third place, may refer to the object itself."""
-        if isinstance(obj, ModuleType | FunctionType | type):
-            if obj is str:
-                return NotImplemented
-            if not is_own(obj):
-                return str, (f"{obj.__name__} {version_of(obj)}",)
-            contents = None if isinstance(obj, ModuleType) else dict(contents_of(obj))
-            return str, (source_of(obj),), contents
-        if isinstance(obj, StarTracker | DomeTracker):
-            return (
-                str,
-                (type(obj).__qualname__,),
-                [getattr(obj, key, None) for key in TRACKER],
-            )
-        try:
-            return obj.__reduce_ex__(4)
-        except TypeError:  # such as a lock or an open file
-            return str, (type(obj).__qualname__,)
-
-
-def is_own(code: Any) -> bool:
-    """Whether a module, function or class is the user's: neither installed nor of skysim."""
-    if isinstance(code, FunctionType):
-        return not code.__code__.co_filename.startswith(INSTALLED)
-    name = code.__name__ if isinstance(code, ModuleType) else code.__module__
-    file = getattr(sys.modules.get(name), "__file__", None) or ""
-    return name not in sys.builtin_module_names and not file.startswith(INSTALLED)
-
-
-def version_of(code: Any) -> str:
-    """The version of the package of a module, function or class; empty if it has none."""
-    package = (getattr(code, "__module__", None) or code.__name__).partition(".")[0]
-    return str(getattr(sys.modules.get(package), "__version__", ""))
-
-
-def source_of(code: Any) -> str:
-    """The source code of a module, function or class; of a function without a file its compiled code."""
-    try:
-        return inspect.getsource(code)
-    except (OSError, TypeError):
-        return marshal.dumps(code.__code__).hex() if hasattr(code, "__code__") else repr(code)
-
-
-def contents_of(code: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what a function uses, by name: defaults, globals, variables of a closure; or the methods of a class."""
-    if isinstance(code, type):
-        yield "bases", code.__bases__
-        for name, member in vars(code).items():
-            inner = getattr(member, "__func__", getattr(member, "fget", member))
-            if isinstance(inner, FunctionType):
-                yield name, inner
-        return
-    yield "defaults", (code.__defaults__, code.__kwdefaults__)
-    for name in sorted(set(names_in(code.__code__)) & set(code.__globals__)):
-        yield name, code.__globals__[name]
-    for name, cell in zip(code.__code__.co_freevars, code.__closure__ or (), strict=True):
-        try:
-            yield name, cell.cell_contents
-        except ValueError:  # not yet assigned
-            continue
-
-
-def names_in(code: CodeType) -> Iterator[str]:
-    """Yield the names of globals and attributes in compiled code, with that of the functions in it."""
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from names_in(constant)
+def is_own(file: str) -> bool:
+    """Whether a module's file is the user's: neither installed nor of skysim."""
+    return is_file(Path(file)) and not file.startswith(INSTALLED)
 
 
 def digest_of(given: Any) -> str:
-    """First 16 hexadecimal digits of the SHA-256 of what a function or an object does, see the module."""
-    data = io.BytesIO()
-    SourcePickler(data, 4).dump(given)
-    return hashlib.sha256(data.getvalue()).hexdigest()[:16]
+    """First 16 hexadecimal digits of the SHA-256 of the user's source files and of the values in a function or object.
+
+    1. The files are the loaded modules from the folder of its own one, and below: any of them may be called.
+    2. The values are the variables of a function's closure, or the fields of an object.
+    3. What is defined in a session without a file, or has values that do not tell what they are, gets a digest of its
+       own each time: nothing tells whether it has changed, so its trials are not continued.
+    """
+    code = given if isinstance(given, FunctionType | type) else type(given)
+    # 1. Files.
+    home = getattr(sys.modules.get(code.__module__), "__file__", None) or ""
+    files = {getattr(module, "__file__", None) or "" for module in sys.modules.values()}
+    folder = str(Path(home).parent)
+    own = sorted(file for file in files if home and file.startswith(folder) and is_own(file))
+    texts = [code.__qualname__, *(Path(file).read_text("utf-8", "replace") for file in own)]
+    # 2. Values.
+    cells = [cell.cell_contents for cell in getattr(code, "__closure__", None) or ()]
+    fields = getattr(given, "__dict__", {}) if code is not given else {}
+    values = [
+        repr(value.tolist() if isinstance(value, np.ndarray) else value)
+        for value in [*cells, *fields.values()]
+    ]
+    # 3. Unknown: no file, the address of an object, or an array that is cut short.
+    if not own or any(" at 0x" in text or "..." in text for text in values):
+        values.append(uuid4().hex)
+    texts += values
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()[:16]
 
 
 def digests_of(programs: Programs) -> dict[str, str]:
