@@ -245,7 +245,6 @@ OPTIONS = {  # the option of each function parameter, by the parameter's key in 
         "where",
         "response",
         "dataset.frames",
-        "datasheet.end_of_life",
         "datasheet.fields",
         "datasheet.fmu",
         "survey.imu_sigma",

@@ -26,8 +26,6 @@ from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.datasheet.scene_changes import (
     FIXED_PATTERN,
     OFF_DEG,
-    EndOfLife,
-    aged,
     beside,
     excluding_bodies,
     side_px,
@@ -190,8 +188,6 @@ class Designer:
     ----------
     rates_deg_s
         Rates in place of those that follow from the camera
-    end_of_life
-        What the camera has suffered at the end of its life
     """
 
     def __init__(
@@ -199,12 +195,10 @@ class Designer:
         scene: Scene,
         size: Size,
         rates_deg_s: Sequence[float] = (),
-        end_of_life: EndOfLife | None = None,
     ) -> None:
         self.scene = scene
         self.size = size
         self.chosen_rates_deg_s = sorted({rate for rate in rates_deg_s if rate})
-        self.end_of_life = end_of_life
         self.seeds = unit_seeds(scene)
         self.temperatures_c = states_c(scene, size.states)
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
@@ -264,9 +258,6 @@ class Designer:
         for body, off_deg in itertools.product(excluding_bodies(self.scene), OFF_DEG):
             change = beside(body, off_deg, off_deg)
             yield from self.draws("exclusion", 1, change, body=body, off_deg=off_deg)
-        if self.end_of_life:
-            for name, change in aged(self.scene.camera, self.end_of_life).items():
-                yield from self.draws("end of life", pairs, change, cause=name)
 
     def terms(self) -> Iterator[DatasheetCell]:
         """The crossed and nested design of `components`."""
@@ -465,7 +456,6 @@ def measure(
     fields: int | None = None,
     least: int = MIN_FIELDS,
     rates_deg_s: Sequence[float] = (),
-    end_of_life: EndOfLife | None = None,
     workers: int | None = None,
     watch: Callable[[int], runner.Watch] | None = None,
 ) -> MeasuredFrames:
@@ -477,7 +467,7 @@ def measure(
         Smaller experiments; number of fields, None for the usual one
     least
         Number of fields that must be solved: MIN_FIELDS, or MODEL_FIELDS for an error model
-    rates_deg_s, end_of_life
+    rates_deg_s
         See `Designer`; without rates they double until MOST_FAIL of the fields fail
     watch
         Called with the number of trials; returns what is called after every batch
@@ -493,7 +483,7 @@ def measure(
     size = replace(usual, fields=usual.fields if fields is None else fields)
     purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
     require_fields(size.fields, size.fields, least, f"too few {purpose}")
-    designer = Designer(scene, size, rates_deg_s, end_of_life)
+    designer = Designer(scene, size, rates_deg_s)
     cells = list(designer.cells())
     path = make_folder(folder) / STUDY
     engine = runner.ENGINES["serial" if workers == 1 else "pool"](workers, "")

@@ -241,7 +241,6 @@ def left_out(statement: Statement) -> list[str]:
             sheet.designer.states > 1,
             "the scene has no section thermal",
         ),
-        "End of life": (statement.end_of_life, "no dose was given: `--end-of-life KRAD`"),
     }
     return [f"{name}: {reason}." for name, (stated, reason) in reasons.items() if not stated]
 

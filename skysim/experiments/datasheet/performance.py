@@ -13,7 +13,6 @@ from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     Bounded,
     bounded,
-    causes,
     mean_known,
     mean_square_ratio,
     rms,
@@ -290,14 +289,6 @@ def disturbances(sheet: MeasuredFrames) -> list[Record]:
 def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
     """Counts and rms errors of some cells, each frame on its own."""
     return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
-
-
-def end_of_life(sheet: MeasuredFrames) -> list[Record]:
-    """Outcomes, errors and the ratio of their mean squares for each damage at the end of life; all together last."""
-    found = causes(sheet, "end of life")
-    return [
-        one | outcome(sheet, sheet.rows("end of life", cause=one["cause"])) for one in found
-    ]
 
 
 def exclusions(sheet: MeasuredFrames) -> list[Record]:

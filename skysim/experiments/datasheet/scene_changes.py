@@ -1,21 +1,10 @@
-"""Changes of a scene that a datasheet measures: what would lower the error, disturbances, and the end of life.
-
-At the end of its life a camera has more dark current and hot pixels, and a darker lens, after an ionizing dose.
-
-Each krad adds dark current and hot pixels and takes light. What a dose does depends on the chip's process and on the
-glass, so the defaults are assumptions, which the sheet marks: give the numbers of a test.
-"""
+"""Changes of a scene that a datasheet measures: what would lower the error, and disturbances."""
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import Field, ValidationError
-
-from skysim.core.units import ConfigModel, Fraction, NotNegative, Number, Positive
-from skysim.core.yaml_reader import explain, parse_yaml
 from skysim.experiments.study.factors import Settings
 from skysim.scene.scene import BODIES_YEARS, Scene
-from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
 from skysim.tracking.onboard_model import onboard_catalog
 
@@ -24,64 +13,6 @@ FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of `ca
 FALSE_STARS_PX = 0.05
 TRUE_STARS = 20
 OFF_DEG = (10.0, 20.0, 30.0, 45.0, 60.0, 90.0)  # angles of the boresight from a bright body
-
-ALL = "all together"
-
-
-class EndOfLife(ConfigModel):
-    """What a camera has suffered: a dose, and what each krad of it does; the defaults are assumed.
-
-    Attributes
-    ----------
-    dose_krad
-        Ionizing dose at the chip and in the lens, krad(Si)
-    dark_e_s_krad
-        Dark current added by each krad at the chip's dark_temperature_c
-    hot_pixels_krad, hot_e_s
-        Fraction of the pixels that each krad makes hot, and their mean dark current
-    transmission_krad
-        Fraction of the light that the glass loses in each krad
-    """
-
-    dose_krad: Positive
-    dark_e_s_krad: NotNegative = 100.0
-    hot_pixels_krad: Fraction = 5e-4
-    hot_e_s: NotNegative = 1000.0
-    transmission_krad: Annotated[Number, Field(ge=0, lt=1)] = 0.002
-
-
-def parse_end_of_life(text: str) -> EndOfLife:
-    """The end of life from YAML: a dose in krad, or a mapping of the keys. Raises InputError."""
-    _, tree = parse_yaml(text)
-    tree = tree if isinstance(tree, dict) else {"dose_krad": tree}
-    try:
-        return EndOfLife.model_validate(tree)
-    except ValidationError as error:
-        raise explain(error, EndOfLife, tree, [], {}).within(
-            "datasheet.end_of_life"
-        ) from None
-
-
-def aged(camera: CameraConfig, life: EndOfLife) -> dict[str, Settings]:
-    """Settings of the aged camera: each damage alone, and all together.
-
-    A transmission that is a curve is not changed.
-    """
-    chip = camera.detector
-    dark_e_s = chip.dark_e_s + life.dose_krad * life.dark_e_s_krad
-    hot = min(chip.hot_pixels + life.dose_krad * life.hot_pixels_krad, 1.0)
-    parts: dict[str, Settings] = {
-        f"dark current {dark_e_s:.3g} e-/s": {"camera.detector.dark_e_s": dark_e_s},
-        f"hot pixels {100 * hot:.3g} %": {
-            "camera.detector.hot_pixels": hot,
-            "camera.detector.hot_e_s": max(chip.hot_e_s, life.hot_e_s),
-        },
-    }
-    if not isinstance(camera.transmission, str):
-        left = camera.transmission * (1 - life.transmission_krad) ** life.dose_krad
-        parts[f"transmission {left:.3g}"] = {"camera.transmission": left}
-    together = {key: value for part in parts.values() for key, value in part.items()}
-    return {**parts, ALL: together}
 
 
 # Changes of any scene.

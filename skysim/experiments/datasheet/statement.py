@@ -63,7 +63,6 @@ class Statement(NamedTuple):
     magnitudes: Rows
     disturbances: Rows
     exclusions: Rows
-    end_of_life: Rows
     times_s: list[float]
     timing: Record
 
@@ -100,7 +99,6 @@ def state(sheet: MeasuredFrames) -> Statement:
         performance.by_level(sheet, "magnitude", "limit_mag"),
         performance.disturbances(sheet),
         performance.exclusions(sheet),
-        performance.end_of_life(sheet),
         times_s,
         performance.timing(sheet, times_s),
     )
@@ -153,7 +151,6 @@ def sections(statement: Statement) -> list[StatementSection]:
         magnitude_section: statement.magnitudes,
         disturbance_section: True,
         exclusion_section: statement.exclusions,
-        life_section: statement.end_of_life,
     }
     return [section(statement) for section, holds in stated.items() if holds]
 
@@ -454,26 +451,6 @@ def exclusion_section(statement: Statement) -> StatementSection:
     ]
     headers = ["body", "angle °", *OUTCOME_HEADERS]
     return StatementSection("Exclusion angles", texts, headers, rows, ["exclusions"])
-
-
-def life_section(statement: Statement) -> StatementSection:
-    """Outcomes and errors of the aged camera."""
-    life = statement.sheet.designer.end_of_life
-    assert life is not None
-    keys = ", ".join(
-        f"{name} {value:g}{'' if name in life.model_fields_set else ' (assumed)'}"
-        for name, value in life
-    )
-    texts = [
-        f"The camera after its dose, at rest, on the same fields, units and noise as before: {keys}.",
-        "What is left of the mean square is in percent of that of the new camera, with 95 % intervals.",
-    ]
-    rows = [
-        [row["cause"], *outcome_row(row), *ratio_cells(row)] for row in statement.end_of_life
-    ]
-    headers = ["damage", *OUTCOME_HEADERS]
-    headers += ["mean square across %", "mean square about %"]
-    return StatementSection("At the end of life", texts, headers, rows)
 
 
 def acceleration_section(statement: Statement) -> StatementSection:

@@ -236,14 +236,14 @@ def squares_by_field(sheet: MeasuredFrames, rows: list[int], axes: slice) -> Flo
     return mean_known(sheet.errors(rows)[axes] ** 2, (0, 1))
 
 
-def causes(sheet: MeasuredFrames, experiment: str = "cause") -> list[Record]:
+def causes(sheet: MeasuredFrames) -> list[Record]:
     """Each change of the scene with the ratio of the mean square after it to that of the unchanged scene.
 
     Across and about the boresight, the least first.
     """
     found = []
-    for name in sheet.levels(experiment, "cause"):
-        rows = sheet.rows(experiment, cause=name)
+    for name in sheet.levels("cause", "cause"):
+        rows = sheet.rows("cause", cause=name)
         draws = sheet.rows("total")
         before = [draw for draw in draws if sheet.cells[draw].levels["draw"] < len(rows)]
         row: Record = {"cause": name}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.datasheet.cells import (
     FULL,
     MIN_FIELDS,
@@ -172,34 +171,6 @@ def test_a_turn_about_the_boresight_smears_the_edge_as_far_as_the_streak_says():
         )
     cells = [one for one in designer.cells() if one.experiment == "boresight"]
     assert all(one.settings["trial.rate_axis"] == "boresight" for one in cells)
-
-
-def test_a_dose_adds_its_dark_current_to_the_chip_s() -> None:
-    camera = load("shefex2", {}).camera
-    life = scene_changes.parse_end_of_life("{dose_krad: 3, dark_e_s_krad: 40}")
-    together = scene_changes.aged(camera, life)[scene_changes.ALL]
-    assert together["camera.detector.dark_e_s"] == camera.detector.dark_e_s + 120
-
-
-def test_the_glass_darkens_by_the_same_share_in_each_krad():
-    scene = load("shefex2", {"camera.transmission": "0.8"})
-    life = scene_changes.parse_end_of_life("{dose_krad: 10, transmission_krad: 0.05}")
-    together = scene_changes.aged(scene.camera, life)[scene_changes.ALL]
-    assert together["camera.transmission"] == pytest.approx(0.8 * 0.95**10)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("-1", "datasheet.end_of_life: dose_krad: .* allowed: greater than 0"),
-        ("{dose_krad: 1, dose: 2}", "datasheet.end_of_life: dose: unknown key"),
-        ("{dark_e_s_krad: 2}", "datasheet.end_of_life: dose_krad: missing"),
-    ],
-)
-def test_an_end_of_life_that_means_nothing_is_refused(text, message):
-    with pytest.raises(InputError, match=message) as refused:
-        scene_changes.parse_end_of_life(text)
-    assert "\n" not in str(refused.value)
 
 
 def test_exclusion_angles_need_a_baffle():

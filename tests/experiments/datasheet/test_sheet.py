@@ -14,7 +14,6 @@ from skysim.core.errors import InputError
 from skysim.experiments.datasheet import cells, datasheet_report, model_fit, performance
 from skysim.experiments.datasheet.cells import Designer, Size
 from skysim.experiments.datasheet.datasheet_report import numbers
-from skysim.experiments.datasheet.scene_changes import parse_end_of_life
 from skysim.experiments.datasheet.statement import Statement, sections, state
 from skysim.experiments.datasheet.variance_components import contributions
 from skysim.experiments.study.execution import trials
@@ -87,7 +86,6 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
     assert text.count("<img") == 6
     # And what is left out, and the second page.
     assert report.markdown().count("\n## ") == len(sections(whole)) + 2
-    assert "End of life: no dose was given" in text
     assert len(list((tmp_path / "whole").glob("*.png"))) == 6
     with pytest.raises(InputError, match="contains another study"):
         cells.measure(
@@ -126,31 +124,19 @@ def test_rates_double_until_most_fields_fail_and_are_kept(
     assert "rate" not in first.solved_at_all_rates()
 
 
-def test_chosen_rates_and_the_end_of_life_are_measured(small: None, tmp_path: Path) -> None:
-    """Much more dark current leaves more of the mean square; a dose of nothing leaves it as it was."""
-    life = parse_end_of_life(
-        "{dose_krad: 10, dark_e_s_krad: 2000, hot_pixels_krad: 0, transmission_krad: 0}"
-    )
+def test_chosen_rates_are_measured(small: None, tmp_path: Path) -> None:
+    rates_deg_s = [0.5, 0, 0.2]
     sheet = cells.measure(
         "shefex2",
         load("shefex2", {}),
         {},
         tmp_path,
         quick=True,
-        rates_deg_s=[0.5, 0, 0.2],
-        end_of_life=life,
+        rates_deg_s=rates_deg_s,
         workers=1,
     )
     assert sheet.levels("rate", "rate_deg_s") == [0.2, 0.5]
     assert sheet.levels("boresight", "rate_deg_s") == [0.2, 0.5]
-    found = {row["cause"].split()[0]: row for row in performance.end_of_life(sheet)}
-    dark, hot, glass, together = (
-        found[name] for name in ("dark", "hot", "transmission", "all")
-    )
-    assert dark["across"].value > 1.2
-    for unchanged in (hot, glass):
-        assert unchanged["across"].value == pytest.approx(1)
-    assert together["across"].value == pytest.approx(dark["across"].value)
 
 
 @pytest.mark.parametrize("solved", [0, 6])

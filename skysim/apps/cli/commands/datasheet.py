@@ -42,14 +42,6 @@ Rates = Annotated[
         " are solved."
     ),
 ]
-AfterDose = Annotated[
-    str | None,
-    typer.Option(
-        "--end-of-life",
-        help="Also measure the aged camera: its dose in krad, or {dose_krad: 10, dark_e_s_krad: 40, ...}, what each"
-        " krad adds.",
-    ),
-]
 ModelFolder = Annotated[
     Path | None,
     typer.Option(
@@ -70,7 +62,6 @@ def datasheet(
     quick: Quick = False,
     fields: FieldCount = None,
     rates: Rates = None,
-    end_of_life: AfterDose = None,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Processes = None,
@@ -86,7 +77,7 @@ def datasheet(
     Stopped or killed, it goes on where it was when it is called again.
     """
     from skysim.core import files
-    from skysim.experiments.datasheet import cells, datasheet_report, scene_changes
+    from skysim.experiments.datasheet import cells, datasheet_report
     from skysim.experiments.datasheet.statement import state
 
     require_outputs(markdown, model, fmu)
@@ -103,13 +94,11 @@ def datasheet(
             fields=fields,
             least=cells.MODEL_FIELDS if model else cells.MIN_FIELDS,
             rates_deg_s=parse_rates(rates) if rates else [],
-            end_of_life=scene_changes.parse_end_of_life(end_of_life) if end_of_life else None,
             workers=workers,
             watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )
     statement = state(sheet)
-    chosen = {"rates": rates, "end-of-life": end_of_life}
-    options = [f"--{name}={text}" for name, text in chosen.items() if text]
+    options = [f"--rates={rates}"] if rates else []
     report = datasheet_report.datasheet_report(statement, ["--quick"] * quick + options)
     page = datasheet_report.write_all(folder, statement, report)["report"]
     if markdown:
