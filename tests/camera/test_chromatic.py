@@ -25,9 +25,9 @@ from skysim.simulation.lights.light import beam_of
 from skysim.sources.photometry import (
     Band,
     black_body_v0,
+    broad_spectrum,
     colored,
     led_chromatic,
-    measured,
     star_chromatic,
     temperature_k,
 )
@@ -73,7 +73,7 @@ def photons(power: Callable[[Floats], Floats]) -> Callable[[Floats], Floats]:
     return lambda wavelength_m: power(wavelength_m) * wavelength_m
 
 
-WHITE = photons(measured("white").response_at)
+WHITE = photons(broad_spectrum("white", None)[0])
 BLUE = photons(colored(470e-9, 25e-9))
 CASES = {
     "a blue star": (lambda band: star_chromatic(*A0, band), planck(A0), None),

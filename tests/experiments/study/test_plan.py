@@ -3,7 +3,7 @@
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.core.paths import shipped_files
+from skysim.core.paths import STUDIES, shipped_files
 from skysim.experiments.study import plan, study_file
 
 STUDY = """schema: 1
@@ -157,7 +157,7 @@ def test_an_unknown_study_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "path",
-    list(shipped_files(plan.STUDIES).values()),
+    list(shipped_files(STUDIES).values()),
     ids=lambda path: path.stem,
 )
 def test_every_shipped_study_loads(path):
