@@ -648,7 +648,6 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
         lambda at, r: as_fits(at, np.full_like(frame_of(r), 4064)),
         "the frame is saturated",
     ),
-    "NaN": (lambda at, r: as_fits(at, with_nan(frame_of(r))), "NaN or infinite"),
     "truncated FITS": (
         lambda at, r: cut(r / "frame_0000.fits", at),
         "not a complete FITS file",
@@ -656,7 +655,6 @@ BAD_IMAGES: dict[str, tuple[Any, str]] = {
     "truncated PNG": (lambda at, r: cut(r / "frame_0000.png", at), "cannot be decoded"),
     "text": (lambda at, _: text_as_png(at), "cannot be decoded"),
     "missing": (lambda at, _: at / "nosuch.fits", "no such file"),
-    "a cube": (lambda at, r: as_fits(at, np.stack([frame_of(r)] * 4)), "(4, 493, 659)"),
     "not an image": (lambda at, _: SHEFEX, "unknown image suffix; allowed: .fits"),
 }
 

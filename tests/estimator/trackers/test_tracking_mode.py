@@ -129,9 +129,7 @@ def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker)
         match = StarMatch(np.arange(count), rows[:count], START, -9.0)
         attitude = Attitude("solved", START, np.eye(3), match)
         centroids = Centroids(xy, sigma, np.ones(count))
-        report = TrackingMode(tracker)._report(
-            attitude, centroids, sigma, Clock(), 0, False, None
-        )
+        report = TrackingMode(tracker)._report(attitude, centroids, sigma, Clock(), None)
         assert report.chi2_per_dof == pytest.approx(2 * count / (2 * count - 3), rel=1e-6)
 
 
