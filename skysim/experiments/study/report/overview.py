@@ -139,7 +139,8 @@ def survey_share(found: checks.Check, trial: Trial) -> float:
         sizes = reach[f"{angle}_causes_arcsec"]
         sizes |= {CENTROIDS: scale * sizes.get(CENTROIDS, 0.0)}
         total = math.fsum(size**2 for size in sizes.values())
-        shares.append(math.fsum(sizes.get(name, 0.0) ** 2 for name in SURVEYED) / total)
+        if total:
+            shares.append(math.fsum(sizes.get(name, 0.0) ** 2 for name in SURVEYED) / total)
     return max(shares)
 
 
