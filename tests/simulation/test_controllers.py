@@ -135,7 +135,7 @@ def test_a_user_s_pd_law_flies_like_the_built_in_one(
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(installed), *sys.path]))
     built_in = flown()
-    law = {"motion.control.law": "mine"}
+    law = {"motion.control": SHORT["motion.control"] | {"law": "mine"}}
     routes = {
         "function": flown(controller=pd),
         "entry point": flown(changes=law),
