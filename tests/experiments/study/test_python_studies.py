@@ -171,9 +171,10 @@ def helper(image):
     return GAIN * image.sum()
 """
 PILOT = """
+from itertools import count
 from helper_of_a_user import helper
 def solve(image):
-    return helper(image)
+    return helper(image), count(), float(1)
 """
 
 
@@ -204,6 +205,12 @@ def test_the_digest_of_a_function_follows_the_user_s_modules(
         assert own_code.digest_of(pilot.solve) != first
         (tmp_path / f"{name}.py").write_text(text)
     assert own_code.digest_of(pilot.solve) == first
+    # A value that the helper uses, and one that nothing uses.
+    helper = sys.modules["helper_of_a_user"]
+    helper.other = 1
+    assert own_code.digest_of(pilot.solve) == first
+    helper.GAIN = 2.5
+    assert own_code.digest_of(pilot.solve) != first
 
 
 def test_the_digest_has_the_values_of_closures_and_objects() -> None:
@@ -217,8 +224,21 @@ def test_the_digest_has_the_values_of_closures_and_objects() -> None:
         def __call__(self, image: Any) -> Any:
             return self.gain
 
+    class Slotted:
+        __slots__ = ("gain",)
+
+        def __init__(self, gain: float) -> None:
+            self.gain = gain
+
+    def with_default(gain: float) -> Callable[..., Any]:
+        def law(image: Any, factor: float = gain) -> Any:
+            return factor
+
+        return law
+
     values = (1.0, 2.0, np.arange(3000), np.append(np.arange(2999), 0))
-    parts = [*map(with_gain, values), Held(1.0), Held(2.0)]
+    parts: list[Any] = [*map(with_gain, values), with_default(1.0), with_default(2.0)]
+    parts += [Slotted(1.0), Slotted(2.0), Held(1.0), Held(2.0)]
     digests = [own_code.digest_of(part) for part in parts]
     assert len(set(digests)) == len(parts)
     assert own_code.digest_of(with_gain(2.0)) == digests[1]
