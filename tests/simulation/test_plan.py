@@ -884,7 +884,7 @@ WEAK = {"vehicle__wheels__torque_limit": "0.05 N m"}
                 "vehicle__center_of_mass": '["1 mm", "0 m", "-0.5 mm"]',
                 "motion__maneuver": '[{kind: hold, duration: "1 s"}]',
             },
-            "wheel_y saturated from 0.",
+            "wheel_y saturated from 0.2 s",
             True,
         ),
         # Momentum runs out, although the torque would do.
