@@ -112,7 +112,9 @@ def fail_if_not_met(judged: Iterable[Mapping[str, Any]]) -> None:
     """End with exit code 1 if a requirement is not met; one that is not shown yet is no failure."""
     from typer import Exit
 
-    if any(one["answer"] == "not met" for one in judged):
+    from skysim.results.requirements import NOT_MET
+
+    if any(one["answer"] == NOT_MET for one in judged):
         raise Exit(1)
 
 

@@ -151,15 +151,14 @@ def make_dome_solver(
     from skysim.experiments.dome_survey import survey_images, survey_prior
     from skysim.experiments.tracker_comparison import with_config
     from skysim.scene import loader
-    from skysim.scene.sections.light import DomeConfig
     from skysim.simulation.lab import build_lab
     from skysim.tracking import factory, onboard_model
     from skysim.tracking.tracker_interface import OWN
 
     scene = loader.load_scene(dome)
-    light = scene.light
-    if not isinstance(light, DomeConfig):
-        raise InputError("solve.dome", f"the light of {dome} is {light.kind}", "a dome")
+    light = scene.dome
+    if light is None:
+        raise InputError("solve.dome", f"the light of {dome} is {scene.light.kind}", "a dome")
     # 1. The lists without simulated errors. One picture is too few for codes.
     own = with_config(scene, "tracker", name=OWN, decoder=None, **(stages or {}))
     lab = build_lab(survey_prior.as_listed(own))
