@@ -10,13 +10,12 @@ residuals (p_measured - p) / sigma by Levenberg-Marquardt:
    with the priors (`normal_equations`).
 3. Damp the diagonal and eliminate the lights (`eliminate_lights`). Lights are coupled to one another only through
    frames, so each light's 3 x 3 block is eliminated by the Schur complement, and a dense system of frames, lever and
-   lens remains (Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6). A penalty holds the moves that
-   change no pixel (`gauge_freedoms`).
+   lens remains (Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6).
 4. Solve for frames, lever and lens, and substitute back for the lights (`step`).
 5. Accept the step and reduce the damping if the loss falls; otherwise increase the damping.
 6. Stop when the Newton decrement, the squared step in standard deviations, is negligible.
 
-Afterwards `bundle_covariance` computes the covariance in the requested gauge.
+Afterwards `bundle_covariance` computes the covariance.
 
 Measured on AFIT's dome (892 lights, 600 frames): 14 such steps converge to a cost of 1.1e4. scipy's least_squares
 with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduced the cost from 5.4e8 to 4.1e8 after
@@ -391,31 +390,6 @@ def _append_dense(left: csr_array, right: Floats) -> csr_array:
     )
 
 
-def gauge_freedoms(bundle: Bundle) -> tuple[Floats, Floats]:
-    """Return the gauge freedoms Z, four moves that change no pixel: (3 N, 4) of positions and (R, 4) of the rest.
-
-    A rotation of the lab by a small e changes x by e x x, and A to A exp(-[e]) = exp(-[A e]) A. A change of scale
-    multiplies x and r alike. A prior map fixes all four.
-    """
-    lights = len(bundle.position_m)
-    frames = len(bundle.R_body_from_lab)
-    led = np.zeros((lights, 3, 4))
-    # Columns 0 to 2: rotations about the lab's axes; column 3: scale
-    for axis, e in enumerate(np.eye(3)):
-        led[:, :, axis] = np.cross(e, bundle.position_m)
-    led[:, :, 3] = bundle.position_m
-    rest = np.zeros((3 * frames + 3 + bundle.free_lens, 4))
-    rest[: 3 * frames, :3] = -bundle.R_body_from_lab.reshape(-1, 3)
-    rest[3 * frames : 3 * frames + 3, 3] = bundle.camera_body_m
-    return led.reshape(-1, 4), rest
-
-
-def free_gauge(bundle: Bundle) -> Floats:
-    """Return the (R, 4) part of the gauge freedoms in the unknowns but the lights; (R, 0) if a prior map fixes them."""
-    rest = gauge_freedoms(bundle)[1]
-    return rest if np.isinf(bundle.map_sigma_m) else rest[:, :0]
-
-
 class ReducedSystem(NamedTuple):
     """Reduced system after elimination of the lights.
 
@@ -437,23 +411,17 @@ class ReducedSystem(NamedTuple):
     scale: Floats
 
 
-def eliminate_lights(terms: NormalEquations, gauge: Floats, damping: float) -> ReducedSystem:
-    """Eliminate the lights, with Marquardt's damping and the gauge freedoms held.
+def eliminate_lights(terms: NormalEquations, damping: float) -> ReducedSystem:
+    """Eliminate the lights, with Marquardt's damping.
 
     The normal equations [[A, B], [B^T, D]] [x; y] = [a; b] of lights x and other unknowns y give
     (D - B^T A^-1 B) y = b - B^T A^-1 a: the Schur complement of A, which is block diagonal. Damping multiplies the
     diagonals of A and D by 1 + damping.
 
-    Parameters
-    ----------
-    gauge
-        (R, 4 or 0) gauge freedoms that no prior fixes. Their outer product is added as a penalty,
-        which makes the matrix regular and changes no other move
-
     Raises
     ------
     LinAlgError
-        If the lever or the lens is undetermined as well.
+        If an unknown is undetermined: without a prior map, four moves change no pixel.
     """
     # A^-1, block by block
     blocks = terms.by_led * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
@@ -465,8 +433,7 @@ def eliminate_lights(terms: NormalEquations, gauge: Floats, damping: float) -> R
     matrix[np.diag_indices_from(matrix)] += damping * terms.rest.diagonal()
     # Scale D to a unit diagonal: the unknowns have different units (rad, m, px).
     scale = 1 / np.sqrt(terms.rest.diagonal())
-    gauge_basis, _ = np.linalg.qr(gauge / scale[:, None])
-    matrix = matrix * scale * scale[:, None] + gauge_basis @ gauge_basis.T
+    matrix = matrix * scale * scale[:, None]
     return ReducedSystem(inverse, elimination, cho_factor(matrix, lower=True), scale)
 
 
@@ -527,7 +494,7 @@ def adjust(
     for _ in range(STEPS):
         # 3. and 4. Eliminate the lights, solve, and substitute back. More damping makes a matrix regular.
         try:
-            led, rest = step(terms, eliminate_lights(terms, free_gauge(bundle), damping))
+            led, rest = step(terms, eliminate_lights(terms, damping))
         except LinAlgError:
             if damping > 1e6:
                 raise

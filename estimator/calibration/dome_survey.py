@@ -5,18 +5,17 @@ The method is bundle adjustment (`bundle_adjustment`) from an approximate map an
 1. Improve the start attitudes, and reject wrong identifications (`_reject_misidentified`).
 2. Select the connected subset: lights and frames that the sightings determine (`survey_subset`).
 3. Adjust all unknowns by least squares (`bundle_adjustment.adjust`).
-4. Transform the solution to the gauge (`in_gauge`).
-5. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
+4. Compute the covariances, and the misfit sqrt(chi-square / redundancy). If the noise is to be fitted, multiply it by
    the misfit and repeat from step 3 (`_fit`).
 
-Gauge freedoms, which no pixel can determine, and the constraints that fix them here:
+Gauge freedoms, which no pixel can determine, and what fixes them here:
 
-* rotation of the lab frame (3): every light rotates by G, every body_from_lab by G^-1. Fixed by the start map: the
-  survey is rotated onto it in the least-squares sense.
+* rotation of the lab frame (3): every light rotates by G, every body_from_lab by G^-1. Fixed by the start map, which is
+  used as a measurement: each of its positions is inaccurate (leds_sigma_m), but there are many.
 * rotation of the body frame against the camera (3): body_from_lab <- B body_from_lab, lever <- B lever,
   cam_from_body <- cam_from_body B^-1. cam_from_body is therefore fixed at its start value.
 * scale (1): lights and lever scale together. A known lens does not help, because a camera that rotates about the
-  bearing measures only directions. The mean size of the start map fixes it. The attitude does not depend on it.
+  bearing measures only directions. The start map fixes it. The attitude does not depend on it.
 
 The focal length is observable (yaw closes at 360 degrees). The principal point is observable weakly: its effect differs
 from a rotation of the camera only by the square of the field angle.
@@ -24,8 +23,7 @@ from a rotation of the camera only by the square of the field angle.
 Three more moves are nearly free if the field of view is narrow: conformal maps of the sphere of directions.
 tan(t/2) <- k tan(t/2) for every angle t from an axis stretches each field equally in both directions, and a small
 change of the lights' distances hides the stretch; only its gradient across one field remains. The scale of tilts is
-then wrong by about 0.1 percent, whatever the number of lights. The start map constrains these moves if it is used as a
-measurement (leds_sigma_m): each of its positions is inaccurate, but there are many.
+then wrong by about 0.1 percent, whatever the number of lights. The start map constrains these moves as well.
 """
 
 from collections.abc import Sequence
@@ -48,7 +46,6 @@ from estimator.core.checks import Floats, Ints
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
-LOSSES: dict[str, float] = {"linear": np.inf, "cauchy": CAUCHY}
 GATE = 5.0  # residuals above this many robust sigmas are outliers in the final fit
 GROSS_GATE = 6.0  # the same for the first rejection, after only the attitudes are fitted
 # Least number of redundant coordinates of a survey that estimates its noise from them.
@@ -85,8 +82,7 @@ class DomeFrame:
 class DomeSurvey:
     """Result of a dome survey.
 
-    The covariances are of errors against the truth if the start map is used as a measurement. Otherwise they are
-    relative to the gauge and do not include its error.
+    The covariances are of errors against the truth.
 
     Attributes
     ----------
@@ -122,7 +118,7 @@ class DomeSurvey:
         Factor by which sigma_px was multiplied; 1 unless the noise is fitted
     common_m, common_camera
         The part of the covariances that all lights, lever and lens share, as of `LedMap`: (M, N, 3)
-        and (M, 11); None without the start map as a measurement
+        and (M, 11)
     """
 
     status: str
@@ -139,9 +135,9 @@ class DomeSurvey:
     lens_covariance: Floats
     rms_px: float
     misfit: float
-    noise_scale: float = 1.0
-    common_m: Floats | None = None
-    common_camera: Floats | None = None
+    noise_scale: float
+    common_m: Floats
+    common_camera: Floats
 
     @property
     def focal_sigma_px(self) -> float:
@@ -154,8 +150,8 @@ class DomeSurvey:
         leds = self.leds
         row = self.surveyed
         total_m2 = self.led_covariance_m2[row]
-        common_m = None if self.common_m is None else self.common_m[:, row]
-        shared_m2 = 0.0 if common_m is None else np.einsum("mni,mnj->nij", common_m, common_m)
+        common_m = self.common_m[:, row]
+        shared_m2 = np.einsum("mni,mnj->nij", common_m, common_m)
         return LedMap(
             leds.id[row],
             leds.position_m[row],
@@ -175,8 +171,8 @@ def survey(
     lever_start: Lever,
     camera_start: Camera,
     fit_distortion: bool = False,
-    loss: str = "linear",
-    leds_sigma_m: float = np.inf,
+    *,
+    leds_sigma_m: float,
     fit_noise: bool = False,
     assumed: Assumed | None = None,
 ) -> DomeSurvey:
@@ -190,10 +186,8 @@ def survey(
         Start values of the map, the lever and the camera
     fit_distortion
         Also fit k1, k2, p1, p2; k3 has no visible effect in a narrow field
-    loss
-        "linear", or "cauchy": wrong identifications are rejected first; those of a light seen only twice hardly show
     leds_sigma_m
-        Standard deviation of the start map per axis, used as a measurement; inf: it is only a start value
+        Standard deviation of the start map per axis, which is used as a measurement
     fit_noise
         Multiply sigma_px by the misfit and fit again until the misfit is 1 (estimation of a variance component: Koch
         1999, Parameter Estimation and Hypothesis Testing in Linear Models, section 3.6). The weights of pixels and map
@@ -209,16 +203,8 @@ def survey(
     Unconnected
         If the frames form several groups.
     """
-    if loss not in LOSSES:
-        raise ValueError(f"survey: unknown loss {loss!r}; allowed: {', '.join(LOSSES)}")
-    if not leds_sigma_m > 0:
-        raise ValueError(
-            f"survey: leds_sigma_m is {leds_sigma_m}; allowed: above 0, inf for a start only"
-        )
-    if assumed and np.isinf(leds_sigma_m):
-        raise ValueError(
-            "survey: an assumed lever needs the map for all else; allowed: a finite leds_sigma_m"
-        )
+    if not 0 < leds_sigma_m < np.inf:
+        raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: finite, above 0")
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
     check_map(leds_start)
@@ -227,7 +213,7 @@ def survey(
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
     start = Bundle.start(leds_start, lever_start, camera_start, attitudes, fit_distortion)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
-    fit = _fit(start, sightings, LOSSES[loss], fit_noise)
+    fit = _fit(start, sightings, fit_noise)
     # The frame, and the row in it, of each rejected sighting.
     row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
     outliers = np.column_stack([sightings.frame, row])[~fit.keep]
@@ -235,7 +221,7 @@ def survey(
 
 
 class _Fit(NamedTuple):
-    """A fitted subset, the (M,) mask of sightings kept, the quality of the fit, and its common errors if any."""
+    """A fitted subset, the (M,) mask of sightings kept, the quality of the fit, and its common errors."""
 
     subset: Subset
     keep: np.ndarray
@@ -243,10 +229,10 @@ class _Fit(NamedTuple):
     covariances: Covariances
     misfit: float
     noise_scale: float
-    common: tuple[Floats, Floats] | None
+    common: tuple[Floats, Floats]
 
 
-def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> _Fit:
+def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
     """Fit the connected subset of the observations: the numbered steps of the module.
 
     Raises
@@ -255,11 +241,10 @@ def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> 
         If the lever or the lens is undetermined.
     """
     covariances = None
-    common = None
     scale = 1.0
     try:
         # 1. Wrong identifications
-        start, keep = _reject_misidentified(start, sightings, width)
+        start, keep = _reject_misidentified(start, sightings)
         # 2. Connected subset
         subset = connected_subset(start, sightings, keep)
         for _ in range(NOISE_ROUNDS if fit_noise else 1):
@@ -268,20 +253,16 @@ def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> 
                 subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index]
             )
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
-            # 4. Gauge. If the map as a measurement fixes it, the fit is in that gauge already.
-            if np.isinf(fitted.map_sigma_m):
-                fitted = in_gauge(fitted)
             subset = replace(subset, bundle=fitted, sightings=scaled)
-            # 5. Covariances, misfit, and noise
-            covariances = _covariances(subset)
+            # 4. Covariances, misfit, and noise
+            covariances = bundle_covariance.covariance(_terms(subset), fitted)
             if fit_noise:
                 check_redundancy(subset, covariances)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
-        if np.isfinite(subset.bundle.map_sigma_m):
-            common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
+        common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
     except LinAlgError:
         # A singular matrix raises the same ValueError as a nearly singular one
         covariances = None
@@ -292,41 +273,9 @@ def _fit(start: Bundle, sightings: Sightings, width: float, fit_noise: bool) -> 
     return _Fit(subset, keep, converged, covariances, misfit, scale, common)
 
 
-def in_gauge(fitted: Bundle) -> Bundle:
-    """Return the bundle rotated and scaled onto its start map; its pixels do not change.
-
-    1. Find the rotation G of the lab frame onto the start map.
-    2. Find the scale s onto the start map.
-    3. Apply them: x <- s G x, A <- A G^T, r <- s r.
-    """
-    # 1. Rotation
-    position_m = fitted.position_m
-    start_m = fitted.map_m
-    rotation = Rotation.align_vectors(start_m, position_m)[0].as_matrix()
-    # 2. Scale. It makes the survey's projection on the start map equal to the start map's own sum of squares,
-    # sum(x_0 . s G x) = sum(x_0 . x_0): the linear constraint of `bundle_covariance.gauge_constraints`.
-    scale = np.sum(start_m**2) / np.sum(start_m * (position_m @ rotation.T))
-    # 3. Transformed bundle
-    return replace(
-        fitted,
-        position_m=scale * position_m @ rotation.T,
-        R_body_from_lab=fitted.R_body_from_lab @ rotation.T,
-        camera_body_m=scale * fitted.camera_body_m,
-    )
-
-
 def _terms(subset: Subset) -> ba.NormalEquations:
     """Return the normal equations of a fitted subset."""
     return ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
-
-
-def _covariances(subset: Subset) -> Covariances:
-    """Return the covariances of a fitted subset: of total errors with a measured map, else relative to the gauge."""
-    bundle = subset.bundle
-    terms = _terms(subset)
-    if np.isfinite(bundle.map_sigma_m):
-        return bundle_covariance.covariance(terms, bundle)
-    return bundle_covariance.covariance_in_gauge(terms, bundle)
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
@@ -338,19 +287,17 @@ def _misfit(subset: Subset, covariances: Covariances) -> float:
 def redundancy(subset: Subset, covariances: Covariances) -> float:
     """Return the number of pixel coordinates minus the number of unknowns that they determine.
 
-    With the map as a measurement, the pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of
-    the lights, and the map determines the rest. Without it the pixels determine U minus the four gauge freedoms. An
-    assumed lever and focal length are counted in the same way as the map.
+    The pixels determine U - tr(C) / sigma_map^2 of the U unknowns, C the covariance of the lights, and the map
+    determines the rest: at least the four gauge freedoms. An assumed lever and focal length are counted in the same way
+    as the map.
     """
     bundle = subset.bundle
-    # Lights, rotations, lever and lens, minus the gauge freedoms
-    unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens - 4
-    if np.isfinite(bundle.map_sigma_m):
-        by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
-        if bundle.assumed:
-            by_prior += float(bundle.assumed.weight @ np.diag(covariances.shared)[:4])
-        unknowns -= max(by_prior - 4, 0.0)
-    return 2 * len(subset.index) - unknowns
+    # Lights, rotations, lever and lens
+    unknowns = 3.0 * (len(subset.led) + len(subset.frame) + 1) + bundle.free_lens
+    by_prior = float(np.einsum("nii->", covariances.by_led)) / bundle.map_sigma_m**2
+    if bundle.assumed:
+        by_prior += float(bundle.assumed.weight @ np.diag(covariances.shared)[:4])
+    return 2 * len(subset.index) - unknowns + max(by_prior, 4.0)
 
 
 def check_redundancy(subset: Subset, covariances: Covariances) -> None:
@@ -392,12 +339,10 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
     )
 
 
-def _reject_misidentified(
-    full: Bundle, sightings: Sightings, width: float
-) -> tuple[Bundle, np.ndarray]:
+def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, np.ndarray]:
     """Improve the start values and reject wrong identifications; return the bundle and the (M,) mask of those kept.
 
-    a. Fit the attitudes only. With an infinite width (least squares) this is all.
+    a. Fit the attitudes only.
     b. Reject gross outliers: residuals beyond GROSS_GATE robust sigmas.
     c. Fit the whole bundle with Cauchy's loss, for a noise that shrinks with the residuals until it settles.
     d. Reject residuals beyond GATE robust sigmas.
@@ -412,8 +357,6 @@ def _reject_misidentified(
     subset = connected_subset(full, sightings, keep)
     fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
     full = subset.insert_into(full, fitted)
-    if np.isinf(width):
-        return full, keep
     # b. Gross outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GROSS_GATE)
     subset = connected_subset(full, sightings, keep)
@@ -422,7 +365,7 @@ def _reject_misidentified(
     previous = np.inf
     while (scale := ba.robust_scale(fitted, subset.sightings)) < 0.9 * previous:
         noisy = replace(subset.sightings, sigma_px=scale * subset.sightings.sigma_px)
-        fitted = ba.adjust(fitted, noisy, width, decrement=0.1)[0]
+        fitted = ba.adjust(fitted, noisy, CAUCHY, decrement=0.1)[0]
         previous = scale
     # d. Outliers
     keep[subset.index] = _inliers(fitted, subset.sightings, GATE)
@@ -468,11 +411,9 @@ def _report(
     by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
     residual = ba.residuals(subset.bundle, subset.sightings)
     residual_px = residual * subset.sightings.sigma_px[:, None]
-    common_m = common_camera = None
-    if fit.common:
-        common_m = np.zeros((len(fit.common[0]), lights, 3))
-        common_m[:, subset.led], by_camera = fit.common
-        common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
+    common_m = np.zeros((len(fit.common[0]), lights, 3))
+    common_m[:, subset.led], by_camera = fit.common
+    common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
     return DomeSurvey(
         status,
         replace(leds, position_m=full.position_m),

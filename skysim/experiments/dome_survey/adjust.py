@@ -275,13 +275,12 @@ def with_names(run: SurveyRun) -> SurveyRun:
     position_m = run.prior.leds.position_m.copy()
     position_m[new] = survey.leds.position_m[old]
     order = np.argsort(name)
-    common_m = survey.common_m
     renamed = replace(
         survey,
         leds=replace(survey.leds, position_m=position_m),
         led_covariance_m2=survey.led_covariance_m2[order],
         surveyed=survey.surveyed[order],
-        common_m=None if common_m is None else common_m[:, order],
+        common_m=survey.common_m[:, order],
     )
     matches = [Correspondences(match.light, name[match.led]) for match in run.matches]
     return replace(run, survey=renamed, matches=matches)
@@ -342,7 +341,6 @@ def adjust_connected(
                 prior.lever,
                 prior.camera,
                 fit_distortion=uncertainty.fit_distortion,
-                loss="cauchy",
                 leds_sigma_m=uncertainty.led_sigma_m,
                 fit_noise=True,
                 assumed=before,

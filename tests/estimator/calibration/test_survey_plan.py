@@ -83,13 +83,11 @@ def simulated(
         if uses_assumed
         else None
     )
-    loss = "cauchy" if change else "linear"
     return survey(
         frames,
         listed,
         lever,
         camera,
-        loss=loss,
         leds_sigma_m=LIST_SIGMA_M,
         fit_noise=True,
         assumed=assumed,
