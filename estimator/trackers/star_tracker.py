@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
-from estimator.catalog import catalog, pair_index, quad_index, sky_index
+from estimator.catalog import catalog, index_file, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
 from estimator.core.camera import Camera
@@ -171,7 +171,7 @@ class StarTracker(FrameTracker):
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
         """Quads of the stars that form pairs, built on first use."""
-        return quad_index.build(self.sky, self._height_rad)
+        return index_file.quads(self.sky, self._height_rad)
 
     @property
     def _field_sr(self) -> float:
@@ -501,21 +501,23 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
-        most = self.settings.searched_stars
-        at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
-        if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
+        effort = self.settings.searched_stars, model.max_checks
+        calibrated = not (model.by_quads or self.focal_uncertainty)
+        if (
+            calibrated
+            and not self.camera.row_time_s
+            and misfit.are_small(sigma_px / self.camera.focal_px)
+        ):
             lights = flat_centroids(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
+            return misfit.identify(lights, self.sensor, self.quads, self.sky, *effort)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
+        index = self.quads, self.sky
+        if calibrated:
+            return star_quads.quads_or_pairs(detections, *index, *effort), 0.0
         if not model.by_quads:
-            return star_search.lost_in_space(
-                detections, self.sky, most, model.max_checks
-            ), 0.0
+            return star_search.lost_in_space(detections, self.sky, *effort), 0.0
         known = not self.focal_uncertainty
-        solution = star_quads.identify(
-            detections, self.quads, self.sky, most, model.max_checks, known
-        )
-        return solution, 0.0
+        return star_quads.identify(detections, *index, *effort, known), 0.0
 
     def refit(
         self,
