@@ -7,10 +7,10 @@ of a few adjacent bins:
    a pair (`_sweep`).
 2. Sort them into bins (`counting_sort`).
 
-Stars are binned by direction (`Cells`) in the cells of the cube [-1, 1]^3 about the unit sphere, for searches within
-any angle (`within`, `nearest`). The stars are listed cell after cell. A search within a chord visits the cells that meet
-the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each (x, y) column
-is one loop.
+Stars are binned by direction (`Cells`): the cube [-1, 1]^3 about the unit sphere is divided into cells, for searches
+within any angle (`within`, `nearest`). The stars are listed cell after cell. A search within a chord visits the cells
+that meet the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each
+(x, y) column is one loop.
 """
 
 from math import pi, sqrt

@@ -412,7 +412,7 @@ CHANGED = 0.9  # share of a star's information below which the field is fitted a
 
 def are_small(sigma_rad: Floats) -> bool:
     """Return whether companions are undetectable: their greatest error is below the error of every centroid."""
-    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
+    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD[-1])
 
 
 def with_companions(

@@ -31,6 +31,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.vectors import rotation_of
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import advice
@@ -562,7 +563,7 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
-        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        cam_from_ref = rotation_of(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         common_rad2 = None
         solver = self.settings.solver
