@@ -31,6 +31,7 @@ from estimator.core.constants import (
     TT_MINUS_UTC_S,
 )
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
 
@@ -419,7 +420,7 @@ def from_columns(
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
     """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
-    return unit(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
+    return normalized(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
 
 
 def apparent(stars: StarCatalog, observer: Observer) -> Floats:
@@ -434,7 +435,7 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     """
     # 1. and 2. Proper motion and parallax.
     vectors = at_epoch(stars, observer.epoch_yr)
-    vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
+    vectors = normalized(vectors - stars.parallax_rad[:, None] * observer.position_au)
     distance_au = np.linalg.norm(observer.position_au)
     from_sun = observer.position_au / distance_au
     along = vectors @ from_sun
@@ -442,14 +443,9 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disk,
     # where no star is visible.
     deflection = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
-    vectors = unit(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
+    vectors = normalized(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
     # 4. Aberration.
-    return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
-
-
-def unit(vectors: Floats) -> Floats:
-    """(N, 3) vectors, normalized."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return normalized(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
 
 
 def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
@@ -460,7 +456,12 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
     result = StarCatalog(
-        stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr
+        stars.id[first],
+        normalized(means[:, :3]),
+        means[:, 3:6],
+        means[:, 6],
+        v_mag,
+        stars.epoch_yr,
     )
     return result.brightest_first()
 

@@ -33,10 +33,8 @@ HEAD = SIDE**4 + 1  # words of `first`
 
 def folder() -> Path:
     """Return the folder of the files."""
-    own = os.environ.get("ESTIMATOR_CACHE_DIR")
-    return Path(
-        own or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "estimator")
-    ).expanduser()
+    user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.environ.get("ESTIMATOR_CACHE_DIR") or f"{user}/estimator").expanduser()
 
 
 def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:

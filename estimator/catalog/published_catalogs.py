@@ -33,6 +33,7 @@ from estimator.catalog.sky_index import Cells, within
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
+from estimator.core.vectors import normalized
 
 # Color indexes of a G2 star, used where the catalog has no color.
 SUN_B_V = 0.65
@@ -137,7 +138,7 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     by_light = np.argsort(merged, kind="stable")
     return OnBoard(
         stars.id[order][first][by_light],
-        catalog.unit(means)[by_light],
+        normalized(means)[by_light],
         merged[by_light],
         components[by_light],
         stars.epoch_yr,

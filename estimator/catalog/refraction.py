@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from estimator.catalog.catalog import utc
 from estimator.core import checks
@@ -130,21 +131,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
             2004.3109 * centuries - 0.42665 * centuries**2,
         ]
     )
-    return _about_z(zeta) @ _about_y(-theta) @ _about_z(z) @ of_date
-
-
-def _about_z(angle: float) -> Floats:
-    """(3, 3) matrix of components in axes turned by the angle about z."""
-    c = np.cos(angle)
-    s = np.sin(angle)
-    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-
-
-def _about_y(angle: float) -> Floats:
-    """(3, 3) matrix of components in axes turned by the angle about y."""
-    c = np.cos(angle)
-    s = np.sin(angle)
-    return np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    return Rotation.from_euler("ZYZ", [-zeta, theta, -z]).apply(of_date)
 
 
 def refraction_constants(

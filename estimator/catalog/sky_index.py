@@ -3,8 +3,7 @@
 Pairs (`build`) are sorted into bins of equal width in angle, so that the candidates for a measured angle are the pairs
 of a few adjacent bins:
 
-1. Find all pairs by a sweep along z: with the stars sorted by z, only stars with |dz| up to the greatest chord can form
-   a pair (`_sweep`).
+1. Find all pairs (`close_pairs`).
 2. Sort them into bins (`counting_sort`).
 
 Stars are binned by direction (`Cells`): the cube [-1, 1]^3 about the unit sphere is divided into cells, for searches
@@ -18,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
@@ -266,30 +266,26 @@ def build(
     vectors = sky.vectors[:paired]
     if len(vectors) ** 2 * share > MOST_PAIRS:
         vectors = vectors[: int(np.sqrt(MOST_PAIRS / share))]
-    by_z = np.argsort(vectors[:, 2])
-    sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
-    # 1. Find the pairs. A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
-    found = np.empty((0, 2), np.int32)
-    half_chord = np.empty(0)
-    total = int(1.2 * len(vectors) ** 2 * share) + 1000
-    while total > len(found):
-        found = np.empty((total, 2), np.int32)
-        half_chord = np.empty(total)
-        total = _sweep(*sorted_xyz, 2 * np.sin(max_angle_rad / 2), found, half_chord)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    # In place: there may be millions.
-    angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])
-    angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
+    # 1. Find the pairs.
+    pair, angle_rad = close_pairs(vectors, max_angle_rad)
     # 2. Sort them into bins; the width leaves the greatest angle in the last bin, whatever the rounding.
-    bins = max(total // PAIRS_PER_BIN, 1)
+    bins = max(len(pair) // PAIRS_PER_BIN, 1)
     bin_rad = max_angle_rad * (1 + 1e-9) / bins
     first, order = counting_sort((angle_rad / bin_rad).astype(np.int32), bins)
-    pair = by_z.astype(np.int32)[found[order]]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
         )
-    return sky._replace(pair=pair, first=first, bin_rad=bin_rad)
+    return sky._replace(pair=pair[order], first=first, bin_rad=bin_rad)
+
+
+def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[NDArray[np.int32], Floats]:
+    """The (P, 2) rows of all pairs of (N, 3) unit vectors up to an angle, and their (P,) angles."""
+    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    return pair, 2 * np.arcsin(np.minimum(half_chord, 1.0))
 
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
@@ -317,42 +313,3 @@ def _smoothed_histogram(mag: Floats) -> Floats:
 def magnitude_density(sky: SkyIndex, mag: float) -> float:
     """Probability density of the catalog's magnitudes at `mag`, 1 / mag."""
     return sky.density[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.density) - 1)]
-
-
-@jit
-def _sweep(
-    x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats
-) -> int:
-    """Step 1: find all pairs up to a chord among stars sorted by z.
-
-    Parameters
-    ----------
-    x, y, z
-        (N,) components of the unit vectors
-    reach
-        Greatest chord
-    found, half_chord
-        (P, 2) rows of the pairs and (P,) half-chords, written in place; no more than the arrays hold
-
-    Returns
-    -------
-    int
-        Number of pairs; one greater than the arrays asks for another sweep
-    """
-    total = 0
-    for i in range(len(z)):
-        for j in range(i + 1, len(z)):
-            dz = z[j] - z[i]
-            if dz > reach:
-                break  # the stars are sorted by z: all further ones are out of reach too
-            dx = x[j] - x[i]
-            dy = y[j] - y[i]
-            chord2 = dx * dx + dy * dy + dz * dz
-            if chord2 > reach * reach:
-                continue
-            if total < len(half_chord):
-                found[total, 0] = i
-                found[total, 1] = j
-                half_chord[total] = sqrt(chord2) / 2
-            total += 1
-    return total

@@ -126,27 +126,22 @@ class StarTracker(FrameTracker):
         self.stars = catalog.merge_doubles(
             apparent_stars, settings.merge_px / camera.focal_px
         )
-        limit_mag = catalog.limit_for_density(
-            self.stars, self._field_sr, settings.field_stars
-        )
-        index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
+        paired = int(min(settings.field_stars * 4 * np.pi / self._field_sr, len(self.stars)))
+        places = self.stars.vectors, self.stars.v_mag
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
         if default:
-            self.sky = sky_index.build(
-                self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars)
-            )
+            self.sky = sky_index.build(*places, longest_rad, paired)
             patterns = len(self.sky.pair)
         else:
-            self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
+            self.sky = sky_index.build_without_pairs(*places)
             known = settings.zero_point_mag is not None
+            magnitude = self.stars.v_mag[:paired] if known else None
             self.index = pair_index.build(
-                index_stars.vectors,
-                longest_rad,
-                magnitude=index_stars.v_mag if known else None,
+                self.stars.vectors[:paired], longest_rad, magnitude=magnitude
             )
             patterns = len(self.index.pair)
         self.field_matcher = FieldMatcher(

@@ -44,7 +44,6 @@ def apart(a: NDArray, b: NDArray) -> NDArray:
     catalog.StarCatalog.brightest_first,
     catalog.at_epoch,
     catalog.apparent,
-    catalog.unit,
 )
 @given(rng=SEEDS, year=some.floats(1900, 2100))
 def test_stars_move_across_the_sky_and_no_farther_than_they_can(
@@ -57,9 +56,6 @@ def test_stars_move_across_the_sky_and_no_farther_than_they_can(
     )
     np.testing.assert_allclose(
         catalog.at_epoch(stars, stars.epoch_yr), stars.vectors, rtol=0, atol=1e-15
-    )
-    np.testing.assert_allclose(
-        catalog.unit(stars.vectors * 7.0), stars.vectors, rtol=0, atol=1e-15
     )
     there = catalog.Observer(year, units(rng, 1)[0], 3e4 * units(rng, 1)[0])
     seen = catalog.apparent(stars, there)
@@ -251,6 +247,7 @@ def test_a_prepared_catalog_counts_every_star(
     sky_index.build_grid,
     sky_index.build,
     sky_index.build_without_pairs,
+    sky_index.close_pairs,
     SkyIndex.bytes,
 )
 @given(rng=SEEDS, most_rad=some.floats(0.3, 3.2), count=some.integers(8, 50))
@@ -261,6 +258,10 @@ def test_both_indexes_hold_the_existing_pairs(
     mag = np.sort(rng.uniform(0, 6, count))
     every = apart(vectors, vectors)[np.triu_indices(count, 1)]
     pairs = int(np.count_nonzero(every <= most_rad))
+    pair, angle_rad = sky_index.close_pairs(vectors, most_rad)
+    expected = apart(vectors, vectors)[tuple(pair.T)]
+    np.testing.assert_allclose(angle_rad, expected, rtol=0, atol=1e-7)
+    assert len(pair) == pairs
     for build in (
         pair_index.build,
         lambda *arguments: sky_index.build(arguments[0], mag, arguments[1]),

@@ -33,7 +33,7 @@ def test_the_stars_within_a_distance_match_brute_force(make, chord: float) -> No
             vectors, known.first, known.row, known.side, *place, chord
         )
         assert near == (off.argmin() if off.min() < chord else -1)
-        assert apart2 == pytest.approx(min(off.min(), chord) ** 2, abs=1e-30)
+        assert apart2 == pytest.approx(min(off.min(), chord) ** 2, rel=1e-12, abs=1e-30)
 
 
 def test_every_star_is_in_one_cell() -> None:
