@@ -104,7 +104,7 @@ def quads_or_pairs(
     candidates = len(stars.pair) * gate / (stars.bin_rad * (len(stars.first) - 1))
     if np.isfinite(detections.mag[0]):
         candidates *= MAG_SHARE
-    checks = int(min(QUAD_EFFORT * candidates, float(max_checks)))
+    checks = int(min(QUAD_EFFORT * candidates, 2.0 * max_checks))
     free = changed(detections, len(detections.sigma), 1.0, star_search.WRONG_FOCAL)
     solution = identify(free, quads, stars, max_detections, checks, True)
     if len(solution.star):

@@ -1,11 +1,10 @@
 """Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
 
 The stages are detection and centroiding (`pipeline`), identification, and solution. The default identifier computes
-identity, attitude and covariance in one step by Bayesian evidence, from pairs of stars
-(`identification/star_search.py`). If the focal length is uncertain, quads of stars (`identification/star_quads.py`) are
-searched first, and the focal length and the first radial distortion coefficient are fitted to each frame's stars. Quads
-also find a calibrated focal length that is wrong: where a short search by pairs fails, or where its residuals are too
-large. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
+identity, attitude and covariance in one step by Bayesian evidence, from quads of stars
+(`identification/star_quads.py`) and then from pairs (`identification/star_search.py`). If the focal length is
+uncertain, the longer search by quads is first, and the focal length and the first radial distortion coefficient are
+fitted to each frame's stars. Quads also find a calibrated focal length that is wrong. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
 the match is significant.
 """
 
