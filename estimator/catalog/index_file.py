@@ -56,7 +56,7 @@ def read(path: Path) -> QuadIndex:
     """Map a file into memory. Raises OSError or ValueError if there is none, or if it is damaged."""
     # Copy on write: compiled code has one version, for arrays that can be written.
     words = np.asarray(np.memmap(path, np.int32, "c"))
-    if len(words) <= HEAD or zlib.crc32(words[:-1]) != words[-1].view(np.uint32):
+    if len(words) <= HEAD or zlib.crc32(words[:-1].data) != words[-1].view(np.uint32):
         raise ValueError(f"{path}: damaged")
     star, code = words[HEAD:-1].reshape(2, -1, 4)
     return QuadIndex(star, code.view(np.float32), words[:HEAD])

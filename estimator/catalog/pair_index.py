@@ -215,4 +215,4 @@ def neighbor_range(
 @jit
 def first_from(values: Floats, begin: int, end: int, least: float) -> int:
     """The first row in [begin, end) of sorted values that is at least `least`, by bisection; `end` if there is none."""
-    return begin + np.searchsorted(values[begin:end], least)
+    return begin + int(np.searchsorted(values[begin:end], least))

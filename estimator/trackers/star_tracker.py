@@ -4,8 +4,8 @@ The stages are detection and centroiding (`pipeline`), identification, and solut
 identity, attitude and covariance in one step by Bayesian evidence, from quads of stars
 (`identification/star_quads.py`) and then from pairs (`identification/star_search.py`). If the focal length is
 uncertain, the longer search by quads is first, and the focal length and the first radial distortion coefficient are
-fitted to each frame's stars. Quads also find a calibrated focal length that is wrong. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
-the match is significant.
+fitted to each frame's stars. Quads also find a calibrated focal length that is wrong. The candidates of a published
+identifier (`registry`) are matched to the full catalog, refined, and accepted if the match is significant.
 """
 
 from __future__ import annotations
