@@ -24,17 +24,16 @@ from estimator.catalog.quad_index import SIDE, QuadIndex
 from estimator.catalog.sky_index import SkyIndex
 
 FORM = b"quads 1"
-FEW_STARS = (
-    50_000  # the index of fewer stars is built in a fraction of a second, and not kept
-)
+# The index of fewer stars is built in a fraction of a second, and not kept.
+FEW_STARS = 50_000
 MOST_FILES = 8
 HEAD = SIDE**4 + 1  # words of `first`
 
 
 def folder() -> Path:
     """Return the folder of the files."""
-    user = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(os.environ.get("ESTIMATOR_CACHE_DIR") or f"{user}/estimator").expanduser()
+    user = os.getenv("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.getenv("ESTIMATOR_CACHE_DIR") or f"{user}/estimator").expanduser()
 
 
 def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:

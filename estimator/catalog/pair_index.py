@@ -206,9 +206,8 @@ def neighbor_range(
 ) -> tuple[int, int]:
     """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
     begin = first_neighbor(index, star, low_rad)
-    end = begin
-    while end < index.first[star + 1] and index.separation_rad[end] <= high_rad:
-        end += 1
+    beyond = np.nextafter(high_rad, np.inf)
+    end = first_from(index.separation_rad, begin, index.first[star + 1], beyond)
     return begin, end
 
 

@@ -131,7 +131,7 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     order = np.argsort(stars.magnitude, kind="stable")
     vectors = stars.vectors[order]
     magnitude = stars.magnitude[order]
-    groups = catalog.close_groups(vectors, closer_than_rad)
+    groups = catalog.close_groups(vectors, 2 * np.sin(closer_than_rad / 2))
     means, merged = catalog.light_centers(vectors, magnitude, groups)
     _, first = np.unique(groups, return_index=True)  # the brightest of each group
     components = np.bincount(groups, stars.components[order]).astype(np.int64)

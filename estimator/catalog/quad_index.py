@@ -13,7 +13,7 @@ negative, and C is the one with the smaller first number.
 1. Choose stars that are bright for their surroundings, PER_CIRCLE in a circle as high as the field, so that the
    brightest detections of a frame are among them everywhere in the sky (`_locally_bright`). The number of quads grows
    with its fourth power and with the number of circles that cover the sky: it is smaller for narrow fields, so that
-   there are about MOST_QUADS at any scale.
+   there are no more quads than in MOST_CIRCLES.
 2. Form all quads of a chosen star and its chosen neighbors, and their codes (`_quads`).
 3. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
 
@@ -38,11 +38,10 @@ from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
-# Stars of quads in a circle as high as the field; the least number, and the number of quads beyond which it is reduced.
+# Stars of quads in a circle as high as the field; the least number, and the number of circles that reduces it.
 PER_CIRCLE = 10
 LEAST_PER_CIRCLE = 6
-MOST_QUADS = 2.5e6
-QUADS_PER_CIRCLE = 820  # measured, with PER_CIRCLE stars
+MOST_CIRCLES = 3000  # of 820 quads each, measured with PER_CIRCLE stars
 # Greatest and least distance of A and B, in units of the field's height.
 LONGEST = 0.75
 SHORTEST = 0.15
@@ -77,23 +76,21 @@ def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Build the index of the stars of `sky` for fields of the given height: the module's steps."""
     # 1. Chosen stars.
     # 16 / height^2 circles cover the sky.
-    share = min(MOST_QUADS / QUADS_PER_CIRCLE * height_rad * height_rad / 16, 1.0)
+    share = min(MOST_CIRCLES * height_rad * height_rad / 16, 1.0)
     count = max(PER_CIRCLE * share**0.25, LEAST_PER_CIRCLE)
     cells = Cells(sky.side, sky.cell_first, sky.cell_star)
     row = _locally_bright(cells, sky.vectors, _chord(height_rad / 2), count)
     chosen = sky.vectors[row]
     cells = build_grid(chosen)
     # 2. Quads: the first pass only counts them.
-    total = 1
-    found = np.empty((0, 4), np.int32)
-    code = np.empty((0, 4), np.float32)
-    while total > len(found):
+    total = 0
+    bounds = _chord(LONGEST * height_rad), SHORTEST * height_rad
+    for _ in range(2):
         found = np.empty((total, 4), np.int32)
         code = np.empty((total, 4), np.float32)
-        reach = _chord(LONGEST * height_rad)
-        total = _quads(chosen, cells, reach, SHORTEST * height_rad, found, code)
+        total = _quads(chosen, cells, *bounds, found, code)
     # 3. Cells.
-    first, order = counting_sort(_grid_cells(code[:total]), SIDE**4)
+    first, order = counting_sort(_grid_cells(code), SIDE**4)
     return QuadIndex(row[found[order]], code[order], first)
 
 
@@ -107,19 +104,13 @@ def _locally_bright(
     cells: Cells, xyz: Floats, radius: float, count: float
 ) -> NDArray[np.int32]:
     """Step 1: rows of the stars, sorted by brightness, with fewer than `count` brighter ones within a chord."""
-    row = np.empty(len(xyz), np.int32)
     near = np.empty(len(xyz), np.int64)
-    chosen = 0
+    chosen = np.empty(len(xyz), np.bool_)
     for n in range(len(xyz)):
         found = within(cells, xyz, xyz[n, 0], xyz[n, 1], xyz[n, 2], radius, near)
         # The smaller row is the brighter star.
-        brighter = 0
-        for k in range(found):
-            brighter += near[k] < n
-        if brighter < count:
-            row[chosen] = n
-            chosen += 1
-    return row[:chosen].copy()
+        chosen[n] = np.sum(near[:found] < n) < count
+    return np.flatnonzero(chosen).astype(np.int32)
 
 
 @jit
@@ -177,10 +168,8 @@ def _quads(
                         found[total, 1] = b
                         found[total, 2] = near[k]
                         found[total, 3] = near[m]
-                        code[total, 0] = place[k, 0]
-                        code[total, 1] = place[k, 1]
-                        code[total, 2] = place[m, 0]
-                        code[total, 3] = place[m, 1]
+                        code[total, :2] = place[k]
+                        code[total, 2:] = place[m]
                         arrange(code[total], found[total])
                     total += 1
     return total

@@ -14,14 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog.catalog import utc
+from estimator.catalog.catalog import days_after_j2000, utc
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Allowed, Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
-    J2000,
     JULIAN_CENTURY_DAY,
     STANDARD_PRESSURE_HPA,
     STANDARD_TEMPERATURE_K,
@@ -77,10 +76,7 @@ class SiteAir:
 
     def zenith(self, t_s: float) -> Floats:
         """The (3,) zenith in ICRS axes t_s seconds after the epoch."""
-        epoch = utc(self.epoch)
-        if epoch.tzinfo is not None:
-            epoch = epoch.astimezone(datetime.UTC).replace(tzinfo=None)
-        days = (epoch - J2000).total_seconds() / DAY_S + t_s / DAY_S
+        days = days_after_j2000(utc(self.epoch)) + t_s / DAY_S
         return zenith_icrs(
             days, np.radians(self.latitude_deg), np.radians(self.longitude_deg)
         )

@@ -121,9 +121,8 @@ class StarTracker(FrameTracker):
             UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
         )
         # Stars that a frame can show, and the brighter ones among them that form patterns
-        apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(
-            apparent_stars, settings.merge_px / camera.focal_px
+            replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
         paired = int(min(settings.field_stars * 4 * np.pi / self._field_sr, len(self.stars)))
         places = self.stars.vectors, self.stars.v_mag
@@ -137,10 +136,10 @@ class StarTracker(FrameTracker):
             patterns = len(self.sky.pair)
         else:
             self.sky = sky_index.build_without_pairs(*places)
-            known = settings.zero_point_mag is not None
-            magnitude = self.stars.v_mag[:paired] if known else None
+            unknown = settings.zero_point_mag is None
+            bright, magnitude = (part[:paired] for part in places)
             self.index = pair_index.build(
-                self.stars.vectors[:paired], longest_rad, magnitude=magnitude
+                bright, longest_rad, magnitude=None if unknown else magnitude
             )
             patterns = len(self.index.pair)
         self.field_matcher = FieldMatcher(
@@ -496,6 +495,7 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
+        index = self.quads, self.sky
         effort = self.settings.searched_stars, model.max_checks
         calibrated = not (model.by_quads or self.focal_uncertainty)
         if (
@@ -504,15 +504,14 @@ class StarTracker(FrameTracker):
             and misfit.are_small(sigma_px / self.camera.focal_px)
         ):
             lights = flat_centroids(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, self.quads, self.sky, *effort)
+            return misfit.identify(lights, self.sensor, *index, *effort)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
-        index = self.quads, self.sky
         if calibrated:
             return star_quads.quads_or_pairs(detections, *index, *effort), 0.0
         if not model.by_quads:
             return star_search.lost_in_space(detections, self.sky, *effort), 0.0
-        known = not self.focal_uncertainty
-        return star_quads.identify(detections, *index, *effort, known), 0.0
+        found = star_quads.identify(detections, *index, *effort, not self.focal_uncertainty)
+        return found, 0.0
 
     def refit(
         self,
