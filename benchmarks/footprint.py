@@ -16,7 +16,7 @@ from benchmarks.timing import figure
 from estimator import Camera, Centroids, StarTracker, TrackingMode
 from estimator.trackers.warm_up import draw
 
-REPEATS = 200
+REPEATS = 100
 
 
 def rss_mb() -> float:
@@ -48,6 +48,9 @@ def measure() -> list[dict[str, Any]]:
         figure("tracker built in", built_s, "s", stars),
         figure("tracker built", rss_mb(), "MB", stars),
         figure("index of pairs", pairs_mb, "MB", stars),
+        figure(
+            "index of quads", sum(array.nbytes for array in tracker.quads) / 1e6, "MB", stars
+        ),
         figure("index of stars", tracker.sky.bytes / 1e6 - pairs_mb, "MB", stars),
     ]
     follower = TrackingMode(tracker)
@@ -62,8 +65,11 @@ def measure() -> list[dict[str, Any]]:
     light = light[:25]
     image = draw(camera, xy_px, 3000 * light / light.max() + 100, np.dtype("u2"))
     centroids = Centroids(xy_px, np.full(len(xy_px), 0.1), light)
+    turned_px = xy_px[:, ::-1].copy()
+    mirrored = Centroids(turned_px, centroids.sigma_px, light)
     for name, call in (
         ("centroids, lost in space", lambda: tracker.solve_centroids(centroids)),
+        ("centroids, refused", lambda: tracker.solve_centroids(mirrored)),
         ("frame, lost in space", lambda: tracker.solve(image)),
         ("frame, tracked", lambda: follower.solve(image, 0.0)),
     ):

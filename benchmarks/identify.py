@@ -1,15 +1,23 @@
-"""Lost-in-space solution from centroids of SHEFEX-2's camera, compared with tetra3rs."""
+"""Lost-in-space solution from centroids, compared with tetra3rs: SHEFEX-2's camera, and narrow fields of a deep sky.
+
+The deep sky is Gaia's to V 10 (`benchmarks.sky`). The narrow camera's index is built once and then read from disk; that
+of tetra3rs takes a minute, and is kept in out/ too.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import tempfile
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.timing import versus
+from benchmarks.sky import deep_catalog
+from benchmarks.timing import figure, verdict, versus
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
@@ -18,9 +26,19 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
 
 FIELDS = 100
+NARROW_FIELDS = 40
+NARROW_DEG = 2.6
+NARROW_PX = 1024
+FALSE_SHARES = 0.0, 0.3
+WRONG_RAD = np.radians(1 / 6)
 
 
 def measure() -> list[dict[str, Any]]:
+    """All rows of the area."""
+    return [shefex(), *narrow()]
+
+
+def shefex() -> dict[str, Any]:
     """100 random fields of 14.87 x 11.15 deg: the 15 brightest stars to V 5.75, 0.1 px noise, no false stars."""
     camera = Camera(659, 493, 25e-3 / 9.9e-6, (329.0, 246.0))
     stars = catalog.brighter_than(catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv"), 5.75)
@@ -28,14 +46,70 @@ def measure() -> list[dict[str, Any]]:
         camera, stars, catalog.at_epoch(stars, 2020.0), Settings(centroid_sigma_px=0.1)
     )
     fields = [field(tracker, np.random.default_rng([3, n])) for n in range(FIELDS)]
-    result = versus(
+    return versus(
         f"identify + solve {FIELDS} SHEFEX fields",
         lambda: [tracker.solve_centroids(centroids) for centroids in fields],
         "tetra3rs",
         tetra3rs(camera, fields),
-        repeats=5,
+        bar=1.0,
+        repeats=20,
     )
-    return [result]
+
+
+def narrow() -> list[dict[str, Any]]:
+    """Index and times of fields of 2.6 deg, all stars to V 10 (55 in a mean field), 0.1 px noise."""
+    stars = catalog.read(deep_catalog())
+    camera = Camera.from_fov(NARROW_PX, NARROW_PX, fov_deg=NARROW_DEG)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["ESTIMATOR_CACHE_DIR"] = folder
+        for step in ("built", "read"):
+            tracker = StarTracker.for_sky(camera, stars=stars)
+            begin = time.perf_counter()
+            megabytes = sum(array.nbytes for array in tracker.quads) / 1e6
+            taken = time.perf_counter() - begin
+            rows.append(figure(f"2.6 deg to V 10: index of quads {step} in", taken, "s"))
+        rows.append(figure("2.6 deg to V 10: index of quads", megabytes, "MB"))
+        tracker.warm_up()
+        for share in FALSE_SHARES:
+            rows += narrow_times(tracker, share)
+    return rows
+
+
+def narrow_times(tracker: StarTracker, false_share: float) -> list[dict[str, Any]]:
+    """Median and 90 % of the times of narrow fields with a share of false lights, and the fields solved right."""
+    name = f"2.6 deg to V 10, {100 * false_share:.0f} % false"
+    seconds = []
+    right = 0
+    for n in range(NARROW_FIELDS):
+        rng = np.random.default_rng([4, n])
+        attitude = Rotation.random(rng=rng)
+        seen = crowded(tracker, attitude, false_share, rng)
+        begin = time.perf_counter()
+        solved = tracker.solve_centroids(seen).cam_from_ref
+        seconds.append(time.perf_counter() - begin)
+        right += solved is not None and (solved * attitude.inv()).magnitude() < WRONG_RAD
+    middle, late = 1e3 * np.quantile(seconds, [0.5, 0.9])
+    what = f"{NARROW_FIELDS} fields"
+    return [
+        verdict(f"{name}: median", float(middle), "ms", what, 1.0),
+        figure(f"{name}: 90 %", float(late), "ms", what),
+        verdict(f"{name}: right", 100 * right / NARROW_FIELDS, "%", what, 98, least=True),
+    ]
+
+
+def crowded(
+    tracker: StarTracker, attitude: Rotation, false_share: float, rng: np.random.Generator
+) -> Centroids:
+    """All stars in the field at an attitude, with noise, and false lights of the catalog's magnitudes."""
+    rows, xy_px = tracker.field_matcher.in_field(tracker.camera, attitude)
+    false = round(len(rows) * false_share / (1 - false_share))
+    mag = tracker.stars.v_mag[rows] + 0.25 * rng.standard_normal(len(rows))
+    mag = np.concatenate([mag, rng.choice(tracker.stars.v_mag, false)])
+    places = rng.uniform(0, tracker.camera.width_px - 1, (false, 2))
+    xy_px = np.concatenate([xy_px + 0.1 * rng.standard_normal(xy_px.shape), places])
+    order = np.argsort(mag)
+    return Centroids(xy_px[order], np.full(len(order), 0.1), 10 ** (-0.4 * mag[order]))
 
 
 def field(tracker: StarTracker, rng: np.random.Generator) -> Centroids:

@@ -56,14 +56,20 @@ BODIES = {
 
 def measure() -> list[dict[str, Any]]:
     """All rows of the area."""
-    if not DEEP.is_file():
-        DEEP.parent.mkdir(parents=True, exist_ok=True)
-        star_archives.build_gaia(10.0, DEEP)
+    deep_catalog()
     return [
         *bodies(),
         *(row for fov_deg in FIELDS_DEG for row in narrow(fov_deg)),
         frame_time(),
     ]
+
+
+def deep_catalog() -> Path:
+    """The catalog of Gaia to V 10, which is built where it is missing."""
+    if not DEEP.is_file():
+        DEEP.parent.mkdir(parents=True, exist_ok=True)
+        star_archives.build_gaia(10.0, DEEP)
+    return DEEP
 
 
 def bodies() -> list[dict[str, Any]]:

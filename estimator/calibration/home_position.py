@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
-from estimator.catalog.catalog import unit
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +131,7 @@ def pooled(value: Floats, group: Ints) -> Floats:
     value, group
         (S,) samples, and the group of each: a light or a pair of lights
     """
-    count = np.bincount(group)
-    difference = value - (np.bincount(group, value) / np.maximum(count, 1))[group]
-    squares = np.bincount(group, difference**2)
-    return np.where(count > 1, np.sqrt(squares / np.maximum(count - 1, 1)), np.nan)
+    return np.sqrt(_covariance(value[:, None], group)[:, 0, 0])
 
 
 class _Samples(NamedTuple):
@@ -190,7 +187,7 @@ def calibrate(
     order, mean_m, brightness, count = _brightest_first(samples, at_home)
     covariance = _covariance(samples.lab_m, samples.led)[order]
     return HomeCatalog(
-        id_[order], unit(mean_m), brightness, mean_m, covariance, count, *epsilons
+        id_[order], normalized(mean_m), brightness, mean_m, covariance, count, *epsilons
     )
 
 
@@ -254,7 +251,7 @@ def _check(index: int, sighting: Sighting) -> None:
 def _separations(samples: _Samples) -> tuple[Floats, Ints]:
     """Return the angle about the bearing of every pair in every frame (eq. 45), and its pair's number."""
     # All pairs of each frame
-    direction = unit(samples.body_m)
+    direction = normalized(samples.body_m)
     first = []
     second = []
     for rows in np.split(
@@ -286,14 +283,14 @@ def _maximum(deviation: Floats, source: str) -> float:
     return float(finite.max())
 
 
-def _covariance(lab_m: Floats, led: Ints) -> Floats:
-    """Return the (N, 3, 3) sample covariance of each light's positions, m^2; NaN for a single position."""
-    count = np.bincount(led)
-    # Deviations from each light's mean position
-    mean_m = np.array([np.bincount(led, column) for column in lab_m.T]) / count
-    difference_m = lab_m - mean_m.T[led]
-    covariance = np.zeros((len(count), 3, 3))
-    np.add.at(covariance, led, np.einsum("si,sj->sij", difference_m, difference_m))
+def _covariance(value: Floats, group: Ints) -> Floats:
+    """Return the (G, D, D) sample covariance of each group's values (S, D); NaN for a single value."""
+    count = np.bincount(group)
+    # Deviations from each group's mean
+    mean = np.array([np.bincount(group, column) for column in value.T]) / np.maximum(count, 1)
+    difference = value - mean.T[group]
+    covariance = np.zeros((len(count), *2 * value.shape[1:]))
+    np.add.at(covariance, group, np.einsum("si,sj->sij", difference, difference))
     covariance[count < 2] = np.nan
     return covariance / np.maximum(count - 1, 1)[:, None, None]
 

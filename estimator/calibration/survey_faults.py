@@ -14,13 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import gammainccinv
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
+from estimator.catalog.catalog import close_groups
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.constants import SIGMA_PER_MAD
@@ -214,13 +213,10 @@ def stray_lights(
     )
     points = np.nan_to_num(points, nan=1e9)
     # 2. Groups
-    pairs = cKDTree(points).query_pairs(reach_m, output_type="ndarray")
-    size = len(points)
-    links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(size, size))
-    groups, label = connected_components(links, directed=False)
+    label = close_groups(points, reach_m)
     sigma_rad = sigma_px / held.camera.focal_px
     out = []
-    for group in range(groups):
+    for group in range(label.max() + 1):
         # 3. Meeting point
         rows = np.flatnonzero(label == group)
         place_m = _meeting_point(origins[rows], directions[rows], points[rows], sigma_rad)

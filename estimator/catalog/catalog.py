@@ -31,6 +31,7 @@ from estimator.core.constants import (
     TT_MINUS_UTC_S,
 )
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
 
@@ -240,6 +241,13 @@ def utc(date: object) -> datetime.datetime:
     return time
 
 
+def days_after_j2000(time_utc: datetime.datetime) -> float:
+    """Days from J2000.0 to a UTC time (naive means UTC), without leap seconds."""
+    if time_utc.tzinfo is not None:
+        time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
+    return (time_utc - J2000) / datetime.timedelta(days=1)
+
+
 def on_earth(time_utc: datetime.datetime) -> Observer:
     """The observer at the Earth's center at a UTC time (naive means UTC), from the IAU ephemeris `epv00`.
 
@@ -253,10 +261,8 @@ def on_earth(time_utc: datetime.datetime) -> Observer:
     except ImportError:
         message = "a date needs pyerfa (pip install pyerfa); without it: StarTracker(camera, stars, vectors)"
         raise ImageError(message) from None
-    if time_utc.tzinfo is not None:
-        time_utc = time_utc.astimezone(datetime.UTC).replace(tzinfo=None)
     # epv00 takes TDB; TT is within 2 ms of it.
-    days = (time_utc - J2000) / datetime.timedelta(days=1) + TT_MINUS_UTC_S / DAY_S
+    days = days_after_j2000(time_utc) + TT_MINUS_UTC_S / DAY_S
     _, barycentric = erfa.epv00(J2000_JD, days)
     meters_per_second = erfa.DAU / DAY_S
     return Observer(
@@ -419,7 +425,7 @@ def from_columns(
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:
     """(N, 3) barycentric unit vectors at a Julian year: R + (t - t0) dR/dt, normalized."""
-    return unit(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
+    return normalized(stars.vectors + (epoch_yr - stars.epoch_yr) * stars.drift_rad_yr)
 
 
 def apparent(stars: StarCatalog, observer: Observer) -> Floats:
@@ -434,7 +440,7 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     """
     # 1. and 2. Proper motion and parallax.
     vectors = at_epoch(stars, observer.epoch_yr)
-    vectors = unit(vectors - stars.parallax_rad[:, None] * observer.position_au)
+    vectors = normalized(vectors - stars.parallax_rad[:, None] * observer.position_au)
     distance_au = np.linalg.norm(observer.position_au)
     from_sun = observer.position_au / distance_au
     along = vectors @ from_sun
@@ -442,25 +448,25 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
     # The vector (e - (u.e) u) / (1 + u.e) has length cot(psi / 2). The floor keeps it finite behind the Sun's disk,
     # where no star is visible.
     deflection = (from_sun - along[:, None] * vectors) / np.maximum(1 + along, 1e-5)[:, None]
-    vectors = unit(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
+    vectors = normalized(vectors + SUN_DEFLECTION_RAD / distance_au * deflection)
     # 4. Aberration.
-    return unit(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
-
-
-def unit(vectors: Floats) -> Floats:
-    """(N, 3) vectors, normalized."""
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return normalized(vectors + observer.velocity_m_s / SPEED_OF_LIGHT_M_S)
 
 
 def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     """Replace each group of unresolved stars by one star at their center of light, with their total flux."""
-    groups = close_groups(stars.vectors, closer_than_rad)
+    groups = close_groups(stars.vectors, 2 * np.sin(closer_than_rad / 2))
     values = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
     means, v_mag = light_centers(values, stars.v_mag, groups)
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
     result = StarCatalog(
-        stars.id[first], unit(means[:, :3]), means[:, 3:6], means[:, 6], v_mag, stars.epoch_yr
+        stars.id[first],
+        normalized(means[:, :3]),
+        means[:, 3:6],
+        means[:, 6],
+        v_mag,
+        stars.epoch_yr,
     )
     return result.brightest_first()
 
@@ -492,15 +498,14 @@ def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
     return means, -2.5 * np.log10(total)
 
 
-def close_groups(vectors: Floats, closer_than_rad: float) -> Ints:
-    """Label each star with its group: the connected components of the graph of pairs closer than an angle.
+def close_groups(points: Floats, distance: float) -> Ints:
+    """Label each point (N, 3) with its group: the connected components of the graph of pairs within a distance.
 
-    Each star takes the least label among itself and its neighbors until none changes. scipy.sparse.csgraph does the
+    Each point takes the least label among itself and its neighbors until none changes. scipy.sparse.csgraph does the
     same, but takes longer to import than this to run.
     """
-    chord = 2 * np.sin(closer_than_rad / 2)
-    one, other = cKDTree(vectors).query_pairs(chord, output_type="ndarray").T
-    label = np.arange(len(vectors))
+    one, other = cKDTree(points).query_pairs(distance, output_type="ndarray").T
+    label = np.arange(len(points))
     before = np.empty(0, int)
     while not np.array_equal(label, before):
         before = label.copy()

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
@@ -103,11 +102,7 @@ def build(
             f"magnitudes {magnitudes.shape} of {len(vectors)} stars; allowed: one for each, the brightest first"
         )
     # All pairs, sorted by angle.
-    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
-    angle = 2 * np.arcsin(half_chord)
+    pair, angle = sky_index.close_pairs(vectors, max_angle_rad)
     order = np.argsort(angle, kind="stable")
     pair = np.ascontiguousarray(pair[order])
     angle = angle[order]
@@ -211,19 +206,12 @@ def neighbor_range(
 ) -> tuple[int, int]:
     """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
     begin = first_neighbor(index, star, low_rad)
-    end = begin
-    while end < index.first[star + 1] and index.separation_rad[end] <= high_rad:
-        end += 1
+    beyond = np.nextafter(high_rad, np.inf)
+    end = first_from(index.separation_rad, begin, index.first[star + 1], beyond)
     return begin, end
 
 
 @jit
 def first_from(values: Floats, begin: int, end: int, least: float) -> int:
     """The first row in [begin, end) of sorted values that is at least `least`, by bisection; `end` if there is none."""
-    while begin < end:
-        middle = (begin + end) // 2
-        if values[middle] < least:
-            begin = middle + 1
-        else:
-            end = middle
-    return begin
+    return begin + int(np.searchsorted(values[begin:end], least))

@@ -33,6 +33,7 @@ from estimator.catalog.sky_index import Cells, within
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
+from estimator.core.vectors import normalized
 
 # Color indexes of a G2 star, used where the catalog has no color.
 SUN_B_V = 0.65
@@ -130,14 +131,14 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     order = np.argsort(stars.magnitude, kind="stable")
     vectors = stars.vectors[order]
     magnitude = stars.magnitude[order]
-    groups = catalog.close_groups(vectors, closer_than_rad)
+    groups = catalog.close_groups(vectors, 2 * np.sin(closer_than_rad / 2))
     means, merged = catalog.light_centers(vectors, magnitude, groups)
     _, first = np.unique(groups, return_index=True)  # the brightest of each group
     components = np.bincount(groups, stars.components[order]).astype(np.int64)
     by_light = np.argsort(merged, kind="stable")
     return OnBoard(
         stars.id[order][first][by_light],
-        catalog.unit(means)[by_light],
+        normalized(means)[by_light],
         merged[by_light],
         components[by_light],
         stars.epoch_yr,

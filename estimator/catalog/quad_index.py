@@ -11,10 +11,14 @@ must always have the same code (`arrange`): A and B are exchanged if the sum of 
 negative, and C is the one with the smaller first number.
 
 1. Choose stars that are bright for their surroundings, PER_CIRCLE in a circle as high as the field, so that the
-   brightest detections of a frame are among them everywhere in the sky (`_locally_bright`).
-2. List the chosen neighbors of each chosen star (`_neighbors`).
-3. Form all quads of neighbors, and their codes (`_quads`).
-4. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
+   brightest detections of a frame are among them everywhere in the sky (`_locally_bright`). The number of quads grows
+   with its fourth power and with the number of circles that cover the sky: it is smaller for narrow fields, so that
+   there are no more quads than in MOST_CIRCLES.
+2. Form all quads of a chosen star and its chosen neighbors, and their codes (`_quads`).
+3. Sort them into the cells of a grid of four dimensions (`_grid_cells`).
+
+Aberration is conformal: it multiplies the angles of a small field by one factor, up to 1 +- 10^-4, and changes a code
+by 10^-4 of the field's size. Proper motions do change it.
 """
 
 from typing import NamedTuple
@@ -22,16 +26,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of, counting_sort
+from estimator.catalog.sky_index import (
+    Cells,
+    SkyIndex,
+    build_grid,
+    cell_of,
+    counting_sort,
+    within,
+)
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 
-PER_CIRCLE = 10  # stars of quads in a circle as high as the field
+# Stars of quads in a circle as high as the field; the least number, and the number of circles that reduces it.
+PER_CIRCLE = 10
+LEAST_PER_CIRCLE = 6
+MOST_CIRCLES = 3000  # of 820 quads each, measured with PER_CIRCLE stars
 # Greatest and least distance of A and B, in units of the field's height.
 LONGEST = 0.75
 SHORTEST = 0.15
-NEIGHBORS = 60  # greatest number of stars near one star that are combined with it
+NEIGHBORS = (
+    60  # greatest number of stars near one star that are combined with it, the brightest
+)
 SIDE = 20  # cells along each of the four axes
 # Bounds of the coordinates along B to A and across: C and D are nearer to A and to B than A is to B.
 ALONG = 0.5
@@ -52,94 +68,68 @@ class QuadIndex(NamedTuple):
     """
 
     star: NDArray[np.int32]
-    code: Floats
+    code: NDArray[np.float32]
     first: NDArray[np.int32]
 
 
 def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
-    """Build the index of the stars and pairs of `sky` for fields of the given height: the module's steps."""
-    # 1. and 2. Chosen stars and their neighbors.
-    chosen = _locally_bright(
-        sky.pair, sky.first, sky.bin_rad, height_rad / 2, len(sky.vectors)
-    )
-    neighbor, first = _neighbors(
-        sky.pair, sky.first, sky.bin_rad, LONGEST * height_rad, chosen
-    )
-    total = 1
-    found = np.empty((0, 4), np.int32)
-    code = np.empty((0, 4))
-    # 3. Quads: the first pass only counts them.
-    while total > len(found):
+    """Build the index of the stars of `sky` for fields of the given height: the module's steps."""
+    # 1. Chosen stars.
+    # 16 / height^2 circles cover the sky.
+    share = min(MOST_CIRCLES * height_rad * height_rad / 16, 1.0)
+    count = max(PER_CIRCLE * share**0.25, LEAST_PER_CIRCLE)
+    cells = Cells(sky.side, sky.cell_first, sky.cell_star)
+    row = _locally_bright(cells, sky.vectors, _chord(height_rad / 2), count)
+    chosen = sky.vectors[row]
+    cells = build_grid(chosen)
+    # 2. Quads: the first pass only counts them.
+    total = 0
+    bounds = _chord(LONGEST * height_rad), SHORTEST * height_rad
+    for _ in range(2):
         found = np.empty((total, 4), np.int32)
-        code = np.empty((total, 4))
-        total = _quads(sky.vectors, neighbor, first, SHORTEST * height_rad, found, code)
-    # 4. Cells.
-    cells, order = counting_sort(_grid_cells(code[:total]), SIDE**4)
-    return QuadIndex(found[order], code[order], cells)
+        code = np.empty((total, 4), np.float32)
+        total = _quads(chosen, cells, *bounds, found, code)
+    # 3. Cells.
+    first, order = counting_sort(_grid_cells(code), SIDE**4)
+    return QuadIndex(row[found[order]], code[order], first)
+
+
+def _chord(angle_rad: float) -> float:
+    """Chord of an angle; that of half a turn for greater ones."""
+    return float(2 * np.sin(min(angle_rad, np.pi) / 2))
 
 
 @jit
 def _locally_bright(
-    pair: NDArray, first: NDArray, bin_rad: float, radius_rad: float, count: int
-) -> NDArray[np.bool_]:
-    """Step 1: (count,) whether each star, sorted by brightness, has fewer than PER_CIRCLE brighter ones around it."""
-    brighter = np.zeros(count, np.int64)
-    for p in range(first[cell_of(radius_rad / bin_rad, len(first) - 1)]):
-        # The greater row is the fainter star.
-        brighter[max(pair[p, 0], pair[p, 1])] += 1
-    return brighter < PER_CIRCLE
-
-
-@jit
-def _neighbors(
-    pair: NDArray, first: NDArray, bin_rad: float, reach_rad: float, chosen: NDArray
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Step 2: the chosen stars within reach of each chosen star.
-
-    Returns
-    -------
-    neighbor, start
-        The neighbors of star s are neighbor[start[s] : start[s + 1]], by increasing angle up to the width of a bin
-    """
-    end = first[cell_of(reach_rad / bin_rad, len(first) - 1)]
-    start = np.zeros(len(chosen) + 1, np.int64)
-    # Count the neighbors of each star, add the counts up, and fill the lists.
-    for p in range(end):
-        if chosen[pair[p, 0]] and chosen[pair[p, 1]]:
-            start[pair[p, 0] + 1] += 1
-            start[pair[p, 1] + 1] += 1
-    for s in range(len(chosen)):
-        start[s + 1] += start[s]
-    neighbor = np.empty(start[-1], np.int32)
-    free = start.copy()
-    for p in range(end):
-        i = pair[p, 0]
-        j = pair[p, 1]
-        if chosen[i] and chosen[j]:
-            neighbor[free[i]] = j
-            neighbor[free[j]] = i
-            free[i] += 1
-            free[j] += 1
-    return neighbor, start
+    cells: Cells, xyz: Floats, radius: float, count: float
+) -> NDArray[np.int32]:
+    """Step 1: rows of the stars, sorted by brightness, with fewer than `count` brighter ones within a chord."""
+    near = np.empty(len(xyz), np.int64)
+    chosen = np.empty(len(xyz), np.bool_)
+    for n in range(len(xyz)):
+        found = within(cells, xyz, xyz[n, 0], xyz[n, 1], xyz[n, 2], radius, near)
+        # The smaller row is the brighter star.
+        chosen[n] = np.sum(near[:found] < n) < count
+    return np.flatnonzero(chosen).astype(np.int32)
 
 
 @jit
 def _quads(
     xyz: Floats,
-    neighbor: NDArray,
-    start: NDArray,
-    shortest_rad: float,
+    cells: Cells,
+    longest: float,
+    shortest: float,
     found: NDArray,
-    code: Floats,
+    code: NDArray,
 ) -> int:
-    """Step 3: find all quads of neighbors, and their codes.
+    """Step 2: find all quads of neighbors, and their codes.
 
     Parameters
     ----------
-    xyz
-        (N, 3) unit vectors of the stars
-    shortest_rad
-        Least distance of A and B
+    xyz, cells
+        (N, 3) unit vectors of the stars, brightest first, and their grid
+    longest, shortest
+        Greatest and least chord of A and B
     found, code
         (Q, 4) rows and codes of the quads, written in place; no more than the arrays hold
 
@@ -150,19 +140,20 @@ def _quads(
     """
     total = 0
     frame = np.empty((3, 3))
+    around = np.empty(len(xyz), np.int64)
     near = np.empty(NEIGHBORS, np.int64)
     place = np.empty((NEIGHBORS, 2))
-    for a in range(len(start) - 1):
+    for a in range(len(xyz)):
+        star_a = vectors.row(xyz, a)
+        reached = within(cells, xyz, star_a[0], star_a[1], star_a[2], longest, around)
+        candidates = np.sort(around[:reached])[:NEIGHBORS]
         # A and B.
-        for entry in range(start[a], start[a + 1]):
-            b = neighbor[entry]
-            star_a = vectors.row(xyz, a)
+        for b in candidates:
             star_b = vectors.row(xyz, b)
             length = vectors.chord(star_a, star_b)
-            if b < a or length < shortest_rad:
+            if b < a or length < shortest:
                 continue
             vectors.pair_frame(star_a, star_b, frame)
-            candidates = neighbor[start[a] : min(start[a + 1], start[a] + NEIGHBORS)]
             count = _stars_between(xyz, candidates, a, b, frame, near, place)
             # Pairs C, D of these stars.
             for k in range(count):
@@ -177,10 +168,8 @@ def _quads(
                         found[total, 1] = b
                         found[total, 2] = near[k]
                         found[total, 3] = near[m]
-                        code[total, 0] = place[k, 0]
-                        code[total, 1] = place[k, 1]
-                        code[total, 2] = place[m, 0]
-                        code[total, 3] = place[m, 1]
+                        code[total, :2] = place[k]
+                        code[total, 2:] = place[m]
                         arrange(code[total], found[total])
                     total += 1
     return total
@@ -223,7 +212,7 @@ def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float,
 
 
 @jit
-def arrange(code: Floats, star: NDArray) -> None:
+def arrange(code: NDArray, star: NDArray) -> None:
     """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the module's order, in place."""
     # Exchange A and B: half a turn.
     if code[0] + code[2] < 0:
@@ -245,7 +234,7 @@ def code_cell(value: float, axis: int) -> int:
 
 
 @jit
-def _grid_cells(code: Floats) -> NDArray[np.int64]:
+def _grid_cells(code: NDArray) -> NDArray[np.int64]:
     """(Q,) number of the cell of each code (Q, 4) in the grid of SIDE^4 cells."""
     cell = np.zeros(len(code), np.int64)
     for n in range(len(code)):

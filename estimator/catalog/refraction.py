@@ -12,15 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from estimator.catalog.catalog import utc
+from estimator.catalog.catalog import days_after_j2000, utc
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Allowed, Floats
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
-    J2000,
     JULIAN_CENTURY_DAY,
     STANDARD_PRESSURE_HPA,
     STANDARD_TEMPERATURE_K,
@@ -76,10 +76,7 @@ class SiteAir:
 
     def zenith(self, t_s: float) -> Floats:
         """The (3,) zenith in ICRS axes t_s seconds after the epoch."""
-        epoch = utc(self.epoch)
-        if epoch.tzinfo is not None:
-            epoch = epoch.astimezone(datetime.UTC).replace(tzinfo=None)
-        days = (epoch - J2000).total_seconds() / DAY_S + t_s / DAY_S
+        days = days_after_j2000(utc(self.epoch)) + t_s / DAY_S
         return zenith_icrs(
             days, np.radians(self.latitude_deg), np.radians(self.longitude_deg)
         )
@@ -130,21 +127,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
             2004.3109 * centuries - 0.42665 * centuries**2,
         ]
     )
-    return _about_z(zeta) @ _about_y(-theta) @ _about_z(z) @ of_date
-
-
-def _about_z(angle: float) -> Floats:
-    """(3, 3) matrix of components in axes turned by the angle about z."""
-    c = np.cos(angle)
-    s = np.sin(angle)
-    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
-
-
-def _about_y(angle: float) -> Floats:
-    """(3, 3) matrix of components in axes turned by the angle about y."""
-    c = np.cos(angle)
-    s = np.sin(angle)
-    return np.array([[c, 0, -s], [0, 1.0, 0], [s, 0, c]])
+    return Rotation.from_euler("ZYZ", [-zeta, theta, -z]).apply(of_date)
 
 
 def refraction_constants(

@@ -3,22 +3,13 @@
 Pairs (`build`) are sorted into bins of equal width in angle, so that the candidates for a measured angle are the pairs
 of a few adjacent bins:
 
-1. Find all pairs by a sweep along z: with the stars sorted by z, only stars with |dz| up to the greatest chord can form
-   a pair (`_sweep`).
+1. Find all pairs (`close_pairs`).
 2. Sort them into bins (`counting_sort`).
 
-Directions are binned twice, for two kinds of search:
-
-`SkyIndex.cell_first`, `cell_star`: on the six faces of a cube about the observer, for the nearest star within a small
-gate (`nearest`). A star is projected onto a face by the gnomonic projection (u, v), the two other components over the
-face's component, and each face is a grid of side x side cells. The grid extends beyond the face's edges (|u|, |v| = 1)
-to FACE_HALF_WIDTH, so that a search around any direction needs only the cells of one face. Stars near an edge are
-therefore stored on more than one face.
-
-`Cells`: in the cells of the cube [-1, 1]^3 about the unit sphere, for searches within any angle (`within`,
-`nearest_in_grid`). The stars are listed cell after cell. A search within a chord visits the cells that meet
-the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each (x, y) column
-is one loop.
+Stars are binned by direction (`Cells`): the cube [-1, 1]^3 about the unit sphere is divided into cells, for searches
+within any angle (`within`, `nearest`). The stars are listed cell after cell. A search within a chord visits the cells
+that meet the box of that half-width about the direction. Cells adjacent in z are adjacent in the list, so that each
+(x, y) column is one loop.
 """
 
 from math import pi, sqrt
@@ -26,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
@@ -33,7 +25,8 @@ from estimator.core.jit import jit
 
 # Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.
 
-MAX_SIDE = 64  # 64^3 cells: a table of a megabyte
+MAX_SIDE = 128  # 128^3 cells: a table of eight megabytes
+STARS_PER_CELL = 0.25  # of the cells that the sphere meets: measured, fastest for `nearest` with small gates
 
 
 class Cells(NamedTuple):
@@ -55,11 +48,11 @@ class Cells(NamedTuple):
 
 
 def build_grid(vectors: Floats) -> Cells:
-    """Build the cells of (N, 3) unit vectors, with about one star in each cell that the sphere meets.
+    """Build the cells of (N, 3) unit vectors, with STARS_PER_CELL in each cell that the sphere meets, or more.
 
     The sphere meets about 4 pi / (2 / side)^2 = pi side^2 cells.
     """
-    side = min(max(int(sqrt(len(vectors) / pi)), 2), MAX_SIDE)
+    side = min(max(int(sqrt(len(vectors) / pi / STARS_PER_CELL)), 2), MAX_SIDE)
     return Cells(side, *counting_sort(_cube_cells(vectors, side), side**3))
 
 
@@ -156,39 +149,58 @@ def within(
 
 
 @jit
-def nearest_in_grid(
-    cells: Cells, vectors: Floats, x: float, y: float, z: float, chord: float
-) -> int:
-    """The row of the star nearest to (x, y, z) within a straight-line distance `chord`; -1 if there is none."""
+def nearest(
+    vectors: Floats,
+    cell_first: NDArray,
+    cell_row: NDArray,
+    side: int,
+    x: float,
+    y: float,
+    z: float,
+    gate: float,
+) -> tuple[int, float]:
+    """The star nearest to a unit vector within a gate.
+
+    Parameters
+    ----------
+    cell_first, cell_row, side
+        Fields of `Cells`: passing the whole tuple would cost more than the search
+    x, y, z
+        Unit vector in the catalog's frame
+    gate
+        Greatest straight-line distance
+
+    Returns
+    -------
+    star, distance2
+        Row of the star and its squared distance; -1 and gate^2 if none is within the gate
+    """
     best = -1
-    least2 = chord * chord
-    side = cells.side
-    for i in range(edge_cell(x - chord, side), edge_cell(x + chord, side) + 1):
-        for j in range(edge_cell(y - chord, side), edge_cell(y + chord, side) + 1):
+    closest2 = gate * gate
+    for i in range(edge_cell(x - gate, side), edge_cell(x + gate, side) + 1):
+        for j in range(edge_cell(y - gate, side), edge_cell(y + gate, side) + 1):
             low = (i * side + j) * side
-            begin = cells.first[low + edge_cell(z - chord, side)]
-            end = cells.first[low + edge_cell(z + chord, side) + 1]
+            begin = cell_first[low + edge_cell(z - gate, side)]
+            end = cell_first[low + edge_cell(z + gate, side) + 1]
             for entry in range(begin, end):
-                s = cells.row[entry]
+                s = cell_row[entry]
                 dx = vectors[s, 0] - x
                 dy = vectors[s, 1] - y
                 dz = vectors[s, 2] - z
                 distance2 = dx * dx + dy * dy + dz * dz
-                if distance2 < least2:
+                if distance2 < closest2:
                     best = s
-                    least2 = distance2
-    return best
+                    closest2 = distance2
+    return best, closest2
 
 
-# Sky index: star pairs binned by separation, and stars by direction on the faces of a cube.
+# Sky index: star pairs binned by separation, and stars by direction.
 PAIRS_PER_BIN = 8
-STARS_PER_CELL = 0.5
+MOST_PAIRS = 2e6  # of a uniform sky: fewer stars are paired for more
 MAG_STEP = 0.1
 MAG_SMOOTHING = (
     0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
 )
-# Half-width of a face's grid in tangents. It exceeds 1 (45 degrees) so that a gate up to 0.05 rad stays on one face.
-FACE_HALF_WIDTH = 1.2
 
 
 class SkyIndex(NamedTuple):
@@ -208,13 +220,8 @@ class SkyIndex(NamedTuple):
         (N,) magnitudes, increasing
     density
         Density of the magnitudes, 1 / mag, from mag[0] in steps of MAG_STEP
-    cell_first, cell_star
-        The stars of cell c are cell_star[cell_first[c] : cell_first[c + 1]]; each face of the cube has side x side
-        cells
-    side
-        Number of cells along the side of a face
-    cells
-        The stars in the spatial grid, for wide searches
+    cell_first, cell_star, side
+        `Cells` of the stars: first, row, side
     """
 
     vectors: Floats
@@ -226,14 +233,11 @@ class SkyIndex(NamedTuple):
     cell_first: NDArray[np.int32]
     cell_star: NDArray[np.int32]
     side: int
-    cells: Cells
 
     @property
     def bytes(self) -> int:
         """Memory of the arrays, bytes."""
-        return sum(
-            array.nbytes for array in (*self, *self.cells) if isinstance(array, np.ndarray)
-        )
+        return sum(array.nbytes for array in self if isinstance(array, np.ndarray))
 
 
 def build(
@@ -248,7 +252,7 @@ def build(
     max_angle_rad
         Greatest angle of a pair
     paired
-        Number of brightest stars that form pairs; None: all
+        Number of brightest stars that form pairs; None: all. Fewer do if there would be more than MOST_PAIRS
 
     Raises
     ------
@@ -256,44 +260,41 @@ def build(
         For fewer than 3 pairs.
     """
     sky = build_without_pairs(vectors, mag)
-    vectors = sky.vectors[:paired]
     max_angle_rad = min(max_angle_rad, np.pi)
-    by_z = np.argsort(vectors[:, 2])
-    sorted_xyz = np.ascontiguousarray(vectors[by_z].T)
-    # 1. Find the pairs. A uniform sky's pairs and a fifth more; a second sweep if these are not enough.
-    expected = len(vectors) ** 2 * np.sin(max_angle_rad / 2) ** 2 / 2
-    found = np.empty((0, 2), np.int32)
-    half_chord = np.empty(0)
-    total = int(1.2 * expected) + 1000
-    while total > len(found):
-        found = np.empty((total, 2), np.int32)
-        half_chord = np.empty(total)
-        total = _sweep(*sorted_xyz, 2 * np.sin(max_angle_rad / 2), found, half_chord)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    # In place: there may be millions.
-    angle_rad = np.minimum(half_chord[:total], 1.0, out=half_chord[:total])
-    angle_rad = np.multiply(np.arcsin(angle_rad, out=angle_rad), 2, out=angle_rad)
+    # A uniform sky of N stars has N^2 / 2 pairs, the share sin^2(angle / 2) of them up to an angle.
+    share = np.sin(max_angle_rad / 2) ** 2 / 2
+    vectors = sky.vectors[:paired]
+    if len(vectors) ** 2 * share > MOST_PAIRS:
+        vectors = vectors[: int(np.sqrt(MOST_PAIRS / share))]
+    # 1. Find the pairs.
+    pair, angle_rad = close_pairs(vectors, max_angle_rad)
     # 2. Sort them into bins; the width leaves the greatest angle in the last bin, whatever the rounding.
-    bins = max(total // PAIRS_PER_BIN, 1)
+    bins = max(len(pair) // PAIRS_PER_BIN, 1)
     bin_rad = max_angle_rad * (1 + 1e-9) / bins
     first, order = counting_sort((angle_rad / bin_rad).astype(np.int32), bins)
-    pair = by_z.astype(np.int32)[found[order]]
     if len(pair) < 3:
         raise ImageError(
             f"{len(pair)} pairs of stars within {np.degrees(max_angle_rad):.2f} deg are too few; allowed: 3 or more"
         )
-    return sky._replace(pair=pair, first=first, bin_rad=bin_rad)
+    return sky._replace(pair=pair[order], first=first, bin_rad=bin_rad)
+
+
+def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[NDArray[np.int32], Floats]:
+    """The (P, 2) rows of all pairs of (N, 3) unit vectors up to an angle, and their (P,) angles."""
+    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
+    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    return pair, 2 * np.arcsin(np.minimum(half_chord, 1.0))
 
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
     """Build the index of (N, 3) unit vectors, brightest first, without pairs: for look-ups by direction only."""
     vectors = np.ascontiguousarray(vectors, dtype=float)
     mag = np.ascontiguousarray(mag, dtype=float)
-    side = max(int(np.sqrt(len(vectors) / STARS_PER_CELL / 6)), 1)
-    empty_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
-    faces = _cells(vectors, side)
-    cells = build_grid(vectors)
-    return SkyIndex(vectors, *empty_pairs, mag, _smoothed_histogram(mag), *faces, side, cells)
+    no_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
+    side, first, row = build_grid(vectors)
+    return SkyIndex(vectors, *no_pairs, mag, _smoothed_histogram(mag), first, row, side)
 
 
 def _smoothed_histogram(mag: Floats) -> Floats:
@@ -312,143 +313,3 @@ def _smoothed_histogram(mag: Floats) -> Floats:
 def magnitude_density(sky: SkyIndex, mag: float) -> float:
     """Probability density of the catalog's magnitudes at `mag`, 1 / mag."""
     return sky.density[cell_of((mag - sky.mag[0]) / MAG_STEP, len(sky.density) - 1)]
-
-
-@jit
-def _sweep(
-    x: Floats, y: Floats, z: Floats, reach: float, found: NDArray, half_chord: Floats
-) -> int:
-    """Step 1: find all pairs up to a chord among stars sorted by z.
-
-    Parameters
-    ----------
-    x, y, z
-        (N,) components of the unit vectors
-    reach
-        Greatest chord
-    found, half_chord
-        (P, 2) rows of the pairs and (P,) half-chords, written in place; no more than the arrays hold
-
-    Returns
-    -------
-    int
-        Number of pairs; one greater than the arrays asks for another sweep
-    """
-    total = 0
-    for i in range(len(z)):
-        for j in range(i + 1, len(z)):
-            dz = z[j] - z[i]
-            if dz > reach:
-                break  # the stars are sorted by z: all further ones are out of reach too
-            dx = x[j] - x[i]
-            dy = y[j] - y[i]
-            chord2 = dx * dx + dy * dy + dz * dz
-            if chord2 > reach * reach:
-                continue
-            if total < len(half_chord):
-                found[total, 0] = i
-                found[total, 1] = j
-                half_chord[total] = sqrt(chord2) / 2
-            total += 1
-    return total
-
-
-def _cells(vectors: Floats, side: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Sort the stars by cell of the faces; a star near the edge of a face is also on the neighboring face.
-
-    Returns
-    -------
-    cell_first, cell_star
-        Fields of SkyIndex
-    """
-    cell = []
-    star = []
-    for axis in range(3):
-        for sign in (1, -1):
-            # Gnomonic projection onto this face, of the stars before it.
-            along = sign * vectors[:, axis]
-            gnomonic = (
-                np.roll(vectors, -axis, axis=1)[:, 1:] / np.maximum(along, 1e-9)[:, None]
-            )
-            on_face = np.flatnonzero(
-                (along > 0) & (np.abs(gnomonic).max(axis=1) < FACE_HALF_WIDTH)
-            )
-            cells = (gnomonic[on_face] + FACE_HALF_WIDTH) * side / (2 * FACE_HALF_WIDTH)
-            column, row = cells.astype(np.int64).T
-            cell.append(((2 * axis + (sign < 0)) * side + row) * side + column)
-            star.append(on_face)
-    first, order = counting_sort(np.concatenate(cell), 6 * side * side)
-    return first, np.concatenate(star)[order].astype(np.int32)
-
-
-@jit
-def _on_face(x: float, y: float, z: float) -> tuple[int, float, float]:
-    """Face of the cube before a unit vector, and its gnomonic coordinates on it.
-
-    The largest component selects the face; the two others over it are the coordinates.
-    """
-    ax = abs(x)
-    ay = abs(y)
-    az = abs(z)
-    if ax >= ay and ax >= az:
-        inverse = 1 / ax
-        return 0 if x > 0 else 1, y * inverse, z * inverse
-    if ay >= az:
-        inverse = 1 / ay
-        return 2 if y > 0 else 3, z * inverse, x * inverse
-    inverse = 1 / az
-    return 4 if z > 0 else 5, x * inverse, y * inverse
-
-
-@jit
-def nearest(
-    vectors: Floats,
-    cell_first: NDArray,
-    cell_star: NDArray,
-    side: int,
-    x: float,
-    y: float,
-    z: float,
-    gate: float,
-) -> tuple[int, float]:
-    """The star nearest to a unit vector within a gate.
-
-    The first four arguments are fields of a SkyIndex: passing the whole tuple would cost more than the search.
-
-    Parameters
-    ----------
-    x, y, z
-        Unit vector in the catalog's frame
-    gate
-        Greatest distance, rad, at most 0.05
-
-    Returns
-    -------
-    star, distance2
-        Row of the star and its squared chord; -1 and gate^2 if none is within the gate
-    """
-    face, u, v = _on_face(x, y, z)
-    # The cells that a square of the gate's half-width about (u, v) meets.
-    scale = side / (2 * FACE_HALF_WIDTH)
-    # A gnomonic coordinate changes by at most (1 + u^2 + v^2) times the angle, to first order; the last factor bounds
-    # the higher orders.
-    reach = gate * (1 + u * u + v * v) * (1 + 4 * gate)
-    left = cell_of((u - reach + FACE_HALF_WIDTH) * scale, side)
-    right = cell_of((u + reach + FACE_HALF_WIDTH) * scale, side - 1)
-    top = cell_of((v - reach + FACE_HALF_WIDTH) * scale, side)
-    bottom = cell_of((v + reach + FACE_HALF_WIDTH) * scale, side - 1)
-    best = -1
-    closest2 = gate * gate
-    for row in range(top, bottom + 1):
-        # The cells of a row are contiguous in `cell_star`: one loop covers them.
-        row_start = (face * side + row) * side
-        for entry in range(cell_first[row_start + left], cell_first[row_start + right + 1]):
-            star = cell_star[entry]
-            dx = vectors[star, 0] - x
-            dy = vectors[star, 1] - y
-            dz = vectors[star, 2] - z
-            distance2 = dx * dx + dy * dy + dz * dz
-            if distance2 < closest2:
-                best = star
-                closest2 = distance2
-    return best, closest2

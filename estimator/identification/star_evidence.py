@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from estimator.catalog.pair_index import first_from
 from estimator.catalog.sky_index import (
     MAG_SMOOTHING,
+    Cells,
     SkyIndex,
     magnitude_density,
     nearest,
@@ -439,7 +440,8 @@ def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int
     bx, by, bz = vectors.row(R, 2)
     # Stars within the circle around the field, then those in the field.
     near = np.empty(len(sky.vectors), np.int64)
-    count = within(sky.cells, sky.vectors, bx, by, bz, chord, near)
+    cells = Cells(sky.side, sky.cell_first, sky.cell_star)
+    count = within(cells, sky.vectors, bx, by, bz, chord, near)
     inside = 0
     for s in near[:count]:
         if s > faintest:

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
+from estimator.catalog.quad_index import QuadIndex
 from estimator.catalog.sky_index import SkyIndex, nearest
 from estimator.core import vectors
 from estimator.core.camera import Camera
@@ -28,7 +29,7 @@ from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
-from estimator.identification import star_evidence, star_search
+from estimator.identification import star_evidence, star_quads
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import (
     Detections,
@@ -207,18 +208,19 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 def identify(
     lights: FlatCentroids,
     sensor: Sensor,
+    quads: QuadIndex,
     stars: SkyIndex,
     max_detections: int,
     max_checks: int,
 ) -> tuple[Solution, float]:
-    """Search centroids of a calibrated camera by pairs, and match the field again where the residuals are doubtful.
+    """Search centroids of a calibrated camera, and match the field again where the residuals are doubtful.
 
-    Returns the solution of `star_search.lost_in_space` and the factor of the variances: that of `widened`, or 1 without
+    Returns the solution of `star_quads.quads_or_pairs` and the factor of the variances: that of `widened`, or 1 without
     doubt. The factor is 0 where the residuals are so large that the calibration may be wrong: the solution is then as
     it was found.
     """
     detections = detections_of(lights, sensor, 0.0)
-    solution = star_search.lost_in_space(detections, stars, max_detections, max_checks)
+    solution = star_quads.quads_or_pairs(detections, quads, stars, max_detections, max_checks)
     if residuals_too_great(solution) or solution.focal_ratio != 1:
         return solution, 0.0
     if not len(solution.star):
@@ -410,7 +412,7 @@ CHANGED = 0.9  # share of a star's information below which the field is fitted a
 
 def are_small(sigma_rad: Floats) -> bool:
     """Return whether companions are undetectable: their greatest error is below the error of every centroid."""
-    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD.max())
+    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD[-1])
 
 
 def with_companions(

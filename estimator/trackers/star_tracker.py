@@ -1,12 +1,11 @@
 """Star tracker for the real sky: from a frame to an attitude, lost in space. `dome_tracker` does the same for a dome.
 
 The stages are detection and centroiding (`pipeline`), identification, and solution. The default identifier computes
-identity, attitude and covariance in one step by Bayesian evidence, from pairs of stars
-(`identification/star_search.py`). If the focal length is uncertain, quads of stars (`identification/star_quads.py`) are
-searched first, and the focal length and the first radial distortion coefficient are fitted to each frame's stars. Quads
-also find a calibrated focal length that is wrong: where a short search by pairs fails, or where its residuals are too
-large. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
-the match is significant.
+identity, attitude and covariance in one step by Bayesian evidence, from quads of stars
+(`identification/star_quads.py`) and then from pairs (`identification/star_search.py`). If the focal length is
+uncertain, the longer search by quads is first, and the focal length and the first radial distortion coefficient are
+fitted to each frame's stars. Quads also find a calibrated focal length that is wrong. The candidates of a published
+identifier (`registry`) are matched to the full catalog, refined, and accepted if the match is significant.
 """
 
 from __future__ import annotations
@@ -24,13 +23,14 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
-from estimator.catalog import catalog, pair_index, quad_index, sky_index
+from estimator.catalog import catalog, index_file, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.vectors import rotation_of
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import advice
@@ -121,31 +121,25 @@ class StarTracker(FrameTracker):
             UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
         )
         # Stars that a frame can show, and the brighter ones among them that form patterns
-        apparent_stars = replace(stars, vectors=vectors)
         self.stars = catalog.merge_doubles(
-            apparent_stars, settings.merge_px / camera.focal_px
+            replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
-        limit_mag = catalog.limit_for_density(
-            self.stars, self._field_sr, settings.field_stars
-        )
-        index_stars = self.stars.take(self.stars.v_mag <= limit_mag)
+        paired = int(min(settings.field_stars * 4 * np.pi / self._field_sr, len(self.stars)))
+        places = self.stars.vectors, self.stars.v_mag
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
         if default:
-            self.sky = sky_index.build(
-                self.stars.vectors, self.stars.v_mag, longest_rad, len(index_stars)
-            )
+            self.sky = sky_index.build(*places, longest_rad, paired)
             patterns = len(self.sky.pair)
         else:
-            self.sky = sky_index.build_without_pairs(self.stars.vectors, self.stars.v_mag)
-            known = settings.zero_point_mag is not None
+            self.sky = sky_index.build_without_pairs(*places)
+            unknown = settings.zero_point_mag is None
+            bright, magnitude = (part[:paired] for part in places)
             self.index = pair_index.build(
-                index_stars.vectors,
-                longest_rad,
-                magnitude=index_stars.v_mag if known else None,
+                bright, longest_rad, magnitude=None if unknown else magnitude
             )
             patterns = len(self.index.pair)
         self.field_matcher = FieldMatcher(
@@ -171,7 +165,7 @@ class StarTracker(FrameTracker):
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
         """Quads of the stars that form pairs, built on first use."""
-        return quad_index.build(self.sky, self._height_rad)
+        return index_file.quads(self.sky, self._height_rad)
 
     @property
     def _field_sr(self) -> float:
@@ -501,21 +495,23 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
-        most = self.settings.searched_stars
-        at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
-        if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
+        index = self.quads, self.sky
+        effort = self.settings.searched_stars, model.max_checks
+        calibrated = not (model.by_quads or self.focal_uncertainty)
+        if (
+            calibrated
+            and not self.camera.row_time_s
+            and misfit.are_small(sigma_px / self.camera.focal_px)
+        ):
             lights = flat_centroids(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
+            return misfit.identify(lights, self.sensor, *index, *effort)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
+        if calibrated:
+            return star_quads.quads_or_pairs(detections, *index, *effort), 0.0
         if not model.by_quads:
-            return star_search.lost_in_space(
-                detections, self.sky, most, model.max_checks
-            ), 0.0
-        known = not self.focal_uncertainty
-        solution = star_quads.identify(
-            detections, self.quads, self.sky, most, model.max_checks, known
-        )
-        return solution, 0.0
+            return star_search.lost_in_space(detections, self.sky, *effort), 0.0
+        found = star_quads.identify(detections, *index, *effort, not self.focal_uncertainty)
+        return found, 0.0
 
     def refit(
         self,
@@ -560,7 +556,7 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _ = refitted
-        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        cam_from_ref = rotation_of(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         common_rad2 = None
         solver = self.settings.solver

@@ -18,10 +18,10 @@ from estimator.calibration.home_position import (
     led_map,
     pooled,
 )
-from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 
 # AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in, LEDs 8 mm apart.
 CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))
@@ -101,8 +101,8 @@ def pair_error_arcsec(wide_rad: float) -> float:
     rays = np.array([[np.sin(half), 0, np.cos(half)], [-np.sin(half), 0, np.cos(half)]])
     point, reach_m = nearfield.thesis_points(rays, SPHERE, LEVER)
     np.testing.assert_allclose(reach_m, R_M - M_M, rtol=0, atol=1e-15)
-    read = unit(point + LEVER.camera_body_m)
-    true = unit(on_sphere(rays, LEVER.camera_body_m, R_M))
+    read = normalized(point + LEVER.camera_body_m)
+    true = normalized(on_sphere(rays, LEVER.camera_body_m, R_M))
     return float((np.arccos(read[0] @ read[1]) - np.arccos(true[0] @ true[1])) / ARCSEC)
 
 
@@ -176,7 +176,7 @@ def test_different_stops_show_the_geometric_error_without_noise() -> None:
     # The greatest lateral error, of an LED at the greatest tilt, bounds a deviation from above: eq. 44's point less
     # where the ray meets the sphere, at the ray of an apex LED leaning 3.3 degrees and half a board.
     tilt = np.radians(3.3) + 0.0125 / R_M
-    ray = unit(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
+    ray = normalized(np.array([[R_M * np.sin(tilt), 0, R_M * np.cos(tilt) - M_M]]))
     true = on_sphere(ray, LEVER.camera_body_m, R_M)
     off = nearfield.thesis_points(ray, SPHERE, LEVER)[0] + LEVER.camera_body_m - true
     assert 0 < spread < np.linalg.norm(off)
@@ -206,7 +206,7 @@ def home() -> HomeCatalog:
 def test_the_home_catalog_has_the_dome_s_angles_within_noise(home: HomeCatalog) -> None:
     leds = dome()
     truth = {led: place for led, place in zip(leds.id, leds.position_m, strict=True)}
-    true = angles(unit(np.array([truth[led] for led in home.id])))
+    true = angles(normalized(np.array([truth[led] for led in home.id])))
     z = (angles(home.vectors) - true) / (np.sqrt(2) * SIGMA_M / R_M / np.sqrt(50))
     # 66 angles of twelve LEDs: the greatest of 66 normal deviates, at most. The thesis's error adds under .01 of one.
     assert np.abs(z).max() < stats.norm.isf(RARE / 66 / 2)
@@ -279,7 +279,7 @@ def test_the_tracker_map_has_the_catalog_s_directions_on_the_surface(
     scaled = (leds.position_m - oval.center_m) / oval.semi_axes_m
     # A quadratic's rounding.
     np.testing.assert_allclose(np.sum(scaled**2, axis=1), 1, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(unit(leds.position_m), home.vectors, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(normalized(leds.position_m), home.vectors, rtol=0, atol=1e-15)
     assert (leds.id == home.id).all()
 
 

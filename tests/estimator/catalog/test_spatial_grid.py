@@ -29,8 +29,11 @@ def test_the_stars_within_a_distance_match_brute_force(make, chord: float) -> No
         count = sky_index.within(known, vectors, *place, chord, out)
         off = np.linalg.norm(vectors - place, axis=1)
         assert sorted(out[:count]) == np.flatnonzero(off <= chord).tolist()
-        near = sky_index.nearest_in_grid(known, vectors, *place, chord)
+        near, apart2 = sky_index.nearest(
+            vectors, known.first, known.row, known.side, *place, chord
+        )
         assert near == (off.argmin() if off.min() < chord else -1)
+        assert apart2 == pytest.approx(min(off.min(), chord) ** 2, rel=1e-12, abs=1e-30)
 
 
 def test_every_star_is_in_one_cell() -> None:

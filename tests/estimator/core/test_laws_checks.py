@@ -22,6 +22,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
+from estimator.core.vectors import rotation_of
 from estimator.detection import detect
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Settings
@@ -398,3 +399,14 @@ def test_a_misspelled_setting_is_answered_with_the_nearest_name() -> None:
     with pytest.raises(ImageError, match="zero_point_mag is nan"):
         Settings(zero_point_mag=np.nan)
     assert Settings(saturation=4095).saturation == 4095.0
+
+
+@law(rotation_of)
+@given(rng=SEEDS)
+def test_a_rotation_without_scipy_s_checks_is_the_same(rng: np.random.Generator) -> None:
+    known = turn(rng)
+    made = rotation_of(known.as_quat())
+    assert made.single
+    place = rng.standard_normal((3, 3))
+    np.testing.assert_array_equal(made.apply(place), known.apply(place))
+    np.testing.assert_array_equal((made * known.inv()).as_quat()[:3], np.zeros(3))

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import catalog, pair_index
+from estimator.catalog import pair_index
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
+from estimator.core.vectors import normalized
 from estimator.identification.published.fialho import (
     MAG_GATE_SIGMA,
     MIN_SIDE_FRACTION,
@@ -31,7 +32,7 @@ NEVER = 2.0  # a share of the stars that no match has: every triplet is tried
 def uniform_sky(count: int, seed: int) -> pair_index.PairIndex:
     """Uniform random stars, three times as many for each magnitude."""
     rng = np.random.default_rng(seed)
-    vectors = catalog.unit(rng.normal(size=(count, 3)))
+    vectors = normalized(rng.normal(size=(count, 3)))
     return pair_index.build(
         vectors, DIAGONAL_RAD, magnitude=np.sort(5 + np.log(rng.random(count)) / np.log(3))
     )
@@ -49,9 +50,7 @@ def field(
     truth = attitude or Rotation.random(rng=rng)
     x, y, z = truth.apply(sky.vectors).T
     row = np.flatnonzero((z > 0) & (abs(x) < HALF_TAN * z) & (abs(y) < HALF_TAN * z))
-    seen = catalog.unit(
-        truth.apply(sky.vectors[row]) + rng.normal(0, SIGMA_RAD, (len(row), 3))
-    )
+    seen = normalized(truth.apply(sky.vectors[row]) + rng.normal(0, SIGMA_RAD, (len(row), 3)))
     light = sky.magnitude[row] + rng.normal(0, EPSILON_MAG, len(row))
     order = np.argsort(light)
     return seen[order], light[order], row[order], truth
@@ -77,7 +76,7 @@ def triangle(rng: np.random.Generator) -> Floats:
     """Three directions 5 to 9 degrees apart, in no catalog."""
     while True:
         tangents = rng.uniform(-0.12, 0.12, (3, 2))
-        seen = catalog.unit(np.column_stack([tangents, np.ones(3)]))
+        seen = normalized(np.column_stack([tangents, np.ones(3)]))
         sides = np.linalg.norm(seen - seen[[1, 2, 0]], axis=1)
         if sides.min() > np.radians(5) and sides.max() < np.radians(9):
             return seen
@@ -196,7 +195,7 @@ def test_a_false_star_among_the_brightest_stops_one_triangle_but_not_the_next(
     found = np.zeros(2)
     for _ in range(30):
         seen, light, _, _ = field(rng, sky)
-        far = catalog.unit(np.array([[*rng.uniform(-HALF_TAN, HALF_TAN, 2), 1.0]]))
+        far = normalized(np.array([[*rng.uniform(-HALF_TAN, HALF_TAN, 2), 1.0]]))
         seen = np.vstack([far, seen])
         light = np.concatenate([[light[0] - 0.5], light])
         known = {"magnitude": light, "epsilon_mag": EPSILON_MAG}
@@ -272,7 +271,7 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(
     rng = np.random.default_rng(111)
     seen, light, row, _ = field(rng, sky)
     # A companion of the brightest, nearly as bright, a quarter of the least angle away.
-    close = catalog.unit(seen[:1] + np.array([0.25 * MIN_SIDE_FRACTION * DIAGONAL_RAD, 0, 0]))
+    close = normalized(seen[:1] + np.array([0.25 * MIN_SIDE_FRACTION * DIAGONAL_RAD, 0, 0]))
     both = np.vstack([seen[:1], close, seen[1:]])
     match = fialho_2(
         both,
@@ -283,7 +282,7 @@ def test_stars_too_close_for_a_triangle_are_passed_over_or_refused(
     )
     assert match is not None
     assert row[0] in match.star
-    cluster = catalog.unit(
+    cluster = normalized(
         np.array([0, 0, 1.0])
         + rng.normal(0, 0.2 * MIN_SIDE_FRACTION * DIAGONAL_RAD / 3, (8, 3))
     )

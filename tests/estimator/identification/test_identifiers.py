@@ -11,6 +11,7 @@ from estimator.catalog import catalog, pair_index
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
+from estimator.core.vectors import normalized
 from estimator.identification.registry import IDENTIFIERS
 
 pytestmark = pytest.mark.slow  # much is compiled
@@ -75,7 +76,7 @@ class Field:
         light = light + rng.normal(0, EPSILON_MAG, len(light))
         order = np.argsort(light)
         rays = np.column_stack([tangents, np.ones(len(tangents))])[order]
-        self.seen = catalog.unit(rays)
+        self.seen = normalized(rays)
         self.light = light[order]
         self.row: Ints = np.concatenate([row, np.full(false, -1)])[order]
 
@@ -145,7 +146,7 @@ def test_directions_at_random_are_refused(sky: pair_index.PairIndex, name: str) 
     for count in rng.integers(4, 20, 40):
         one = Field(rng, *nothing, 0)
         tangents = rng.uniform(-HALF_TAN, HALF_TAN, (count, 2))
-        one.seen = catalog.unit(np.column_stack([tangents, np.ones(count)]))
+        one.seen = normalized(np.column_stack([tangents, np.ones(count)]))
         one.light = np.sort(rng.choice(sky.magnitude, count))
         assert identify(name, one, sky, max_triangles=50) is None
 
@@ -153,7 +154,7 @@ def test_directions_at_random_are_refused(sky: pair_index.PairIndex, name: str) 
 @pytest.mark.parametrize("name", PAPERS)
 def test_another_sky_is_refused(sky: pair_index.PairIndex, name: str) -> None:
     rng = np.random.default_rng(93)
-    other = catalog.unit(rng.normal(size=sky.vectors.shape))
+    other = normalized(rng.normal(size=sky.vectors.shape))
     for _ in range(15):
         assert identify(name, Field(rng, other, sky.magnitude), sky, max_triangles=50) is None
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import pair_index
-from estimator.catalog.catalog import unit
+from estimator.core.vectors import normalized
 from estimator.identification.chance import MIN_MATCHES
 from estimator.identification.published.saa import AssumptionPool, Gates, SearchInput
 from estimator.identification.published.triangles import triangle
@@ -45,10 +45,10 @@ def test_every_refusal_names_a_setting(
 @law(triangle, slow=True)
 def test_triangles_name_noise_free_stars_or_none(rng: Generator, spherical: bool) -> None:
     """The stars of a field among 300 of the sky, in another order: each is named as itself."""
-    stars = unit(rng.standard_normal((300, 3)))
+    stars = normalized(rng.standard_normal((300, 3)))
     index = pair_index.build(stars, 0.5)
     turn = Rotation.random(rng=rng)
-    near = np.argsort(-stars @ unit(rng.standard_normal((1, 3)))[0])[:9]
+    near = np.argsort(-stars @ normalized(rng.standard_normal((1, 3)))[0])[:9]
     match = triangle(spherical, turn.apply(stars[near]), index, 1e-6)
     if match:
         assert near[match.observed].tolist() == match.star.tolist()
@@ -58,7 +58,7 @@ def test_triangles_name_noise_free_stars_or_none(rng: Generator, spherical: bool
 @given(rng=SEEDS, named=some.integers(0, 12))
 @law(AssumptionPool.is_complete)
 def test_an_assumption_is_complete_with_four_named_stars(rng: Generator, named: int) -> None:
-    rays = unit(rng.uniform([-0.2, -0.2, 1.0], [0.2, 0.2, 1.0], (12, 3)))
+    rays = normalized(rng.uniform([-0.2, -0.2, 1.0], [0.2, 0.2, 1.0], (12, 3)))
     index = pair_index.build(rays, 0.5)
     magnitude = np.zeros(12)
     gates = Gates(1e-3, 1e-3, 0.5, 0.0)
@@ -80,9 +80,11 @@ def test_directions_at_the_true_attitude_are_those_from_the_bearing(rng: Generat
     angles_deg = rng.uniform(-8, 8, 3)
     lab_from_body = Rotation.from_euler("ZYX", angles_deg[::-1], degrees=True)
     cam_from_lab = lever.cam_from_body * lab_from_body.inv()
-    rays = unit(cam_from_lab.apply(place_m) - lever.cam_from_body.apply(lever.camera_body_m))
+    rays = normalized(
+        cam_from_lab.apply(place_m) - lever.cam_from_body.apply(lever.camera_body_m)
+    )
     roll_deg, pitch_deg, yaw_deg = angles_deg.tolist()
     found = assumed_directions(rays, leds, lever, (roll_deg, pitch_deg, yaw_deg))
-    assert found == pytest.approx(unit(cam_from_lab.apply(place_m)), abs=1e-9)
+    assert found == pytest.approx(normalized(cam_from_lab.apply(place_m)), abs=1e-9)
     other = assumed_directions(rays, leds, lever, (roll_deg + 10, pitch_deg, yaw_deg))
     assert np.abs(other - found).max() > 1e-4

@@ -14,8 +14,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import pair_index
-from estimator.catalog.catalog import unit
 from estimator.core.checks import Floats
+from estimator.core.vectors import normalized
 from estimator.identification.published import pyramid
 from estimator.identification.published.primary_pair import Gates, Primary, SearchInput
 from estimator.identification.published.saa import UNMATCHED_COST
@@ -144,7 +144,7 @@ def test_the_tail_of_chance_matches_is_binomial_down_to_the_least_number() -> No
 def test_a_match_counts_as_the_binomial_tail_of_its_gates() -> None:
     """Three of five random directions: their gates cover a share p of the sky of the catalog's local density."""
     rays, _, rows, index, _ = field(1)
-    strays = unit(np.array([[0.1, 0.05, 1.0], [-0.08, 0.06, 1.0]]))
+    strays = normalized(np.array([[0.1, 0.05, 1.0], [-0.08, 0.06, 1.0]]))
     seen = np.vstack([rays, strays])
     corners = np.arange(3)
     hypotheses = 7
@@ -164,7 +164,7 @@ def test_a_match_counts_as_the_binomial_tail_of_its_gates() -> None:
 @pytest.mark.parametrize("zoom", [0.99, 1.01])
 def test_pyramid_names_the_stars_of_a_lens_of_unknown_focal_length(zoom: float) -> None:
     rays, _, rows, index, truth = field(3)
-    zoomed = unit(rays * [zoom, zoom, 1])
+    zoomed = normalized(rays * [zoom, zoom, 1])
     match = PLAIN["pyramid"](zoomed, index, TOLERANCE_RAD, stretch=0.02, focal_unknown=True)
     np.testing.assert_array_equal(match.star, rows[match.observed])
     assert len(match.star) == len(rows)
@@ -231,11 +231,11 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
     rng = np.random.default_rng(8)
     tolerance = 1e-4
     taken = 0
-    corners = unit(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1]]))
+    corners = normalized(np.array([[0.1, 0.02, 1], [-0.06, 0.08, 1], [-0.03, -0.09, 1]]))
     options = pyramid.PyramidOptions(tolerance, 0.0, False, 10, 1000, 4, 0.0, *EDGES)
     for _ in range(100):
-        fourth = unit(np.array([[0.03, 0.05, 1]]))
-        moved = unit(fourth + rng.normal(0, 1.5 * tolerance, 3))
+        fourth = normalized(np.array([[0.03, 0.05, 1]]))
+        moved = normalized(fourth + rng.normal(0, 1.5 * tolerance, 3))
         # As far from the first corner as the fourth star, in another direction.
         decoy = Rotation.from_rotvec(corners[0]).apply(fourth)
         rays = np.vstack([corners, fourth])
@@ -253,7 +253,7 @@ def test_a_fourth_star_has_its_angles_to_all_three_corners() -> None:
 @pytest.mark.parametrize("name", ["pyramid", "shefex"])
 def test_the_number_of_triangles_tried_is_the_allowed_one(name: str) -> None:
     """The first three of four triangles have a false star; the first that has none is the last in order."""
-    stars = unit(
+    stars = normalized(
         np.array(
             [
                 [-0.1, -0.02, 1],
@@ -264,7 +264,7 @@ def test_the_number_of_triangles_tried_is_the_allowed_one(name: str) -> None:
             ]
         )
     )
-    false = unit(np.array([[0.04, -0.05, 1]]))
+    false = normalized(np.array([[0.04, -0.05, 1]]))
     index = pair_index.build(stars, 0.4)
     seen = np.vstack([false, stars])
     limits = {"base_stars": 6, "max_checks": 10**6}
@@ -311,7 +311,7 @@ def crossing_area_sr(
 
 
 def test_shefex_s_gates_have_the_least_area_of_their_crossing_rings() -> None:
-    rays = unit(
+    rays = normalized(
         np.array(
             [
                 [0.1, 0.02, 1],
@@ -359,7 +359,7 @@ def test_a_star_and_its_mirror_image_in_the_base_are_on_different_sides() -> Non
         rays = cap(rng, 4, 0.2)
         volumes = [np.linalg.det(rays[[m, (m + 1) % 3, 3]]) for m in range(3)]
         far = int(np.argmax(np.abs(volumes)))
-        normal = unit(np.cross(rays[[far]], rays[(far + 1) % 3]))[0]
+        normal = normalized(np.cross(rays[[far]], rays[(far + 1) % 3]))[0]
         mirrored = rays[3] - 2 * (rays[3] @ normal) * normal
         index = SimpleNamespace(
             vectors=Rotation.random(rng=rng).apply(np.vstack([rays, mirrored]))
@@ -404,7 +404,7 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
     options = ShefexOptions(2e-6, TOLERANCE_RAD, 10, 10**6, 12, accept=FOURTH_STAR)
     match = SHEFEX.search(rays[:4], index, options._replace(base=4), np.zeros(3, np.int64))
     np.testing.assert_array_equal(match.star, rows[:4])
-    strays = np.vstack([rays[:3], unit(np.array([[0.012, 0.034, 1.0]]))])
+    strays = np.vstack([rays[:3], normalized(np.array([[0.012, 0.034, 1.0]]))])
     assert (
         len(
             SHEFEX.search(strays, index, options._replace(base=4), np.zeros(3, np.int64)).star
@@ -412,7 +412,7 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
         == 0
     )
     # Within wide gates of the angles, but 30 tolerances from its place.
-    moved = unit(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0]))
+    moved = normalized(rays[:4] + np.outer([0, 0, 0, 1], [3e-4, 0, 0]))
     wide = options._replace(cos_error=1e-4, tolerance_rad=1e-5)
     assert (
         len(SHEFEX.search(moved, index, wide._replace(base=4), np.zeros(3, np.int64)).star)
@@ -425,7 +425,7 @@ def test_four_stars_are_the_least_of_shefex_s_match() -> None:
 SEPARATION_RAD = 1e-4
 POSITION_RAD = 1e-2
 STRETCH = 1e-4
-FIVE = unit(
+FIVE = normalized(
     np.array(
         [
             [0.1, 0.02, 1],
@@ -458,7 +458,7 @@ def test_saa_s_gates_of_angles_cross_in_an_area_about_each_star() -> None:
             )
             rings.append((FIVE[row], primary.gate_rad[side, k]))
         assert primary.area_sr[k] == pytest.approx(crossing_area_sr(FIVE[n], rings), rel=0.03)
-    midpoint = unit(FIVE[[0]] + FIVE[2])[0]
+    midpoint = normalized(FIVE[[0]] + FIVE[2])[0]
     reach_rad = np.arccos(FIVE @ midpoint).max() + 3 * SEPARATION_RAD
     assert primary.reach_rad == pytest.approx(reach_rad, abs=1e-9)
 
@@ -470,7 +470,7 @@ def test_saa_s_gate_of_positions_is_three_errors_of_the_predicted_place() -> Non
     errors = []
     primary = primary_of(FIVE, sigma_rad)
     for _ in range(2000):
-        seen = unit(FIVE + sigma_rad * rng.normal(size=FIVE.shape))
+        seen = normalized(FIVE + sigma_rad * rng.normal(size=FIVE.shape))
         R = SAA.triad(seen[0], seen[2]).T @ SAA.triad(FIVE[0], FIVE[2])
         errors.append((FIVE @ R.T - seen)[primary.others])
     for k, n in enumerate(primary.others):
@@ -671,7 +671,7 @@ def test_fialho_s_match_has_more_than_its_share_of_the_observed_stars(
 ) -> None:
     """All stars match among twice as many lights."""
     rays, _, rows, index, _ = field(1)
-    strays = unit(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
+    strays = normalized(rays + np.array([0.004, 0.003, 0]))  # 50 tolerances beside each star
     options = FIALHO.search_options(
         TOLERANCE_RAD, Options(epsilon_mag=0.1), share, True, False
     )

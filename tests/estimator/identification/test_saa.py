@@ -10,13 +10,13 @@ from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.home_position import Sighting, calibrate
 from estimator.catalog import pair_index
-from estimator.catalog.catalog import unit
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
 from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
+from estimator.core.vectors import normalized
 from estimator.identification.published.saa import saa
 
 pytestmark = pytest.mark.long  # an algorithm of the papers: compiles for ten seconds
@@ -50,7 +50,7 @@ EPSILON_MAG = 5.0
 
 
 def patch(places: Floats) -> Floats:
-    return unit(np.column_stack([places * PITCH_RAD, np.ones(len(places))]))
+    return normalized(np.column_stack([places * PITCH_RAD, np.ones(len(places))]))
 
 
 def pairs_of(vectors: Floats, magnitude: Floats) -> PairIndex:
@@ -69,7 +69,7 @@ def observed(
     truth = Rotation.random(rng=rng)
     seen = truth.apply(vectors)
     reflection = truth.apply(patch(rng.uniform(-2.5, 2.5, (false, 2))))
-    seen = unit(
+    seen = normalized(
         np.vstack([seen, reflection]) + rng.normal(0, SIGMA_RAD, (len(seen) + false, 3))
     )
     # The patch is brought before the camera, as a field is.
@@ -225,7 +225,7 @@ def test_a_dome_calibrated_from_its_frames_is_identified_at_the_thesis_s_stops()
         seen = frame(stop)
         order = np.argsort(-seen.brightness)
         point, _ = thesis_points(camera.rays(seen.xy_px[order]), ball, lever)
-        rays = unit(point + lever.camera_body_m)
+        rays = normalized(point + lever.camera_body_m)
         match = saa(
             rays,
             known,

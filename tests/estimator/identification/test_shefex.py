@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog import catalog, pair_index
+from estimator.catalog import pair_index
 from estimator.core.checks import Floats
+from estimator.core.vectors import normalized
 from estimator.identification.published.master_star import master_star
 from estimator.identification.published.shefex import (
     ShefexOptions,
@@ -19,7 +20,7 @@ from estimator.identification.published.shefex import (
 pytestmark = pytest.mark.slow  # much is compiled
 
 ARCSEC_RAD = np.pi / 648_000
-SCREEN_CORNERS = catalog.unit(
+SCREEN_CORNERS = normalized(
     np.array([[0.1, 0.1, 1], [-0.1, 0.1, 1], [0.1, -0.1, 1], [-0.1, -0.1, 1]])
 )
 # "the angle per pixel, computed from the FOV and the CCD size (0.02 deg)".
@@ -60,7 +61,7 @@ def test_no_triangle_is_begun_once_the_effort_is_used_up(
     triangles: int, checks: int, begun: int
 ) -> None:
     """Six stars have 20 triangles; no star of the catalog is near theirs, so that none is found."""
-    seen = catalog.unit(screen(np.random.default_rng(5))[:6])
+    seen = normalized(screen(np.random.default_rng(5))[:6])
     index = pair_index.build(SCREEN_CORNERS, 0.5)
     tried = np.zeros(3, np.int64)
     search(seen, index, ShefexOptions(1e-9, 1e-7, triangles, checks, base=6), tried)
@@ -74,7 +75,7 @@ def test_a_given_cos_error_searches_as_eq_3_does_from_its_tolerance() -> None:
     assert tolerance == pytest.approx(0.495 * PIXEL_RAD, rel=0.01)
     assert cos_error(fov, tolerance) == pytest.approx(5.5e-5, rel=1e-9)
     rng = np.random.default_rng(8)
-    stars = catalog.unit(rng.normal(size=(2000, 3)))
+    stars = normalized(rng.normal(size=(2000, 3)))
     index = pair_index.build(stars, fov)
     seen = stars[np.arccos(np.clip(stars @ stars[0], -1, 1)) < fov / 2]
     error = cos_error(index.max_angle_rad, tolerance)
@@ -88,7 +89,7 @@ def test_a_given_cos_error_searches_as_eq_3_does_from_its_tolerance() -> None:
 
 
 def test_the_angles_of_twenty_triangles_without_a_catalog_pair_are_sixty() -> None:
-    seen = catalog.unit(screen(np.random.default_rng(5))[:6])
+    seen = normalized(screen(np.random.default_rng(5))[:6])
     compared = np.zeros(1, np.int64)
     index = pair_index.build(SCREEN_CORNERS, 0.5)
     assert shefex(seen, index, 1e-7, cos_error=1e-9, compared=compared) is None
@@ -100,7 +101,7 @@ def test_the_angles_of_twenty_triangles_without_a_catalog_pair_are_sixty() -> No
 
 def screen(rng: np.random.Generator) -> Floats:
     """Directions of nine stars, the brightest first."""
-    return catalog.unit(
+    return normalized(
         np.column_stack([rng.uniform([-0.15, -0.11], [0.15, 0.11], (9, 2)), np.ones(9)])
     )
 
@@ -109,7 +110,7 @@ def observe(
     rng: np.random.Generator, stars: Floats, noise_rad: float
 ) -> tuple[Floats, Rotation]:
     truth = Rotation.from_rotvec(rng.normal(0, 0.1, 3))
-    return catalog.unit(truth.apply(stars) + rng.normal(0, noise_rad, stars.shape)), truth
+    return normalized(truth.apply(stars) + rng.normal(0, noise_rad, stars.shape)), truth
 
 
 TOLERANCE_RAD = 500 * ARCSEC_RAD / np.sqrt(2)  # +-500 arcsec of an angle
@@ -160,7 +161,7 @@ def test_nine_stars_of_another_screen_or_a_mirror_are_refused() -> None:
 def test_a_square_of_equal_angles_is_no_answer() -> None:
     # Nine on a lattice: eight turns and mirrors fit; the corner that is the master is four.
     places = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1)]) * 0.1
-    stars = catalog.unit(np.column_stack([places, np.ones(9)]))
+    stars = normalized(np.column_stack([places, np.ones(9)]))
     turned_by = Rotation.from_euler("z", 90, degrees=True)
     match = master_star(turned_by.apply(stars), pair_index.build(stars, 0.5), TOLERANCE_RAD)
     assert match is None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimator.catalog.catalog import unit
 from estimator.core.checks import Floats
+from estimator.core.vectors import normalized
 from tests.helpers.interpreted import interpreted
 
 TRIANGLES = interpreted("estimator.identification.published.triangles")
-CORNERS = unit(np.array([[0.2, 0.0, 1.0], [-0.1, 0.15, 1.0], [0.0, -0.2, 1.0]]))
+CORNERS = normalized(np.array([[0.2, 0.0, 1.0], [-0.1, 0.15, 1.0], [0.0, -0.2, 1.0]]))
 
 
 def inside(points: Floats, corners: Floats) -> Floats:
@@ -32,7 +32,7 @@ def test_area_and_moment_of_a_spherical_triangle_are_the_integrals_over_it() -> 
     points = np.column_stack([points, np.repeat(z, 700)])
     points = points[inside(points, CORNERS)]
     step_sr = 2 * np.pi * (1 - np.cos(0.3)) / 700**2
-    theta = np.arccos(points @ unit(CORNERS.sum(axis=0)[None])[0])
+    theta = np.arccos(points @ normalized(CORNERS.sum(axis=0)[None])[0])
     assert TRIANGLES.spherical_area(*CORNERS) == pytest.approx(
         len(points) * step_sr, rel=1e-3
     )
@@ -61,7 +61,7 @@ def test_a_planar_triangle_has_the_area_and_moment_of_its_plate() -> None:
 
 
 def test_small_triangles_are_the_same_on_the_plane_and_on_the_sphere() -> None:
-    small = unit(CORNERS * [1e-2, 1e-2, 1])
+    small = normalized(CORNERS * [1e-2, 1e-2, 1])
     planar = TRIANGLES.planar_features(*small)
     assert TRIANGLES.spherical_area(*small) == pytest.approx(planar[0], rel=1e-5)
     assert TRIANGLES.spherical_moment(*small) == pytest.approx(planar[1], rel=1e-5)
@@ -71,9 +71,9 @@ def test_area_and_moment_scatter_by_the_module_s_law() -> None:
     """Noise of sigma along both axes of each direction; 1,000 draws give a deviation to 2.2 %, three of them here."""
     rng = np.random.default_rng(48)
     sigma = 1e-5
-    corners = unit(CORNERS * [0.3, 0.3, 1])
+    corners = normalized(CORNERS * [0.3, 0.3, 1])
     drawn = [
-        TRIANGLES.planar_features(*unit(corners + rng.normal(0, sigma, (3, 3))))
+        TRIANGLES.planar_features(*normalized(corners + rng.normal(0, sigma, (3, 3))))
         for _ in range(1000)
     ]
     area, moment = TRIANGLES.planar_features(*corners)
@@ -84,7 +84,7 @@ def test_area_and_moment_scatter_by_the_module_s_law() -> None:
 
 def test_area_moment_and_longest_side_determine_the_shortest() -> None:
     rng = np.random.default_rng(49)
-    for corners in unit(rng.normal([0, 0, 5], 0.4, (200, 3, 3)).reshape(-1, 3)).reshape(
+    for corners in normalized(rng.normal([0, 0, 5], 0.4, (200, 3, 3)).reshape(-1, 3)).reshape(
         -1, 3, 3
     ):
         p, q, r = TRIANGLES._corners(corners, np.arange(3))

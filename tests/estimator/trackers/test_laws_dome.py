@@ -18,11 +18,11 @@ from estimator.attitude.nearfield import SOLVERS
 from estimator.calibration import home_position
 from estimator.calibration.home_position import Sighting
 from estimator.catalog import pair_index
-from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
+from estimator.core.vectors import normalized
 from estimator.identification import led_detections, led_index, led_search
 from estimator.trackers import dome_tracker
 from estimator.trackers.dome_tracker import DomeTracker
@@ -522,7 +522,7 @@ def test_positions_of_lights_are_those_of_equations_43_to_45(
     found = home_position.body_positions(xy_px, CAMERA, surface, arm) - [0, 0, 0.3]
     np.testing.assert_allclose(found[:, :2], 0.9 * tangent, rtol=0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 0.9, rtol=1e-12, atol=0)
-    first, second = unit(rng.standard_normal((2, 3)))
+    first, second = normalized(rng.standard_normal((2, 3)))
     angle = home_position.separation_rad(first, second)
     assert np.cos(angle) == pytest.approx(first @ second, abs=1e-12)
 

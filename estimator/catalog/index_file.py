@@ -1,0 +1,73 @@
+"""Index of quads on disk, memory-mapped: that of a deep catalog takes seconds to build and a hundred megabytes.
+
+A file is named by the SHA-256 of what its index is built from: directions, field, and the text FORM, which changes with
+the method. Directions change with the date of the frames (aberration by up to 20", proper motion), so that another date
+is another file. A file holds 32-bit words: `QuadIndex.first`, `star` and `code`, and last the CRC-32 of all words
+before it. Compiled code reads rows without checks, so that an index is used only if this sum is right; any other file
+is written again. It is written to a temporary name and renamed, so that several processes may start at once. Of the
+files, the newest MOST_FILES are kept. Where the folder cannot be written, the index is built in memory.
+
+The folder is ESTIMATOR_CACHE_DIR, or else `estimator` in XDG_CACHE_HOME or in ~/.cache.
+"""
+
+import hashlib
+import os
+import tempfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from estimator.catalog import quad_index
+from estimator.catalog.quad_index import SIDE, QuadIndex
+from estimator.catalog.sky_index import SkyIndex
+
+FORM = b"quads 1"
+# The index of fewer stars is built in a fraction of a second, and not kept.
+FEW_STARS = 50_000
+MOST_FILES = 8
+HEAD = SIDE**4 + 1  # words of `first`
+
+
+def folder() -> Path:
+    """Return the folder of the files."""
+    user = os.getenv("XDG_CACHE_HOME") or "~/.cache"
+    return Path(os.getenv("ESTIMATOR_CACHE_DIR") or f"{user}/estimator").expanduser()
+
+
+def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
+    """Return the quads of a sky for fields of the given height: from their file, else built and written to it."""
+    if len(sky.vectors) < FEW_STARS:
+        return quad_index.build(sky, height_rad)
+    key = hashlib.sha256(FORM + np.float64(height_rad).tobytes() + sky.vectors.tobytes())
+    path = folder() / f"quads_{key.hexdigest()}.bin"
+    with suppress(OSError, ValueError):
+        return read(path)
+    built = quad_index.build(sky, height_rad)
+    with suppress(OSError, ValueError):
+        _write(path, built)
+        return read(path)
+    return built
+
+
+def read(path: Path) -> QuadIndex:
+    """Map a file into memory. Raises OSError or ValueError if there is none, or if it is damaged."""
+    # Copy on write: compiled code has one version, for arrays that can be written.
+    words = np.asarray(np.memmap(path, np.int32, "c"))
+    if len(words) <= HEAD or zlib.crc32(words[:-1].data) != words[-1].view(np.uint32):
+        raise ValueError(f"{path}: damaged")
+    star, code = words[HEAD:-1].reshape(2, -1, 4)
+    return QuadIndex(star, code.view(np.float32), words[:HEAD])
+
+
+def _write(path: Path, quads: QuadIndex) -> None:
+    """Write a file, and remove the oldest ones."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = b"".join(array.tobytes() for array in (quads.first, quads.star, quads.code))
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        file.write(data + np.uint32(zlib.crc32(data)).tobytes())
+    os.replace(file.name, path)
+    files = sorted(path.parent.glob("quads_*.bin"), key=os.path.getmtime)
+    for old in files[:-MOST_FILES]:
+        old.unlink()
