@@ -3,7 +3,8 @@
 The stages are detection and centroiding (`pipeline`), identification, and solution. The default identifier computes
 identity, attitude and covariance in one step by Bayesian evidence, from pairs of stars
 (`identification/star_search.py`). If the focal length is uncertain, quads of stars (`identification/star_quads.py`) are
-searched first, and the focal length and the first radial distortion coefficient are fitted to each frame's stars. Quads
+searched first, and the camera is fitted to each frame's stars (`lens_fit`), as it is where a calibrated camera does not
+fit the whole field. Quads
 also find a calibrated focal length that is wrong: where a short search by pairs fails, or where its residuals are too
 large. The candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if
 the match is significant.
@@ -24,6 +25,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
+from estimator.attitude.wahba import matrix_of
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
@@ -50,10 +52,11 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
 )
-from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
+from estimator.trackers.refinement import NO_MATCH, SHEARED, FieldMatcher, solved_attitude
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
+    FOCAL_MARGIN,
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
     WRONG_FOCAL_SEARCH,
@@ -166,6 +169,7 @@ class StarTracker(FrameTracker):
             field,
             np.nan if zero_mag is None else zero_mag,
             self.settings.magnitude_sigma,
+            self.camera.aspect,
         )
 
     @functools.cached_property
@@ -443,7 +447,7 @@ class StarTracker(FrameTracker):
         focal_uncertainty
             Relative uncertainty of the focal length, if it is larger than that of the tracker
         """
-        uncertainty = max(self.focal_uncertainty, focal_uncertainty)
+        uncertainty = max(FOCAL_MARGIN * self.focal_uncertainty, focal_uncertainty)
         return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
@@ -456,10 +460,10 @@ class StarTracker(FrameTracker):
         1. Search with this model of the errors (`_search`). With a calibrated camera and residuals that are too large,
            also search for a wrong focal length.
         2. Match and fit again by the residuals (`refit`).
-        3. Drop the solution of a calibrated camera that fits only a part of the field, and a sheared field.
-        4. With an uncertain focal length, fit the lens to all stars, unless an undistorted one explains the solution.
-           If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
+        3. Drop the solution if the camera model fits only a part of the field or a sheared one; with a fitted camera,
+           also a field of view outside of its bounds, and a match that is not beyond chance.
         """
+        status = NO_MATCH
         for model in searches:
             # 1. Search
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
@@ -476,26 +480,16 @@ class StarTracker(FrameTracker):
             # 2. Residuals
             refitted = self.refit(centroids, solution, sigma_px, variance)
             # 3. Wrong camera model
-            partial = not self.focal_uncertainty and self.field_matcher.misfits(
-                refitted.solution, centroids
-            )
-            if partial or refitted.sheared:
-                continue
-            attitude = self.attitude_of(centroids, refitted, sigma_px)
-            # 4. Lens
-            if self.focal_uncertainty and not (
-                model.min_error_px == MIN_ERROR_PX
-                and self.field_matcher.fits(solution, centroids, sigma_px)
-            ):
-                zoomed = self.camera.zoomed(solution.focal_ratio)
-                start = Rotation.from_quat(solution.cam_from_ref_xyzw)
-                fitted = self.field_matcher.refine(centroids, zoomed, start)
-                if fitted.solved or model.relative_error:
-                    attitude = fitted
-            clock.lap("solve")
-            if attitude.solved:
+            reason = self.field_matcher.reason_against(refitted, centroids)
+            if not reason:
+                attitude = self.attitude_of(centroids, refitted, sigma_px)
+                clock.lap("solve")
                 return attitude
-        return Attitude(NO_MATCH)
+            status = reason if status == NO_MATCH else status
+            clock.lap("solve")
+            if reason == SHEARED:
+                break
+        return Attitude(status)
 
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
@@ -512,6 +506,7 @@ class StarTracker(FrameTracker):
                 detections, self.sky, most, model.max_checks
             ), 0.0
         known = not self.focal_uncertainty
+        detections = detections._replace(tangent=detections.tangent / [1.0, model.aspect])
         solution = star_quads.identify(
             detections, self.quads, self.sky, most, model.max_checks, known
         )
@@ -524,7 +519,12 @@ class StarTracker(FrameTracker):
         sigma_px: Floats,
         variance: float = 0.0,
     ) -> Refit:
-        """Return a solution with the errors and, of a calibrated global shutter, the lens that its residuals imply.
+        """Return a solution with the errors and the camera that its residuals and the field imply.
+
+        1. Match again with the errors of most evidence (`misfit`).
+        2. Fit the camera with the match of the whole field (`FieldMatcher.with_lens`), unless the camera model explains
+           the solution. That of a calibrated camera is doubted if the errors are larger than claimed, or if stars just
+           miss detections.
 
         Parameters
         ----------
@@ -533,27 +533,51 @@ class StarTracker(FrameTracker):
         variance
             Factor of the variances if the solution has been matched again already; else 0
         """
+        matcher = self.field_matcher
         same_focal = solution.focal_ratio == 1
         camera = self.camera if same_focal else self.camera.zoomed(solution.focal_ratio)
-        if not len(solution.star) or 0 < variance < misfit.TELLING:
-            return Refit(solution, camera, variance or 1.0)
+        if not len(solution.star):
+            return Refit(solution, camera, 1.0)
+        # 1. Errors
         uncertainty = 0.0 if same_focal else star_search.WRONG_FOCAL
         detections = self.detections(centroids, sigma_px, uncertainty)
+        own_px = self.sigma_px(centroids)
+        exact = np.array_equal(own_px, sigma_px)
+        known = exact and not self.focal_uncertainty
         if not variance:
-            solution, detections = misfit.with_companions(solution, detections, self.sky)
+            if exact:
+                solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
-            if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
+            whole = len(solution.star) == len(centroids)
+            if whole and solution.chi2 < misfit.DOUBTFUL and known:
                 return Refit(solution, camera, 1.0)
-        if self.focal_uncertainty or self.camera.row_time_s:
-            # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
-            dof = max(2 * len(solution.star) - 4, 1)
-            variance = variance_factor(dof * solution.chi2, dof)
-            scaled = solution._replace(covariance_rad2=variance * solution.covariance_rad2)
-            return Refit(scaled, camera, variance)
-        fit_lens = not self.camera.focal_sigma
-        return misfit.refit(
-            solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
-        )
+            if known and not self.camera.row_time_s:
+                R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+                solution, variance = misfit.widened(
+                    solution, R_cam_from_ref, detections, self.sky
+                )
+            else:
+                # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
+                dof = max(2 * len(solution.star) - 4, 1)
+                variance = variance_factor(dof * solution.chi2, dof)
+                scaled = variance * solution.covariance_rad2
+                solution = solution._replace(covariance_rad2=scaled)
+        # 2. Camera
+        weight = detections.weight if exact else self.detections(centroids, own_px).weight
+        if self.focal_uncertainty:
+            fits = exact and matcher.fits(solution, centroids, weight)
+        else:
+            fixed = self.camera.focal_sigma or self.camera.row_time_s
+            fits = fixed or len(solution.star) < misfit.LENS_MATCHES
+            fits = fits or (
+                known
+                and variance < misfit.TELLING
+                and not matcher.misfits(camera, solution, centroids)
+            )
+        if fits:
+            return Refit(solution, camera, variance)
+        start = variance if known else 1.0
+        return matcher.with_lens(solution, centroids, weight, start, exact)
 
     def attitude_of(
         self, centroids: Centroids, refitted: Refit, sigma_px: Floats

@@ -1,0 +1,363 @@
+"""Fit of attitude and camera to the stars of a field, grown from the few stars of a candidate over the whole field.
+
+A wrong camera model (pixels that are not square, a distortion, a drifted focal length) lets the stars of one part of
+the field match, at an attitude that fits this part. Statistics of these stars cannot show it. `grow` therefore extends
+the match over the field by the prediction's own uncertainty. The unknowns p are a small rotation, the logarithms of the
+focal length and of the aspect, a shear s, a twist u, and the distortion's k1, k2, p1 and p2. With the distorted
+tangents t' of a star,
+
+    x = c_x + f (t'_x + s t'_y - u t'_y^2),    y = c_y + f (a t'_y + s t'_x + u t'_x t'_y)
+
+The camera's numbers have normal priors about what the tracker was given. The steps:
+
+1. Fit p to the matches: Gauss-Newton with the weights of a soft L1 loss, which gives the posterior covariance P.
+2. Predict every star in the field. With the slopes J of its pixel, the prediction has the covariance J P J^T.
+3. Match the stars whose uncertainty is less than the distance at which false lights become likely, each with a gate of
+   its own uncertainty and the centroid's error: the field grows outward as P falls (the gate of a Kalman filter:
+   Bar-Shalom & Fortmann, Tracking and Data Association, section 5.4).
+4. Repeat from 1 until the matches stay the same.
+5. Drop the unknowns that the matches do not ask for: those within few standard deviations of what was given.
+6. Fit again without loss weights, and reject matches beyond GATE_SIGMA.
+
+A camera has neither shear nor twist. Rows that are exposed one after another stretch, shear and twist the image of a
+turning camera by its rates about x, y and z; refraction shears it, and so does the principal point of a wide lens. The
+shear is symmetric: it has no part that looks like a rotation. Displaced rows, however, are this shear and a rotation by
+s. The roll is therefore ambiguous by s, which is added to the covariance; beyond MAX_SHEAR the field is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import exp
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from estimator.attitude.rotation_fit import tangent_jacobian
+from estimator.core.camera import Camera, distorted, distortion_slopes
+from estimator.core.checks import Floats
+from estimator.core.least_squares import variance_factor
+from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
+
+# Unknowns: rotation, log focal length, log aspect, shear, twist, k1, k2, p1, p2
+UNKNOWNS = 11
+FOCAL, ASPECT, SHEAR, TWIST, K1 = range(3, 8)
+# Groups that are dropped together if the matches do not ask for them
+GROUPS = [9, 10], [7, 8], [4, 5, 6]
+# Least standard deviations of the priors: relative focal length, aspect and shear; relative distortion at the corner,
+# radial and tangential
+LEAST_PRIOR = 0.01
+LEAST_TANGENTIAL = 0.002
+WIDEST_PRIOR = 0.05  # largest for an uncertain camera: pixels are seldom farther off square
+MAX_FALSE = 0.1  # greatest expected number of false lights within the reach of a match
+LEAST_GATE_PX = 1.5  # least gate while the match grows
+ROUNDS = 12
+STEPS = 3  # Gauss-Newton steps of a round
+NEEDED_SIGMA = 1.5  # standard deviations within which a group of unknowns is dropped
+MAX_SHEAR = 1e-3
+SHEAR_SIGMA = 4.5  # significance of a shear for which a field is refused
+
+# Function of camera, attitude and radius in pixels that returns rows of centroids and of stars
+Match = Callable[[Camera, Rotation, float], tuple[NDArray, NDArray]]
+
+
+def prior_sigma(camera: Camera, focal_uncertainty: float) -> Floats:
+    """Return the (UNKNOWNS,) standard deviations of the priors for a relative uncertainty of the focal length.
+
+    A rolling shutter's shear and stretch belong to the rate, which is fitted elsewhere: they are then 0.
+    """
+    corner = float(np.tan(camera.diagonal_rad / 2))
+    stretch = (
+        0.0 if camera.row_time_s else np.clip(focal_uncertainty, LEAST_PRIOR, WIDEST_PRIOR)
+    )
+    radial = np.clip(2 * focal_uncertainty, LEAST_PRIOR, 2 * WIDEST_PRIOR)
+    tangential = max(0.1 * radial, LEAST_TANGENTIAL) / corner
+    return np.array(
+        [np.inf] * 3
+        + [max(focal_uncertainty, LEAST_PRIOR), stretch, stretch, stretch]
+        + [radial / corner**2, radial / corner**4, tangential, tangential]
+    )
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A fitted attitude and camera.
+
+    Attributes
+    ----------
+    given
+        Camera about which the unknowns have their priors
+    cam_from_ref
+        Attitude
+    change
+        (UNKNOWNS,) changes of the camera's numbers; those of the rotation are 0
+    covariance
+        (UNKNOWNS, UNKNOWNS) posterior covariance, with the variances times `variance`
+    variance
+        Factor of the claimed variances
+    """
+
+    given: Camera
+    cam_from_ref: Rotation
+    change: Floats
+    covariance: Floats
+    variance: float
+
+    @property
+    def camera(self) -> Camera:
+        """The fitted camera, without shear and twist."""
+        log_focal, log_aspect = self.change[[FOCAL, ASPECT]].tolist()
+        k = np.add(self.given.distortion, np.append(self.change[K1:], 0.0))
+        return replace(
+            self.given,
+            focal_px=self.given.focal_px * exp(log_focal),
+            aspect=self.given.aspect * exp(log_aspect),
+            distortion=tuple(k.tolist()),
+        )
+
+    @property
+    def sheared(self) -> bool:
+        """Whether the field has a significant shear that is too great for an attitude."""
+        shear = abs(self.change[SHEAR])
+        return bool(
+            shear > max(MAX_SHEAR, SHEAR_SIGMA * np.sqrt(self.covariance[SHEAR, SHEAR]))
+        )
+
+    @property
+    def covariance_rad2(self) -> Floats:
+        """(3, 3) covariance of the attitude, with the roll's ambiguity by the shear."""
+        covariance = self.covariance[:3, :3].copy()
+        covariance[2, 2] += self.change[SHEAR] ** 2
+        return covariance
+
+    def project(self, vectors_ref: Floats) -> tuple[Floats, Floats]:
+        """Return the (K, 2) pixels of directions, and their (K, 2, UNKNOWNS) slopes by the unknowns."""
+        camera = self.camera
+        seen = self.cam_from_ref.apply(vectors_ref)
+        tangent = seen[:, :2] / seen[:, 2:]
+        shear, twist = self.change[[SHEAR, TWIST]].tolist()
+        stretch = camera.focal_px * np.array([[1.0, shear], [shear, camera.aspect]])
+        bent = distorted(tangent, camera.distortion)
+        by_tangent, by_coefficients = distortion_slopes(tangent, camera.distortion)
+        by_twist = camera.focal_px * bent[:, 1:] * bent[:, ::-1] * [-1.0, 1.0]
+        offset = bent @ stretch + twist * by_twist
+        slopes = np.zeros((len(seen), 2, UNKNOWNS))
+        jacobian = tangent_jacobian(seen, seen).reshape(-1, 2, 3)
+        slopes[:, :, :3] = stretch @ by_tangent @ jacobian
+        slopes[:, :, FOCAL] = offset
+        slopes[:, 1, ASPECT] = camera.focal_px * camera.aspect * bent[:, 1]
+        slopes[:, :, SHEAR] = camera.focal_px * bent[:, ::-1]
+        slopes[:, :, TWIST] = by_twist
+        slopes[:, :, K1:] = stretch @ by_coefficients[:, :, :4]
+        return offset + camera.center_px, slopes
+
+    def moved(self, step: Floats, covariance: Floats, variance: float) -> Lens:
+        """Return the lens after a step (UNKNOWNS,) of the fit."""
+        turn = Rotation.from_rotvec(step[:3])
+        change = np.append(np.zeros(3), self.change[3:] + step[3:])
+        return Lens(self.given, turn * self.cam_from_ref, change, covariance, variance)
+
+
+class Sights(NamedTuple):
+    """Centroids, brightest first, and stars.
+
+    Attributes
+    ----------
+    xy_px
+        (N, 2) centroids
+    whiten
+        (N, 2, 2) transposed Cholesky factors of the inverse covariances of the centroids, 1/px
+    vectors_ref
+        (M, 3) directions of the stars
+    """
+
+    xy_px: Floats
+    whiten: Floats
+    vectors_ref: Floats
+
+
+def start_of(
+    given: Camera, cam_from_ref: Rotation, focal_ratio: float, variance: float
+) -> Lens:
+    """Return a candidate with a focal length that is `focal_ratio` times the given one."""
+    change = np.zeros(UNKNOWNS)
+    change[FOCAL] = np.log(focal_ratio)
+    return Lens(given, cam_from_ref, change, np.zeros((UNKNOWNS, UNKNOWNS)), variance)
+
+
+def grow(
+    start: Lens,
+    sights: Sights,
+    match: Match,
+    matched: tuple[NDArray, NDArray],
+    prior: Floats,
+    reach_px: float,
+) -> tuple[Lens, NDArray, NDArray, float]:
+    """Extend a candidate over the field: the numbered steps of the module.
+
+    Parameters
+    ----------
+    match
+        Function that pairs centroids and stars
+    matched
+        (K,) rows of the candidate's centroids and of its stars
+    prior
+        (UNKNOWNS,) standard deviations of the priors; 0 for what is not fitted
+    reach_px
+        Distance within which a false light is unlikely
+
+    Returns
+    -------
+    Lens
+        The fitted camera and attitude
+    observed, star
+        (K,) rows of the matched centroids and stars
+    chi2
+        Reduced chi-square of the claimed errors
+    """
+    lens = start
+    observed, star = matched
+    free = prior > 0
+    # 1. to 4. Growth
+    for _ in range(ROUNDS):
+        lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
+        before = observed, star
+        observed, star = _matched(lens, sights, match, reach_px)
+        if len(star) < MIN_EVIDENCE_MATCHES:
+            return lens, *before, np.inf
+        if np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
+            break
+    # 5. Unknowns that are needed
+    lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
+    free &= _needed(lens, free)
+    lens = replace(lens, change=np.where(free, lens.change, 0.0))
+    # 6. Final fit
+    lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
+    observed, star = _matched(lens, sights, match, reach_px)
+    for _ in range(STEPS):
+        lens, distance2, chi2 = fit(
+            lens, sights, observed, star, np.where(free, prior, 0), False
+        )
+        near = distance2 <= GATE_SIGMA**2 * lens.variance
+        if near.all() or near.sum() < MIN_EVIDENCE_MATCHES:
+            break
+        observed = observed[near]
+        star = star[near]
+    return lens, observed, star, chi2
+
+
+def _needed(lens: Lens, free: NDArray) -> NDArray:
+    """Return (UNKNOWNS,) whether each unknown is kept: the rotation, the focal length, and significant groups.
+
+    A group with the values p and the covariance block C has the squared significance p^T C^-1 p. The covariance
+    is conditioned on 0 for each group that is dropped, and so are the values of the others.
+    """
+    keep = free.copy()
+    change = lens.change.copy()
+    covariance = lens.covariance.copy()
+    for group in GROUPS:
+        rows = [n for n in group if free[n]]
+        if not rows:
+            continue
+        gain = np.linalg.solve(covariance[np.ix_(rows, rows)], covariance[rows]).T
+        chi2 = change[rows] @ np.linalg.solve(covariance[np.ix_(rows, rows)], change[rows])
+        if chi2 > NEEDED_SIGMA**2 * len(rows):
+            continue
+        change -= gain @ change[rows]
+        covariance -= gain @ covariance[rows]
+        keep[rows] = False
+    return keep
+
+
+def _matched(
+    lens: Lens, sights: Sights, match: Match, reach_px: float
+) -> tuple[NDArray, NDArray]:
+    """Return the pairs of centroids and stars within the gates of the prediction: steps 2 and 3."""
+    observed, star = match(lens.camera, lens.cam_from_ref, reach_px)
+    pixels, slopes = lens.project(sights.vectors_ref[star])
+    spread = slopes @ lens.covariance @ slopes.swapaxes(1, 2)
+    gate_px = GATE_SIGMA * np.sqrt(np.trace(spread, axis1=1, axis2=2))
+    own_px = (
+        GATE_SIGMA
+        * np.sqrt(lens.variance)
+        / np.linalg.norm(sights.whiten[observed], ord=-2, axis=(1, 2))
+    )
+    distance_px = np.linalg.norm(sights.xy_px[observed] - pixels, axis=1)
+    near = distance_px <= np.hypot(gate_px, np.maximum(own_px, LEAST_GATE_PX))
+    near &= gate_px <= reach_px
+    return observed[near], star[near]
+
+
+def fit(
+    lens: Lens,
+    sights: Sights,
+    observed: NDArray,
+    star: NDArray,
+    prior: Floats,
+    robust: bool,
+) -> tuple[Lens, Floats, float]:
+    """Fit the unknowns to matches by Gauss-Newton, with the factor of the variances that the residuals imply.
+
+    Parameters
+    ----------
+    observed, star
+        (K,) rows of the centroids and of the stars
+    prior
+        (UNKNOWNS,) standard deviations about the given camera; 0 for what is not fitted
+    robust
+        Whether matches have the weights 1 / sqrt(1 + d^2 / v) of a soft L1 loss, d the Mahalanobis distance and v the
+        factor of the variances, which then is that of the median distance
+
+    Returns
+    -------
+    Lens
+        The fitted camera and attitude
+    distance2
+        (K,) squared Mahalanobis distances
+    chi2
+        Reduced chi-square
+    """
+    free = prior > 0
+    information = np.diag(1 / prior[free] ** 2)
+    whiten = sights.whiten[observed]
+    vectors_ref = sights.vectors_ref[star]
+    weight = np.ones(len(star))
+    for _ in range(STEPS):
+        # Linearization
+        pixels, slopes = lens.project(vectors_ref)
+        slopes = whiten @ slopes[:, :, free]
+        residual = (whiten @ (sights.xy_px[observed] - pixels)[:, :, None])[:, :, 0]
+        distance2 = np.sum(residual**2, axis=1)
+        if robust:
+            weight = 1 / np.sqrt(1 + distance2 / lens.variance)
+        # Step
+        weighted = (slopes * weight[:, None, None] / lens.variance).reshape(-1, free.sum())
+        data = weighted.T @ slopes.reshape(-1, free.sum())
+        inverse = np.linalg.inv(data + information)
+        step = np.zeros(UNKNOWNS)
+        step[free] = inverse @ (
+            weighted.T @ residual.ravel() - information @ lens.change[free]
+        )
+        # Factor of the variances; `used` is the number of unknowns that the matches determine.
+        left = residual - slopes @ step[free]
+        distance2 = np.sum(left**2, axis=1)
+        used = float(np.sum(inverse * data))
+        dof = max(2 * len(star) - used, 1.0)
+        chi2 = float(distance2.sum())
+        if robust:
+            variance = max(1.0, float(np.median(distance2)) / 1.386 * 2 * len(star) / dof)
+        else:
+            variance = variance_factor(chi2, dof)
+        covariance = np.zeros((UNKNOWNS, UNKNOWNS))
+        covariance[np.ix_(free, free)] = inverse * (variance / lens.variance)
+        lens = lens.moved(step, covariance, variance)
+    return lens, distance2, chi2 / dof
+
+
+def reach_of(lights: int, camera: Camera) -> float:
+    """Return the distance in pixels within which MAX_FALSE of so many random lights are expected."""
+    density = max(lights, 1) / (camera.width_px * camera.height_px)
+    return float(np.sqrt(MAX_FALSE / np.pi / density))
