@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rotation_fit import tangent_jacobian
-from estimator.core.camera import Camera, distorted, distortion_slopes
+from estimator.core.camera import Camera, Distortion, distorted, distortion_slopes
 from estimator.core.checks import Floats
 from estimator.core.least_squares import variance_factor
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
@@ -55,7 +55,7 @@ WIDEST_PRIOR = 0.05  # largest for an uncertain camera: pixels are seldom farthe
 MAX_FALSE = 0.1  # greatest expected number of false lights within the reach of a match
 LEAST_GATE_PX = 1.5  # least gate while the match grows
 ROUNDS = 12
-STEPS = 3  # Gauss-Newton steps of a round
+STEPS = 3  # Gauss-Newton steps
 NEEDED_SIGMA = 1.5  # standard deviations within which a group of unknowns is dropped
 MAX_SHEAR = 1e-3
 SHEAR_SIGMA = 4.5  # significance of a shear for which a field is refused
@@ -109,14 +109,18 @@ class Lens:
     @property
     def camera(self) -> Camera:
         """The fitted camera, without shear and twist."""
-        log_focal, log_aspect = self.change[[FOCAL, ASPECT]].tolist()
-        k = np.add(self.given.distortion, np.append(self.change[K1:], 0.0))
         return replace(
             self.given,
-            focal_px=self.given.focal_px * exp(log_focal),
-            aspect=self.given.aspect * exp(log_aspect),
-            distortion=tuple(k.tolist()),
+            focal_px=self.given.focal_px * exp(self.change[FOCAL]),
+            aspect=self.given.aspect * exp(self.change[ASPECT]),
+            distortion=self.distortion,
         )
+
+    @property
+    def distortion(self) -> Distortion:
+        """The fitted coefficients."""
+        changed = np.add(self.given.distortion, np.append(self.change[K1:], 0.0))
+        return tuple(changed.tolist())
 
     @property
     def sheared(self) -> bool:
@@ -135,30 +139,25 @@ class Lens:
 
     def project(self, vectors_ref: Floats) -> tuple[Floats, Floats]:
         """Return the (K, 2) pixels of directions, and their (K, 2, UNKNOWNS) slopes by the unknowns."""
-        camera = self.camera
         seen = self.cam_from_ref.apply(vectors_ref)
         tangent = seen[:, :2] / seen[:, 2:]
+        focal_px = self.given.focal_px * exp(self.change[FOCAL])
+        aspect = self.given.aspect * exp(self.change[ASPECT])
         shear, twist = self.change[[SHEAR, TWIST]].tolist()
-        stretch = camera.focal_px * np.array([[1.0, shear], [shear, camera.aspect]])
-        bent = distorted(tangent, camera.distortion)
-        by_tangent, by_coefficients = distortion_slopes(tangent, camera.distortion)
-        by_twist = camera.focal_px * bent[:, 1:] * bent[:, ::-1] * [-1.0, 1.0]
+        stretch = focal_px * np.array([[1.0, shear], [shear, aspect]])
+        bent = distorted(tangent, self.distortion)
+        by_tangent, by_coefficients = distortion_slopes(tangent, self.distortion)
+        by_twist = focal_px * bent[:, 1:] * bent[:, ::-1] * [-1.0, 1.0]
         offset = bent @ stretch + twist * by_twist
         slopes = np.zeros((len(seen), 2, UNKNOWNS))
         jacobian = tangent_jacobian(seen, seen).reshape(-1, 2, 3)
         slopes[:, :, :3] = stretch @ by_tangent @ jacobian
         slopes[:, :, FOCAL] = offset
-        slopes[:, 1, ASPECT] = camera.focal_px * camera.aspect * bent[:, 1]
-        slopes[:, :, SHEAR] = camera.focal_px * bent[:, ::-1]
+        slopes[:, 1, ASPECT] = focal_px * aspect * bent[:, 1]
+        slopes[:, :, SHEAR] = focal_px * bent[:, ::-1]
         slopes[:, :, TWIST] = by_twist
         slopes[:, :, K1:] = stretch @ by_coefficients[:, :, :4]
-        return offset + camera.center_px, slopes
-
-    def moved(self, step: Floats, covariance: Floats, variance: float) -> Lens:
-        """Return the lens after a step (UNKNOWNS,) of the fit."""
-        turn = Rotation.from_rotvec(step[:3])
-        change = np.append(np.zeros(3), self.change[3:] + step[3:])
-        return Lens(self.given, turn * self.cam_from_ref, change, covariance, variance)
+        return offset + self.given.center_px, slopes
 
 
 class Sights(NamedTuple):
@@ -179,22 +178,12 @@ class Sights(NamedTuple):
     vectors_ref: Floats
 
 
-def start_of(
-    given: Camera, cam_from_ref: Rotation, focal_ratio: float, variance: float
-) -> Lens:
-    """Return a candidate with a focal length that is `focal_ratio` times the given one."""
-    change = np.zeros(UNKNOWNS)
-    change[FOCAL] = np.log(focal_ratio)
-    return Lens(given, cam_from_ref, change, np.zeros((UNKNOWNS, UNKNOWNS)), variance)
-
-
 def grow(
     start: Lens,
     sights: Sights,
     match: Match,
     matched: tuple[NDArray, NDArray],
     prior: Floats,
-    reach_px: float,
 ) -> tuple[Lens, NDArray, NDArray, float]:
     """Extend a candidate over the field: the numbered steps of the module.
 
@@ -206,8 +195,6 @@ def grow(
         (K,) rows of the candidate's centroids and of its stars
     prior
         (UNKNOWNS,) standard deviations of the priors; 0 for what is not fitted
-    reach_px
-        Distance within which a false light is unlikely
 
     Returns
     -------
@@ -220,10 +207,12 @@ def grow(
     """
     lens = start
     observed, star = matched
-    free = prior > 0
+    # MAX_FALSE random lights are within this distance.
+    pixels = start.given.width_px * start.given.height_px
+    reach_px = np.sqrt(MAX_FALSE * pixels / np.pi / len(sights.xy_px))
     # 1. to 4. Growth
     for _ in range(ROUNDS):
-        lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
+        lens, _, _ = fit(lens, sights, observed, star, prior, True)
         before = observed, star
         observed, star = _matched(lens, sights, match, reach_px)
         if len(star) < MIN_EVIDENCE_MATCHES:
@@ -231,16 +220,14 @@ def grow(
         if np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
             break
     # 5. Unknowns that are needed
-    lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
-    free &= _needed(lens, free)
-    lens = replace(lens, change=np.where(free, lens.change, 0.0))
+    needed = needed_of(lens, prior)
+    prior = np.where(needed, prior, 0.0)
+    lens = replace(lens, change=np.where(needed, lens.change, 0.0))
     # 6. Final fit
-    lens, _, _ = fit(lens, sights, observed, star, np.where(free, prior, 0), True)
+    lens, _, _ = fit(lens, sights, observed, star, prior, True)
     observed, star = _matched(lens, sights, match, reach_px)
     for _ in range(STEPS):
-        lens, distance2, chi2 = fit(
-            lens, sights, observed, star, np.where(free, prior, 0), False
-        )
+        lens, distance2, chi2 = fit(lens, sights, observed, star, prior, False)
         near = distance2 <= GATE_SIGMA**2 * lens.variance
         if near.all() or near.sum() < MIN_EVIDENCE_MATCHES:
             break
@@ -249,26 +236,23 @@ def grow(
     return lens, observed, star, chi2
 
 
-def _needed(lens: Lens, free: NDArray) -> NDArray:
-    """Return (UNKNOWNS,) whether each unknown is kept: the rotation, the focal length, and significant groups.
+def needed_of(lens: Lens, prior: Floats) -> NDArray:
+    """Return (UNKNOWNS,) whether each unknown is kept: the rotation, what is uncertain, and significant groups.
 
-    A group with the values p and the covariance block C has the squared significance p^T C^-1 p. The covariance
-    is conditioned on 0 for each group that is dropped, and so are the values of the others.
+    A group with the values p and the covariance block C has the squared significance p^T C^-1 p. Values and covariance
+    of the others are conditioned on 0 for each group that is dropped.
     """
-    keep = free.copy()
-    change = lens.change.copy()
-    covariance = lens.covariance.copy()
-    for group in GROUPS:
-        rows = [n for n in group if free[n]]
-        if not rows:
-            continue
-        gain = np.linalg.solve(covariance[np.ix_(rows, rows)], covariance[rows]).T
-        chi2 = change[rows] @ np.linalg.solve(covariance[np.ix_(rows, rows)], change[rows])
-        if chi2 > NEEDED_SIGMA**2 * len(rows):
-            continue
-        change -= gain @ change[rows]
-        covariance -= gain @ covariance[rows]
-        keep[rows] = False
+    keep = prior > 0
+    change = lens.change
+    covariance = lens.covariance
+    for group in GROUPS if prior[FOCAL] > LEAST_PRIOR else (*GROUPS, [FOCAL]):
+        rows = [n for n in group if keep[n]]
+        inverse = np.linalg.inv(covariance[np.ix_(rows, rows)])
+        if change[rows] @ inverse @ change[rows] <= NEEDED_SIGMA**2 * len(rows):
+            gain = covariance[:, rows] @ inverse
+            change = change - gain @ change[rows]
+            covariance = covariance - gain @ covariance[rows]
+            keep[rows] = False
     return keep
 
 
@@ -298,6 +282,7 @@ def fit(
     star: NDArray,
     prior: Floats,
     robust: bool,
+    steps: int = STEPS,
 ) -> tuple[Lens, Floats, float]:
     """Fit the unknowns to matches by Gauss-Newton, with the factor of the variances that the residuals imply.
 
@@ -325,7 +310,7 @@ def fit(
     whiten = sights.whiten[observed]
     vectors_ref = sights.vectors_ref[star]
     weight = np.ones(len(star))
-    for _ in range(STEPS):
+    for _ in range(steps):
         # Linearization
         pixels, slopes = lens.project(vectors_ref)
         slopes = whiten @ slopes[:, :, free]
@@ -353,11 +338,13 @@ def fit(
             variance = variance_factor(chi2, dof)
         covariance = np.zeros((UNKNOWNS, UNKNOWNS))
         covariance[np.ix_(free, free)] = inverse * (variance / lens.variance)
-        lens = lens.moved(step, covariance, variance)
+        turn = Rotation.from_rotvec(step[:FOCAL])
+        step[:FOCAL] = 0.0
+        lens = replace(
+            lens,
+            cam_from_ref=turn * lens.cam_from_ref,
+            change=lens.change + step,
+            covariance=covariance,
+            variance=variance,
+        )
     return lens, distance2, chi2 / dof
-
-
-def reach_of(lights: int, camera: Camera) -> float:
-    """Return the distance in pixels within which MAX_FALSE of so many random lights are expected."""
-    density = max(lights, 1) / (camera.width_px * camera.height_px)
-    return float(np.sqrt(MAX_FALSE / np.pi / density))

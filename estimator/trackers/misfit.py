@@ -22,7 +22,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
-from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
+from estimator.core.least_squares import PRIOR_RIGHT
 from estimator.identification import star_evidence, star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import (
@@ -43,17 +43,6 @@ TRIED = 2.0 ** np.arange(7)  # factors of the variances that are tried
 # log10 of the prior odds of each larger factor against the claimed errors.
 PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
-
-
-def variance_of(residual: Floats, parameters: int) -> float:
-    """Return the factor of the claimed variances, from (K, 2) residuals in standard deviations after a fit.
-
-    Parameters
-    ----------
-    parameters
-        Number of parameters of the fit
-    """
-    return variance_factor(float(np.sum(residual**2)), max(residual.size - parameters, 1))
 
 
 @jit

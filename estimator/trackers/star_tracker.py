@@ -52,14 +52,13 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
 )
-from estimator.trackers.refinement import NO_MATCH, SHEARED, FieldMatcher, solved_attitude
+from estimator.trackers.refinement import NO_MATCH, SHEARED, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
     FOCAL_MARGIN,
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
-    WRONG_FOCAL_SEARCH,
     SearchModel,
 )
 
@@ -151,9 +150,7 @@ class StarTracker(FrameTracker):
                 magnitude=index_stars.v_mag if known else None,
             )
             patterns = len(self.index.pair)
-        self.field_matcher = FieldMatcher(
-            camera, self.stars, self.sky, settings, focal_uncertainty, patterns
-        )
+        self.field_matcher = FieldMatcher(camera, self.stars, focal_uncertainty, patterns)
 
     @functools.cached_property
     def sensor(self) -> Sensor:
@@ -367,7 +364,7 @@ class StarTracker(FrameTracker):
                 # The paper's rule has accepted this match: it is not tested with the whole field.
                 attitude = self.solve_matches(centroids, match.observed, match.star)
             else:
-                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
+                attitude = self._in_field(centroids, camera, match)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
@@ -382,6 +379,25 @@ class StarTracker(FrameTracker):
             settings.cos_error,
         )
         return Attitude(f"{NO_MATCH}: {why}")
+
+    def _in_field(self, centroids: Centroids, camera: Camera, match: StarMatch) -> Attitude:
+        """Solve the candidate of a published identifier with the whole field and, if it is uncertain, with the lens."""
+        matcher = self.field_matcher
+        candidate = Solution(
+            match.observed,
+            match.star,
+            match.cam_from_ref.as_quat(),
+            np.zeros((3, 3)),
+            camera.focal_px / self.camera.focal_px,
+            0.0,
+            1.0,
+            -match.log10_chance,
+        )
+        sigma_px = self.sigma_px(centroids, 0.0)
+        weight = self.detections(centroids, sigma_px).weight
+        refitted = matcher.with_lens(candidate, centroids, weight, 1.0, False)
+        reason = matcher.reason_against(refitted, centroids)
+        return Attitude(reason) if reason else self.attitude_of(centroids, refitted, sigma_px)
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
@@ -412,8 +428,29 @@ class StarTracker(FrameTracker):
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
         # Covariance, with the errors that the residuals imply
+        seen_cam = cam_from_ref.apply(vectors)
+        residual_px = self.camera.pixels(seen_cam) - xy_px
+        chi2 = float(np.sum(np.sum(residual_px**2, axis=1) / sigma_rad**2))
+        chi2 /= self.camera.focal_px**2
+        sigma_rad = sigma_rad * np.sqrt(variance_factor(chi2, max(2 * len(star) - 3, 1)))
+        covariance_rad2, common_rad2 = with_focal_error(
+            covariance(self.camera.rays(xy_px), sigma_rad, solver),
+            self.camera,
+            xy_px,
+            seen_cam,
+            sigma_rad,
+        )
         match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
-        return solved_attitude(match, vectors, xy_px, self.camera, sigma_rad, solver, 3)
+        rms_px = float(np.sqrt(np.mean(residual_px**2)))
+        return Attitude(
+            "solved",
+            cam_from_ref,
+            covariance_rad2,
+            match,
+            rms_px,
+            self.camera,
+            common_rad2,
+        )
 
     def sigma_px(
         self,
@@ -457,8 +494,7 @@ class StarTracker(FrameTracker):
 
         Each search, until one gives an attitude:
 
-        1. Search with this model of the errors (`_search`). With a calibrated camera and residuals that are too large,
-           also search for a wrong focal length.
+        1. Search with this model of the errors (`_search`).
         2. Match and fit again by the residuals (`refit`).
         3. Drop the solution if the camera model fits only a part of the field or a sheared one; with a fitted camera,
            also a field of view outside of its bounds, and a match that is not beyond chance.
@@ -468,12 +504,6 @@ class StarTracker(FrameTracker):
             # 1. Search
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution, variance = self._search(centroids, sigma_px, model)
-            calibrated = not (self.focal_uncertainty or model.by_quads)
-            if calibrated and not variance and misfit.residuals_too_great(solution):
-                # With a wrong focal length a part of the stars may match, at a wrong attitude.
-                other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
-                if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX:
-                    solution = other
             clock.lap("identify")
             if not len(solution.star):
                 continue
@@ -565,10 +595,10 @@ class StarTracker(FrameTracker):
         # 2. Camera
         weight = detections.weight if exact else self.detections(centroids, own_px).weight
         if self.focal_uncertainty:
-            fits = exact and matcher.fits(solution, centroids, weight)
+            fits = bool(exact and matcher.fits(solution, centroids, weight))
         else:
-            fixed = self.camera.focal_sigma or self.camera.row_time_s
-            fits = fixed or len(solution.star) < misfit.LENS_MATCHES
+            fits = bool(self.camera.focal_sigma or self.camera.row_time_s)
+            fits = fits or len(solution.star) < misfit.LENS_MATCHES
             fits = fits or (
                 known
                 and variance < misfit.TELLING
