@@ -102,12 +102,12 @@ WORKS = (
 )
 
 
-def frames(work: Workload, lens: Lens, count: int, seed: int) -> Iterator[Field]:
+def frames(
+    work: Workload, lens: Lens, stars: catalog.StarCatalog, count: int, seed: int
+) -> Iterator[Field]:
     """Random frames of a camera with this lens."""
-    stars = sky_of(work.limit_mag)
     for n in range(count):
         rng = np.random.default_rng([seed, n])
-        # Drawn on a larger sensor, so that a stretch has stars to bring in.
         yield lens.apply(field(work, stars, rng), work.camera, rng)
 
 
@@ -146,7 +146,7 @@ def _rows(work: Workload, lens: Lens, count: int, seed: int) -> list[dict[str, A
     ms = []
     named = 0
     theirs = 0
-    for n, frame in enumerate(frames(work, lens, count, seed)):
+    for n, frame in enumerate(frames(work, lens, stars, count, seed)):
         if n == 0:
             tracker.solve_centroids(frame.centroids)  # compiles
         begin = time.perf_counter()

@@ -57,6 +57,7 @@ LEAST_GATE_PX = 1.5  # least gate while the match grows
 ROUNDS = 12
 STEPS = 3  # Gauss-Newton steps
 NEEDED_SIGMA = 1.5  # standard deviations within which a group of unknowns is dropped
+MOST_SIGMA = 5.0  # largest change of a camera's number, in standard deviations of its prior
 MAX_SHEAR = 1e-3
 SHEAR_SIGMA = 4.5  # significance of a shear for which a field is refused
 
@@ -343,7 +344,7 @@ def fit(
         lens = replace(
             lens,
             cam_from_ref=turn * lens.cam_from_ref,
-            change=lens.change + step,
+            change=np.clip(lens.change + step, -MOST_SIGMA * prior, MOST_SIGMA * prior),
             covariance=covariance,
             variance=variance,
         )
