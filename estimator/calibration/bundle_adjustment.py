@@ -34,6 +34,7 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
+from estimator.attitude.rotation_fit import tangent_gradients
 from estimator.core.camera import Camera, distorted, distortion_slopes
 from estimator.core.checks import Floats, Ints
 
@@ -245,9 +246,7 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     distortion = tuple(bundle.lens[3:].tolist())
     distorted_tangent = distorted(tangent, distortion)
     # E, divided by sigma
-    pinhole = np.zeros((len(q), 2, 3))
-    pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1 / q[:, 2]
-    pinhole[:, :, 2] = -tangent / q[:, 2:]
+    pinhole = tangent_gradients(q)
     weight = 1 / sightings.sigma_px[:, None, None]
     by_tangent, by_coefficients = distortion_slopes(tangent, distortion)
     by_body = focal * weight * (by_tangent @ pinhole @ bundle.R_cam_from_body)

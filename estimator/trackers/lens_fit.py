@@ -30,14 +30,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import exp
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rotation_fit import tangent_jacobian
-from estimator.core.camera import Camera, Distortion, distorted, distortion_slopes
+from estimator.core.camera import Camera, distorted, distortion_slopes
 from estimator.core.checks import Floats
 from estimator.core.least_squares import variance_factor
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
@@ -56,7 +55,8 @@ MAX_FALSE = 0.1  # greatest expected number of false lights within the reach of 
 LEAST_GATE_PX = 1.5  # least gate while the match grows
 ROUNDS = 12
 STEPS = 3  # Gauss-Newton steps
-NEEDED_SIGMA = 1.5  # standard deviations within which a group of unknowns is dropped
+MEDIAN_CHI2 = 1.386  # of chi-square with two degrees of freedom
+NEEDED_SIGMA = 2.0  # standard deviations within which a group of unknowns is dropped
 MOST_SIGMA = 5.0  # largest change of a camera's number, in standard deviations of its prior
 MAX_SHEAR = 1e-3
 SHEAR_SIGMA = 4.5  # significance of a shear for which a field is refused
@@ -110,59 +110,70 @@ class Lens:
     @property
     def camera(self) -> Camera:
         """The fitted camera, without shear and twist."""
+        distortion = np.add(self.given.distortion, np.append(self.change[K1:], 0.0))
         return replace(
             self.given,
             focal_px=self.given.focal_px * exp(self.change[FOCAL]),
             aspect=self.given.aspect * exp(self.change[ASPECT]),
-            distortion=self.distortion,
+            distortion=tuple(distortion.tolist()),
         )
-
-    @property
-    def distortion(self) -> Distortion:
-        """The fitted coefficients."""
-        changed = np.add(self.given.distortion, np.append(self.change[K1:], 0.0))
-        return tuple(changed.tolist())
 
     @property
     def sheared(self) -> bool:
         """Whether the field has a significant shear that is too great for an attitude."""
-        shear = abs(self.change[SHEAR])
-        return bool(
-            shear > max(MAX_SHEAR, SHEAR_SIGMA * np.sqrt(self.covariance[SHEAR, SHEAR]))
-        )
+        sigma = np.sqrt(self.covariance[SHEAR, SHEAR])
+        return bool(abs(self.change[SHEAR]) > max(MAX_SHEAR, SHEAR_SIGMA * sigma))
 
     @property
     def covariance_rad2(self) -> Floats:
         """(3, 3) covariance of the attitude, with the roll's ambiguity by the shear."""
-        covariance = self.covariance[:3, :3].copy()
-        covariance[2, 2] += self.change[SHEAR] ** 2
-        return covariance
+        return self.covariance[:3, :3] + np.diag([0, 0, self.change[SHEAR] ** 2])
 
     def project(self, vectors_ref: Floats) -> tuple[Floats, Floats]:
         """Return the (K, 2) pixels of directions, and their (K, 2, UNKNOWNS) slopes by the unknowns."""
+        camera = self.camera
+        focal_px = camera.focal_px
         seen = self.cam_from_ref.apply(vectors_ref)
         tangent = seen[:, :2] / seen[:, 2:]
-        focal_px = self.given.focal_px * exp(self.change[FOCAL])
-        aspect = self.given.aspect * exp(self.change[ASPECT])
-        shear, twist = self.change[[SHEAR, TWIST]].tolist()
-        stretch = focal_px * np.array([[1.0, shear], [shear, aspect]])
-        bent = distorted(tangent, self.distortion)
-        by_tangent, by_coefficients = distortion_slopes(tangent, self.distortion)
+        shear, twist = self.change[[SHEAR, TWIST]]
+        stretch = focal_px * np.array([[1.0, shear], [shear, camera.aspect]])
+        bent = distorted(tangent, camera.distortion)
+        by_tangent, by_coefficients = distortion_slopes(tangent, camera.distortion)
         by_twist = focal_px * bent[:, 1:] * bent[:, ::-1] * [-1.0, 1.0]
         offset = bent @ stretch + twist * by_twist
         slopes = np.zeros((len(seen), 2, UNKNOWNS))
         jacobian = tangent_jacobian(seen, seen).reshape(-1, 2, 3)
-        slopes[:, :, :3] = stretch @ by_tangent @ jacobian
+        slopes[:, :, :FOCAL] = stretch @ by_tangent @ jacobian
         slopes[:, :, FOCAL] = offset
-        slopes[:, 1, ASPECT] = focal_px * aspect * bent[:, 1]
+        slopes[:, 1, ASPECT] = focal_px * camera.aspect * bent[:, 1]
         slopes[:, :, SHEAR] = focal_px * bent[:, ::-1]
         slopes[:, :, TWIST] = by_twist
         slopes[:, :, K1:] = stretch @ by_coefficients[:, :, :4]
-        return offset + self.given.center_px, slopes
+        return offset + camera.center_px, slopes
+
+    def needed(self, prior: Floats) -> NDArray:
+        """Return (UNKNOWNS,) whether each unknown is kept: the rotation, what is uncertain, and significant groups.
+
+        A group with the values p and the covariance block C has the squared significance p^T C^-1 p. Values and
+        covariance of the others are conditioned on 0 for each group that is dropped.
+        """
+        keep = prior > 0
+        change = self.change
+        covariance = self.covariance
+        for group in GROUPS if prior[FOCAL] > LEAST_PRIOR else (*GROUPS, [FOCAL]):
+            rows = [n for n in group if keep[n]]
+            inverse = np.linalg.inv(covariance[np.ix_(rows, rows)])
+            if change[rows] @ inverse @ change[rows] <= NEEDED_SIGMA**2 * len(rows):
+                gain = covariance[:, rows] @ inverse
+                change = change - gain @ change[rows]
+                covariance = covariance - gain @ covariance[rows]
+                keep[rows] = False
+        return keep
 
 
-class Sights(NamedTuple):
-    """Centroids, brightest first, and stars.
+@dataclass(frozen=True)
+class Sights:
+    """Centroids and stars of a field.
 
     Attributes
     ----------
@@ -172,180 +183,128 @@ class Sights(NamedTuple):
         (N, 2, 2) transposed Cholesky factors of the inverse covariances of the centroids, 1/px
     vectors_ref
         (M, 3) directions of the stars
+    match
+        Function that pairs centroids and stars
     """
 
     xy_px: Floats
     whiten: Floats
     vectors_ref: Floats
+    match: Match
 
+    def grow(self, lens: Lens, pairs: NDArray, prior: Floats) -> tuple[Lens, NDArray, float]:
+        """Extend a candidate over the field: the numbered steps of the module.
 
-def grow(
-    start: Lens,
-    sights: Sights,
-    match: Match,
-    matched: tuple[NDArray, NDArray],
-    prior: Floats,
-) -> tuple[Lens, NDArray, NDArray, float]:
-    """Extend a candidate over the field: the numbered steps of the module.
+        Parameters
+        ----------
+        pairs
+            (2, K) rows of the candidate's centroids and of its stars
+        prior
+            (UNKNOWNS,) standard deviations of the priors; 0 for what is not fitted
 
-    Parameters
-    ----------
-    match
-        Function that pairs centroids and stars
-    matched
-        (K,) rows of the candidate's centroids and of its stars
-    prior
-        (UNKNOWNS,) standard deviations of the priors; 0 for what is not fitted
+        Returns
+        -------
+        Lens
+            The fitted camera and attitude
+        pairs
+            (2, K) rows of the matched centroids and stars
+        chi2
+            Reduced chi-square of the claimed errors
+        """
+        # 1. to 4. Growth
+        for _ in range(ROUNDS):
+            lens, _, _ = self.fit(lens, pairs, prior, True)
+            before = pairs
+            pairs = self._matched(lens)
+            if pairs.shape[1] < MIN_EVIDENCE_MATCHES:
+                return lens, before, np.inf
+            if np.array_equal(pairs, before):
+                break
+        # 5. Unknowns that are needed
+        prior = np.where(lens.needed(prior), prior, 0.0)
+        # 6. Final fit
+        lens, _, _ = self.fit(lens, pairs, prior, True)
+        pairs = self._matched(lens)
+        for _ in range(STEPS):
+            lens, distance2, chi2 = self.fit(lens, pairs, prior, False)
+            near = distance2 <= GATE_SIGMA**2 * lens.variance
+            if near.all() or near.sum() < MIN_EVIDENCE_MATCHES:
+                break
+            pairs = pairs[:, near]
+        return lens, pairs, chi2
 
-    Returns
-    -------
-    Lens
-        The fitted camera and attitude
-    observed, star
-        (K,) rows of the matched centroids and stars
-    chi2
-        Reduced chi-square of the claimed errors
-    """
-    lens = start
-    observed, star = matched
-    # MAX_FALSE random lights are within this distance.
-    pixels = start.given.width_px * start.given.height_px
-    reach_px = np.sqrt(MAX_FALSE * pixels / np.pi / len(sights.xy_px))
-    # 1. to 4. Growth
-    for _ in range(ROUNDS):
-        lens, _, _ = fit(lens, sights, observed, star, prior, True)
-        before = observed, star
-        observed, star = _matched(lens, sights, match, reach_px)
-        if len(star) < MIN_EVIDENCE_MATCHES:
-            return lens, *before, np.inf
-        if np.array_equal(observed, before[0]) and np.array_equal(star, before[1]):
-            break
-    # 5. Unknowns that are needed
-    needed = needed_of(lens, prior)
-    prior = np.where(needed, prior, 0.0)
-    lens = replace(lens, change=np.where(needed, lens.change, 0.0))
-    # 6. Final fit
-    lens, _, _ = fit(lens, sights, observed, star, prior, True)
-    observed, star = _matched(lens, sights, match, reach_px)
-    for _ in range(STEPS):
-        lens, distance2, chi2 = fit(lens, sights, observed, star, prior, False)
-        near = distance2 <= GATE_SIGMA**2 * lens.variance
-        if near.all() or near.sum() < MIN_EVIDENCE_MATCHES:
-            break
-        observed = observed[near]
-        star = star[near]
-    return lens, observed, star, chi2
+    def _matched(self, lens: Lens) -> NDArray:
+        """Return the pairs of centroids and stars within the gates of the prediction: steps 2 and 3."""
+        # MAX_FALSE random lights are within this distance.
+        pixels = lens.given.width_px * lens.given.height_px
+        reach_px = np.sqrt(MAX_FALSE * pixels / np.pi / len(self.xy_px))
+        pairs = np.array(self.match(lens.camera, lens.cam_from_ref, reach_px))
+        observed, star = pairs
+        seen_px, slopes = lens.project(self.vectors_ref[star])
+        spread = slopes @ lens.covariance @ slopes.swapaxes(1, 2)
+        gate_px = GATE_SIGMA * np.sqrt(np.trace(spread, axis1=1, axis2=2))
+        least = np.linalg.norm(self.whiten[observed], ord=-2, axis=(1, 2))
+        own_px = np.maximum(GATE_SIGMA * np.sqrt(lens.variance) / least, LEAST_GATE_PX)
+        distance_px = np.linalg.norm(self.xy_px[observed] - seen_px, axis=1)
+        near = (distance_px <= np.hypot(gate_px, own_px)) & (gate_px <= reach_px)
+        return pairs[:, near]
 
+    def fit(
+        self, lens: Lens, pairs: NDArray, prior: Floats, robust: bool, steps: int = STEPS
+    ) -> tuple[Lens, Floats, float]:
+        """Fit the unknowns to matches by Gauss-Newton, with the factor of the variances that the residuals imply.
 
-def needed_of(lens: Lens, prior: Floats) -> NDArray:
-    """Return (UNKNOWNS,) whether each unknown is kept: the rotation, what is uncertain, and significant groups.
+        Parameters
+        ----------
+        pairs
+            (2, K) rows of the centroids and of the stars
+        prior
+            (UNKNOWNS,) standard deviations about the given camera; 0 for what is not fitted
+        robust
+            Whether matches have the weights 1 / sqrt(1 + d^2 / v) of a soft L1 loss, d the Mahalanobis distance and v
+            the factor of the variances, which then is that of the median distance
 
-    A group with the values p and the covariance block C has the squared significance p^T C^-1 p. Values and covariance
-    of the others are conditioned on 0 for each group that is dropped.
-    """
-    keep = prior > 0
-    change = lens.change
-    covariance = lens.covariance
-    for group in GROUPS if prior[FOCAL] > LEAST_PRIOR else (*GROUPS, [FOCAL]):
-        rows = [n for n in group if keep[n]]
-        inverse = np.linalg.inv(covariance[np.ix_(rows, rows)])
-        if change[rows] @ inverse @ change[rows] <= NEEDED_SIGMA**2 * len(rows):
-            gain = covariance[:, rows] @ inverse
-            change = change - gain @ change[rows]
-            covariance = covariance - gain @ covariance[rows]
-            keep[rows] = False
-    return keep
-
-
-def _matched(
-    lens: Lens, sights: Sights, match: Match, reach_px: float
-) -> tuple[NDArray, NDArray]:
-    """Return the pairs of centroids and stars within the gates of the prediction: steps 2 and 3."""
-    observed, star = match(lens.camera, lens.cam_from_ref, reach_px)
-    pixels, slopes = lens.project(sights.vectors_ref[star])
-    spread = slopes @ lens.covariance @ slopes.swapaxes(1, 2)
-    gate_px = GATE_SIGMA * np.sqrt(np.trace(spread, axis1=1, axis2=2))
-    own_px = (
-        GATE_SIGMA
-        * np.sqrt(lens.variance)
-        / np.linalg.norm(sights.whiten[observed], ord=-2, axis=(1, 2))
-    )
-    distance_px = np.linalg.norm(sights.xy_px[observed] - pixels, axis=1)
-    near = distance_px <= np.hypot(gate_px, np.maximum(own_px, LEAST_GATE_PX))
-    near &= gate_px <= reach_px
-    return observed[near], star[near]
-
-
-def fit(
-    lens: Lens,
-    sights: Sights,
-    observed: NDArray,
-    star: NDArray,
-    prior: Floats,
-    robust: bool,
-    steps: int = STEPS,
-) -> tuple[Lens, Floats, float]:
-    """Fit the unknowns to matches by Gauss-Newton, with the factor of the variances that the residuals imply.
-
-    Parameters
-    ----------
-    observed, star
-        (K,) rows of the centroids and of the stars
-    prior
-        (UNKNOWNS,) standard deviations about the given camera; 0 for what is not fitted
-    robust
-        Whether matches have the weights 1 / sqrt(1 + d^2 / v) of a soft L1 loss, d the Mahalanobis distance and v the
-        factor of the variances, which then is that of the median distance
-
-    Returns
-    -------
-    Lens
-        The fitted camera and attitude
-    distance2
-        (K,) squared Mahalanobis distances
-    chi2
-        Reduced chi-square
-    """
-    free = prior > 0
-    information = np.diag(1 / prior[free] ** 2)
-    whiten = sights.whiten[observed]
-    vectors_ref = sights.vectors_ref[star]
-    weight = np.ones(len(star))
-    for _ in range(steps):
-        # Linearization
-        pixels, slopes = lens.project(vectors_ref)
-        slopes = whiten @ slopes[:, :, free]
-        residual = (whiten @ (sights.xy_px[observed] - pixels)[:, :, None])[:, :, 0]
-        distance2 = np.sum(residual**2, axis=1)
-        if robust:
-            weight = 1 / np.sqrt(1 + distance2 / lens.variance)
-        # Step
-        weighted = (slopes * weight[:, None, None] / lens.variance).reshape(-1, free.sum())
-        data = weighted.T @ slopes.reshape(-1, free.sum())
-        inverse = np.linalg.inv(data + information)
-        step = np.zeros(UNKNOWNS)
-        step[free] = inverse @ (
-            weighted.T @ residual.ravel() - information @ lens.change[free]
-        )
-        # Factor of the variances; `used` is the number of unknowns that the matches determine.
-        left = residual - slopes @ step[free]
-        distance2 = np.sum(left**2, axis=1)
-        used = float(np.sum(inverse * data))
-        dof = max(2 * len(star) - used, 1.0)
-        chi2 = float(distance2.sum())
-        if robust:
-            variance = max(1.0, float(np.median(distance2)) / 1.386 * 2 * len(star) / dof)
-        else:
-            variance = variance_factor(chi2, dof)
-        covariance = np.zeros((UNKNOWNS, UNKNOWNS))
-        covariance[np.ix_(free, free)] = inverse * (variance / lens.variance)
-        turn = Rotation.from_rotvec(step[:FOCAL])
-        step[:FOCAL] = 0.0
-        lens = replace(
-            lens,
-            cam_from_ref=turn * lens.cam_from_ref,
-            change=np.clip(lens.change + step, -MOST_SIGMA * prior, MOST_SIGMA * prior),
-            covariance=covariance,
-            variance=variance,
-        )
-    return lens, distance2, chi2 / dof
+        Returns
+        -------
+        Lens
+            The fitted camera and attitude
+        distance2
+            (K,) squared Mahalanobis distances
+        chi2
+            Reduced chi-square
+        """
+        observed, star = pairs
+        free = prior > 0
+        information = np.diag(1 / np.where(free, prior, 1.0) ** 2)
+        for _ in range(steps):
+            # Linearization: slopes and residual of each pair, whitened
+            seen_px, slopes = lens.project(self.vectors_ref[star])
+            residual = self.xy_px[observed] - seen_px
+            rows = self.whiten[observed] @ np.dstack([slopes * free, residual])
+            distance2 = np.sum(rows[:, :, -1] ** 2, axis=1) / lens.variance
+            weight = 1 / np.sqrt(1 + robust * distance2) / lens.variance
+            # Step
+            normal = np.einsum("kia,k,kib->ab", rows, weight, rows)
+            inverse = np.linalg.inv(normal[:-1, :-1] + information)
+            step = inverse @ (normal[:-1, -1] - information @ lens.change)
+            # Factor of the variances; `used` is the number of unknowns that the matches determine.
+            distance2 = np.sum((rows @ np.append(-step, 1.0)) ** 2, axis=1)
+            used = float(np.sum(inverse * normal[:-1, :-1]))
+            dof = max(2 * len(star) - used, 1.0)
+            chi2 = float(distance2.sum())
+            if robust:
+                median = float(np.median(distance2)) / MEDIAN_CHI2
+                variance = max(1.0, median * 2 * len(star) / dof)
+            else:
+                variance = variance_factor(chi2, dof)
+            most = MOST_SIGMA * prior[FOCAL:]
+            lens = Lens(
+                lens.given,
+                Rotation.from_rotvec(step[:FOCAL]) * lens.cam_from_ref,
+                np.append(
+                    np.zeros(FOCAL), np.clip((lens.change + step)[FOCAL:], -most, most)
+                ),
+                inverse * np.outer(free, free) * (variance / lens.variance),
+                variance,
+            )
+        return lens, distance2, chi2 / dof

@@ -23,8 +23,9 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, lo
 from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.star_detections import information_of
 from estimator.identification.star_evidence import Solution
+from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers import lens_fit
-from estimator.trackers.misfit import Refit
+from estimator.trackers.misfit import Refit, residuals_too_great
 
 NO_MATCH = "no identification beyond chance"
 MISFIT = "the camera model does not fit the field"
@@ -94,14 +95,8 @@ class FieldMatcher:
         exact
             Whether the solution's evidence is by these errors
         """
-        start, sights = self._start(solution, centroids, weight, variance)
-        lens, observed, star, chi2 = lens_fit.grow(
-            start,
-            sights,
-            partial(self.nearest, centroids),
-            (solution.observed, solution.star),
-            self.prior,
-        )
+        sights, start, pairs = self._start(solution, centroids, weight, variance)
+        lens, (observed, star), chi2 = sights.grow(start, pairs, self.prior)
         camera = lens.camera
         dex = solution.dex
         if self.focal_uncertainty or not exact:
@@ -117,6 +112,10 @@ class FieldMatcher:
             # A few stars that are kept, with their claimed errors, have their evidence by the search.
             kept = len(star) >= len(solution.star) and lens.variance < KEPT_VARIANCE
             dex = max(-chance, dex if kept else -np.inf)
+            # The field, not the focal length: a distortion changes what a focal length means.
+            change = abs(self.camera.fov_rad / camera.fov_rad - 1)
+            if change > 1.2 * (self.focal_uncertainty or WRONG_FOCAL):
+                dex = -np.inf
         residual_px = centroids.xy_px[observed] - lens.project(self.stars.vectors[star])[0]
         fitted = Solution(
             observed,
@@ -163,8 +162,8 @@ class FieldMatcher:
 
     def _start(
         self, solution: Solution, centroids: Centroids, weight: Floats, variance: float
-    ) -> tuple[lens_fit.Lens, lens_fit.Sights]:
-        """Return a solution and centroids as input of the fit of the camera; parameters as of `with_lens`."""
+    ) -> tuple[lens_fit.Sights, lens_fit.Lens, NDArray]:
+        """Return centroids and a solution as input of the fit of the camera; parameters as of `with_lens`."""
         information = information_of(weight) / self.camera.focal_px**2
         whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
         change = np.zeros(lens_fit.UNKNOWNS)
@@ -172,8 +171,11 @@ class FieldMatcher:
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         unknown = np.zeros(2 * change.shape)
         return (
+            lens_fit.Sights(
+                centroids.xy_px, whiten, self.stars.vectors, partial(self.nearest, centroids)
+            ),
             lens_fit.Lens(self.camera, cam_from_ref, change, unknown, variance),
-            lens_fit.Sights(centroids.xy_px, whiten, self.stars.vectors),
+            np.array([solution.observed, solution.star]),
         )
 
     def fits(self, solution: Solution, centroids: Centroids, weight: Floats) -> bool:
@@ -184,13 +186,12 @@ class FieldMatcher:
         3. No more unmatched detections than by chance are near stars.
         """
         # 1. Size
-        if solution.chi2 > 1 + 1 / np.sqrt(len(solution.star)):
+        if residuals_too_great(solution):
             return False
         # 2. Unknowns
-        start, sights = self._start(solution, centroids, weight, 1.0)
-        matched = solution.observed, solution.star
-        lens, _, _ = lens_fit.fit(start, sights, *matched, self.prior, False, 1)
-        if lens_fit.needed_of(lens, self.prior)[lens_fit.ASPECT :].any():
+        sights, start, pairs = self._start(solution, centroids, weight, 1.0)
+        lens, _, _ = sights.fit(start, pairs, self.prior, False, 1)
+        if lens.needed(self.prior)[lens_fit.ASPECT :].any():
             return False
         # 3. Near misses
         near, by_chance = self.near_misses(start.camera, solution, centroids)
@@ -211,10 +212,6 @@ class FieldMatcher:
     def reason_against(self, refitted: Refit, centroids: Centroids) -> str:
         """Return the reason to refuse a solution with its camera; empty if there is none."""
         solution, camera, _, sheared = refitted
-        # The field, not the focal length: a distortion changes what a focal length means.
-        change = abs(self.camera.fov_rad / camera.fov_rad - 1)
-        if self.focal_uncertainty and change > 1.2 * self.focal_uncertainty + 1e-9:
-            return NO_MATCH
         if solution.dex < -ACCEPT_LOG10_CHANCE:
             return NO_MATCH
         if sheared:

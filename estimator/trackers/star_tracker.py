@@ -421,36 +421,29 @@ class StarTracker(FrameTracker):
         )
         xy_px = centroids.xy_px[observed]
         vectors = self.stars.vectors[star]
-        sigma_rad = self.sigma_px(centroids)[observed] / self.camera.focal_px
+        sigma_px = self.sigma_px(centroids)
+        sigma_rad = sigma_px[observed] / self.camera.focal_px
         solver = self.settings.solver
+        rays = self.camera.rays(xy_px)
         try:
-            cam_from_ref = SOLVERS[solver](self.camera.rays(xy_px), vectors, sigma_rad)
+            cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
-        # Covariance, with the errors that the residuals imply
-        seen_cam = cam_from_ref.apply(vectors)
-        residual_px = self.camera.pixels(seen_cam) - xy_px
-        chi2 = float(np.sum(np.sum(residual_px**2, axis=1) / sigma_rad**2))
-        chi2 /= self.camera.focal_px**2
-        sigma_rad = sigma_rad * np.sqrt(variance_factor(chi2, max(2 * len(star) - 3, 1)))
-        covariance_rad2, common_rad2 = with_focal_error(
-            covariance(self.camera.rays(xy_px), sigma_rad, solver),
-            self.camera,
-            xy_px,
-            seen_cam,
-            sigma_rad,
+        # Errors that the residuals imply
+        residual_px = self.camera.pixels(cam_from_ref.apply(vectors)) - xy_px
+        chi2 = float(np.sum((residual_px / sigma_px[observed, None]) ** 2))
+        variance = variance_factor(chi2, max(2 * len(star) - 3, 1))
+        solution = Solution(
+            observed,
+            star,
+            cam_from_ref.as_quat(),
+            covariance(rays, np.sqrt(variance) * sigma_rad, solver),
+            1.0,
+            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            chi2,
+            float("nan"),
         )
-        match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
-        rms_px = float(np.sqrt(np.mean(residual_px**2)))
-        return Attitude(
-            "solved",
-            cam_from_ref,
-            covariance_rad2,
-            match,
-            rms_px,
-            self.camera,
-            common_rad2,
-        )
+        return self.attitude_of(centroids, Refit(solution, self.camera, variance), sigma_px)
 
     def sigma_px(
         self,
@@ -595,14 +588,13 @@ class StarTracker(FrameTracker):
         # 2. Camera
         weight = detections.weight if exact else self.detections(centroids, own_px).weight
         if self.focal_uncertainty:
-            fits = bool(exact and matcher.fits(solution, centroids, weight))
+            fits = exact and matcher.fits(solution, centroids, weight)
         else:
-            fits = bool(self.camera.focal_sigma or self.camera.row_time_s)
-            fits = fits or len(solution.star) < misfit.LENS_MATCHES
-            fits = fits or (
-                known
-                and variance < misfit.TELLING
-                and not matcher.misfits(camera, solution, centroids)
+            fixed = bool(self.camera.focal_sigma or self.camera.row_time_s)
+            few = len(solution.star) < misfit.LENS_MATCHES
+            small = exact and variance < misfit.TELLING
+            fits = (
+                fixed or few or (small and not matcher.misfits(camera, solution, centroids))
             )
         if fits:
             return Refit(solution, camera, variance)

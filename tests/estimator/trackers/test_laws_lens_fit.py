@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.lenses import LENSES, WORKS, Lens, frames, judge
@@ -50,10 +51,19 @@ def seen_by(
     pixels, _ = lens.project(vectors)
     xy_px = pixels + SIGMA_PX * rng.standard_normal((count, 2))
     whiten = np.tile(np.eye(2) / SIGMA_PX, (count, 1, 1))
-    return vectors, lens_fit.Sights(xy_px, whiten, vectors)
+
+    def match(
+        camera: Camera, cam_from_ref: Rotation, reach_px: float
+    ) -> tuple[NDArray, NDArray]:
+        apart = xy_px[:, None] - camera.pixels(cam_from_ref.apply(vectors))
+        distance = np.linalg.norm(apart, axis=2)
+        near = np.flatnonzero(distance.min(axis=1) < reach_px)
+        return near, distance[near].argmin(axis=1)
+
+    return vectors, lens_fit.Sights(xy_px, whiten, vectors, match)
 
 
-@law(lens_fit.Lens.project, lens_fit.Lens.camera, lens_fit.Lens.distortion)
+@law(lens_fit.Lens.project)
 @given(rng=SEEDS)
 def test_slopes_are_difference_quotients(rng: np.random.Generator) -> None:
     lens = lens_at(rng)
@@ -92,7 +102,7 @@ def test_a_camera_without_shear_projects_as_the_model(rng: np.random.Generator) 
     )
 
 
-@law(lens_fit.fit, lens_fit.prior_sigma, lens_fit.Lens.covariance_rad2)
+@law(lens_fit.Sights.fit, lens_fit.prior_sigma, lens_fit.Lens.covariance_rad2)
 @given(rng=SEEDS)
 def test_the_fitted_camera_has_an_honest_covariance(rng: np.random.Generator) -> None:
     """Errors of all unknowns, whitened by their covariance, are a chi-square with as many degrees of freedom."""
@@ -104,7 +114,7 @@ def test_the_fitted_camera_has_an_honest_covariance(rng: np.random.Generator) ->
         _, sights = seen_by(true, rng, 60)
         rows = np.arange(60)
         start = replace(true, change=np.zeros(UNKNOWNS))
-        found, _, chi2 = lens_fit.fit(start, sights, rows, rows, prior, False, 6)
+        found, _, chi2 = sights.fit(start, np.array([rows, rows]), prior, False, 6)
         assert 0.5 < chi2 < 1.6
         turn = (found.cam_from_ref * true.cam_from_ref.inv()).as_rotvec()
         error = np.append(turn, (found.change - true.change)[3:])
@@ -113,7 +123,7 @@ def test_the_fitted_camera_has_an_honest_covariance(rng: np.random.Generator) ->
     assert abs(np.mean(errors) - UNKNOWNS) < 5 * np.sqrt(2 * UNKNOWNS / 20)
 
 
-@law(lens_fit.grow, lens_fit.needed_of, lens_fit.Lens.sheared)
+@law(lens_fit.Sights.grow, lens_fit.Lens.needed, lens_fit.Lens.sheared)
 @given(rng=SEEDS, far=some.booleans())
 def test_a_match_grows_from_a_corner_to_the_field(
     rng: np.random.Generator, far: bool
@@ -123,24 +133,17 @@ def test_a_match_grows_from_a_corner_to_the_field(
     true = lens_at(rng)
     true.change[:] = 0.0
     true.change[lens_fit.ASPECT] = 0.04 * far
-    vectors, sights = seen_by(true, rng, 40)
-
-    def match(camera: Camera, cam_from_ref: Rotation, reach_px: float):
-        apart = sights.xy_px[:, None] - camera.pixels(cam_from_ref.apply(vectors))
-        distance = np.linalg.norm(apart, axis=2)
-        near = np.flatnonzero(distance.min(axis=1) < reach_px)
-        return near, distance[near].argmin(axis=1)
-
+    _, sights = seen_by(true, rng, 40)
     corner = np.argsort(np.linalg.norm(sights.xy_px - [200, 200], axis=1))[:8]
     start = replace(true, change=np.zeros(UNKNOWNS))
-    lens, observed, star, chi2 = lens_fit.grow(start, sights, match, (corner, corner), prior)
+    lens, (observed, star), chi2 = sights.grow(start, np.array([corner, corner]), prior)
     assert len(star) >= 38
     assert np.array_equal(observed, star)
     assert chi2 < 2
     assert not lens.sheared
     assert lens.camera.aspect == pytest.approx(np.exp(0.04 * far), abs=2e-3)
     free = np.where(np.diag(lens.covariance) > 0, prior, 0.0)
-    assert lens_fit.needed_of(lens, free)[: lens_fit.ASPECT].all()
+    assert lens.needed(free)[: lens_fit.ASPECT].all()
 
 
 @law(distortion_slopes)
