@@ -150,13 +150,8 @@ def attitude_fields(
 def camera_notes(fitted: Camera, tracker: StarTracker) -> list[str]:
     """What a fitted camera has that was not given: pixels that are not square, a field outside of its bounds."""
     notes = []
-    stretch = fitted.aspect / tracker.camera.aspect
-    if abs(stretch - 1) > NOTED_STRETCH:
-        wide, narrow = "yx" if stretch > 1 else "xy"
-        percent = 100 * (max(stretch, 1 / stretch) - 1)
-        notes.append(
-            f"pixel aspect {fitted.aspect:.3f}: stretched along {wide} by {percent:.1f} % against {narrow}"
-        )
+    if abs(fitted.aspect / tracker.camera.aspect - 1) > NOTED_STRETCH:
+        notes.append(f"pixel aspect {fitted.aspect:.3f} (width over height)")
     wider = fitted.fov_rad / tracker.camera.fov_rad - 1
     if abs(wider) > tracker.focal_uncertainty:
         notes.append(f"the field differs by {100 * wider:+.1f} % from the one given")
