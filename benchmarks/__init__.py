@@ -38,6 +38,7 @@ AREAS = {
     "nees": Area(
         "honest covariances where the tracker's noise is understated", {"count": 50}
     ),
+    "lenses": Area("cameras whose model is wrong, beside tetra3rs", {"count": 5}),
     "rate": Area("angular rate from the streaks of one frame", {"count": 20}),
     "rolling": Area("rolling shutter against a global one"),
     "smear": Area("frames solved by rate: SHEFEX-2's chain and ours", {"count": 10}),

@@ -33,7 +33,8 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.core.camera import Camera
+from estimator.attitude.rotation_fit import tangent_gradients
+from estimator.core.camera import Camera, distorted, distortion_slopes
 from estimator.core.checks import Floats, Ints
 
 # Newton decrement g^T N^-1 g at convergence: the squared step in standard deviations. It is small enough for a
@@ -223,7 +224,8 @@ def residuals(bundle: Bundle, sightings: Sightings) -> Floats:
     q = _in_camera(bundle, sightings)[1]
     in_front = q[:, 2] > 0
     tangent = q[:, :2] / np.where(in_front, q[:, 2], 1.0)[:, None]
-    pixel = bundle.lens[1:3] + bundle.lens[0] * _distort(tangent, bundle.lens[3:])
+    distorted_tangent = distorted(tangent, tuple(bundle.lens[3:].tolist()))
+    pixel = bundle.lens[1:3] + bundle.lens[0] * distorted_tangent
     residual = (sightings.xy_px - pixel) / sightings.sigma_px[:, None]
     return np.where(in_front[:, None], residual, np.inf)
 
@@ -240,14 +242,12 @@ def linearize(bundle: Bundle, sightings: Sightings) -> Linearization:
     b, q = _in_camera(bundle, sightings)
     tangent = q[:, :2] / q[:, 2:]
     focal = bundle.lens[0]
-    coefficients = bundle.lens[3:]
-    distorted_tangent = _distort(tangent, coefficients)
+    distortion = tuple(bundle.lens[3:].tolist())
+    distorted_tangent = distorted(tangent, distortion)
     # E, divided by sigma
-    pinhole = np.zeros((len(q), 2, 3))
-    pinhole[:, 0, 0] = pinhole[:, 1, 1] = 1 / q[:, 2]
-    pinhole[:, :, 2] = -tangent / q[:, 2:]
+    pinhole = tangent_gradients(q)
     weight = 1 / sightings.sigma_px[:, None, None]
-    by_tangent, by_coefficients = _slopes(tangent, coefficients)
+    by_tangent, by_coefficients = distortion_slopes(tangent, distortion)
     by_body = focal * weight * (by_tangent @ pinhole @ bundle.R_cam_from_body)
     # Derivatives by all eight elements of the lens; only the first are unknowns.
     by_center = np.tile(np.eye(2), (len(q), 1, 1))
@@ -271,42 +271,6 @@ def _in_camera(bundle: Bundle, sightings: Sightings) -> tuple[Floats, Floats]:
     rotation = bundle.R_body_from_lab[sightings.frame]
     b = np.einsum("mij,mj->mi", rotation, bundle.position_m[sightings.led])
     return b, (b - bundle.camera_body_m) @ bundle.R_cam_from_body.T
-
-
-def _distort(tangent: Floats, coefficients: Floats) -> Floats:
-    """Return the (M, 2) distorted tangents (Brown 1966, in OpenCV's form: see `core.camera`)."""
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = tangent.T
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    tangential_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    tangential_y = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.column_stack([x * radial + tangential_x, y * radial + tangential_y])
-
-
-def _slopes(tangent: Floats, coefficients: Floats) -> tuple[Floats, Floats]:
-    """Return the derivatives of the distorted tangent with respect to the undistorted one and to the coefficients.
-
-    The first is (M, 2, 2) and symmetric, the second (M, 2, 5) for k1, k2, p1, p2, k3.
-    """
-    k1, k2, p1, p2, k3 = coefficients
-    x, y = tangent.T
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    # Derivative of the radial factor by x, divided by x; by y, divided by y.
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
-    by = np.empty((len(x), 2, 2))
-    by[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    by[:, 0, 1] = by[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    by[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    by_coefficients = [
-        tangent * r2[:, None],
-        tangent * r2[:, None] ** 2,
-        np.column_stack([2 * x * y, r2 + 2 * y * y]),
-        np.column_stack([r2 + 2 * x * x, 2 * x * y]),
-        tangent * r2[:, None] ** 3,
-    ]
-    return by, np.stack(by_coefficients, axis=2)
 
 
 class NormalEquations(NamedTuple):

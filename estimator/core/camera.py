@@ -1,7 +1,10 @@
 """Camera model of the tracker: converts pixels to unit vectors and back, with the calibration that the tracker assumes.
 
 The model is a pinhole with Brown-Conrady distortion in OpenCV's convention. Projection (`Camera.pixels`) applies
-the distortion in closed form; back-projection (`Camera.rays`) inverts it by fixed-point iteration.
+the distortion in closed form; back-projection (`Camera.rays`) inverts it by fixed-point iteration. With the focal
+length f in pixels along x, the aspect a, the principal point c and the distorted tangents t',
+
+    x_px = c_x + f t'_x,    y_px = c_y + a f t'_y.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ NUMBERS = {
     "focal_px": Allowed(1e-9, 1e12, "finite, above 0: focal length over pixel"),
     "focal_sigma": Allowed(0.0, 0.5, "0 to 0.5, relative"),
     "row_time_s": Allowed(-1.0, 1.0, "-1 to 1: seconds from row to row"),
+    "aspect": Allowed(0.5, 2.0, "0.5 to 2: width over height of a pixel"),
 }
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
 
@@ -44,7 +48,7 @@ class Camera:
     width_px, height_px
         Size of the image
     focal_px
-        Focal length divided by the pixel pitch
+        Focal length divided by the pixel pitch along x
     center_px
         Principal point (x, y); the center of pixel (0, 0) is (0, 0)
     distortion
@@ -55,6 +59,8 @@ class Camera:
     row_time_s
         Rolling shutter: each row is exposed this long after the one above it, negative if the
         lower one is first; 0 for a global shutter
+    aspect
+        Width over height of a pixel: the focal length in pixels along y, divided by that along x; 1 for square pixels
 
     Raises
     ------
@@ -69,6 +75,7 @@ class Camera:
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)
     focal_sigma: float = 0.0
     row_time_s: float = 0.0
+    aspect: float = 1.0
 
     def __post_init__(self) -> None:
         if self._is_plain():
@@ -198,6 +205,7 @@ class Camera:
             self.focal_px,
             *self.center_px,
             self.distortion,
+            self.aspect,
         )
 
     def pixels(self, vectors_cam: Floats) -> Floats:
@@ -209,7 +217,8 @@ class Camera:
         z = np.where(vectors_cam[:, 2] > 0, vectors_cam[:, 2], np.nan)
         tangent = vectors_cam[:, :2] / z[:, None]
         tangent[np.sum(tangent**2, axis=1) >= self._fold()] = np.nan
-        return distorted(tangent, self.distortion) * self.focal_px + self.center_px
+        focal_px = self.focal_px * np.array([1.0, self.aspect])
+        return distorted(tangent, self.distortion) * focal_px + self.center_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
         """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
@@ -275,6 +284,7 @@ def undistorted(
     center_x_px: float,
     center_y_px: float,
     distortion: Distortion,
+    aspect: float = 1.0,
 ) -> Floats:
     """Convert (N, 2) pixels to (N, 2) tangents without distortion.
 
@@ -286,7 +296,7 @@ def undistorted(
     no_distortion = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
     for n in range(len(out)):
         measured_x = (xy_px[n, 0] - center_x_px) / focal_px
-        measured_y = (xy_px[n, 1] - center_y_px) / focal_px
+        measured_y = (xy_px[n, 1] - center_y_px) / (aspect * focal_px)
         x = measured_x
         y = measured_y
         for _ in range(0 if no_distortion else 50):
@@ -298,6 +308,31 @@ def undistorted(
         out[n, 0] = x
         out[n, 1] = y
     return out
+
+
+def distortion_slopes(tangent: Floats, distortion: Distortion) -> tuple[Floats, Floats]:
+    """Return the derivatives of the distorted tangent with respect to the undistorted one and to the coefficients.
+
+    The first is (M, 2, 2) and symmetric, the second (M, 2, 5) for k1, k2, p1, p2, k3.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = tangent.T
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    # Derivative of the radial factor by x, divided by x; by y, divided by y.
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
+    by = np.empty((len(x), 2, 2))
+    by[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    by[:, 0, 1] = by[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    by[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    by_coefficients = [
+        tangent * r2[:, None],
+        tangent * r2[:, None] ** 2,
+        np.column_stack([2 * x * y, r2 + 2 * y * y]),
+        np.column_stack([r2 + 2 * x * x, 2 * x * y]),
+        tangent * r2[:, None] ** 3,
+    ]
+    return by, np.stack(by_coefficients, axis=2)
 
 
 def check_frame(image: object, camera: Camera) -> None:

@@ -7,11 +7,8 @@ dp = N^-1 g, N = J^T W J, g = J^T W r. The functions compute
 - dp by Cholesky factorization (`step`);
 - the position's covariance from N^-1 (`position_covariance`);
 - the factor of a covariance whose residuals exceed their errors (`misfit_factor`, `variance_factor`).
-
-`fit_soft_l1` is a robust fit by Levenberg-Marquardt, for models without derivatives.
 """
 
-from collections.abc import Callable
 from math import sqrt
 
 import numpy as np
@@ -23,14 +20,6 @@ from estimator.core.jit import jit
 # or below a thousandth of a pixel: convergence is quadratic where the model fits, so the next step is negligible.
 CONVERGED_CHI2 = 1e-4
 CONVERGED_PX = 1e-3
-
-# Robust fit.
-SLOPE_STEP = 1e-4  # step of the difference quotients, in units of the parameters' scale
-MIN_DAMPING = 1e-9
-MAX_DAMPING = 1e6
-MAX_STEPS = 40
-CONVERGED_FALL = 1e-10  # relative fall of the loss at convergence
-TINY = 1e-12  # diagonal for a parameter without effect
 
 # Prior of the factor of claimed variances: the probability that it is 1. Otherwise it is from 1 to MAX_VARIANCE_FACTOR,
 # evenly in its logarithm.
@@ -183,67 +172,3 @@ def variance_factor(chi2: float, degrees_of_freedom: float) -> float:
     wrong = (1 - PRIOR_RIGHT) * np.exp(log_ratio - highest) / len(FACTORS)
     right = PRIOR_RIGHT * np.exp(-highest)
     return float((right + wrong @ FACTORS) / (right + wrong.sum()))
-
-
-def fit_soft_l1(
-    residual: Callable[[Floats], Floats],
-    start: Floats,
-    scale: Floats,
-    converged_fall: float = CONVERGED_FALL,
-) -> Floats:
-    """Return the parameters that minimize sum(2 (sqrt(1 + r^2) - 1)), the soft L1 loss of residuals (N,).
-
-    The loss grows as |r| beyond 1, so that a few gross errors have little effect. Levenberg-Marquardt on the weights of
-    iteratively reweighted least squares repeats:
-
-    1. Compute the slopes J by difference quotients, with steps of SLOPE_STEP times the scale.
-    2. Sum the normal equations with the weights 1 / sqrt(1 + r^2).
-    3. Solve them, with more damping until the loss does not rise.
-    4. Reduce the damping; stop if the loss hardly falls.
-
-    Parameters
-    ----------
-    residual
-        Function of the (P,) parameters that returns the (N,) residuals, in standard deviations
-    scale
-        (P,) changes of the parameters that change the residuals by about equal amounts
-    converged_fall
-        The fit ends at a step that lowers the loss by no more than this fraction
-    """
-    point = np.asarray(start, dtype=float)
-    r = residual(start)
-    damping = 1e-4
-    for _ in range(MAX_STEPS):
-        # 1. Slopes
-        columns = [
-            (residual(point + one) - r) / SLOPE_STEP for one in np.diag(SLOPE_STEP * scale)
-        ]
-        slopes = np.column_stack(columns)
-        # 2. Normal equations
-        weight = 1 / np.sqrt(1 + r**2)
-        normal = (weight[:, None] * slopes).T @ slopes
-        gradient = slopes.T @ (weight * r)
-        # 3. Step
-        while damping < MAX_DAMPING:
-            change = np.linalg.solve(
-                normal + damping * np.diag(np.diag(normal) + TINY), -gradient
-            )
-            tried = residual(point + scale * change)
-            if soft_l1(tried) <= soft_l1(r):
-                break
-            damping *= 10
-        else:
-            return point
-        # 4. Convergence
-        point = point + scale * change
-        fall = soft_l1(r) - soft_l1(tried)
-        r = tried
-        damping = max(damping / 10, MIN_DAMPING)
-        if fall <= converged_fall * soft_l1(r):
-            return point
-    return point
-
-
-def soft_l1(residual: Floats) -> float:
-    """Return sum(2 (sqrt(1 + r^2) - 1)): squares of small residuals, twice the absolute values of large ones."""
-    return float(np.sum(2 * (np.sqrt(1 + residual**2) - 1)))

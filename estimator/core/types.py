@@ -336,7 +336,8 @@ class Attitude:
     rms_px
         RMS residual of the matched centroids; NaN unless solved
     camera
-        Calibration used, fitted where it was uncertain; None unless solved
+        Camera used, None unless solved. Where it was uncertain or did not fit the field, it has the
+        fitted `focal_px`, `aspect` (width over height of a pixel) and `distortion`
     systematic_rad2
         (3, 3) part of covariance_rad2 that is common to successive frames; None if there is none
     rate

@@ -66,6 +66,8 @@ class Sensor(NamedTuple):
         See `Detections`
     zero_point_mag, magnitude_sigma
         See `trackers.pipeline.Settings`; the zero point is NaN if unknown
+    aspect
+        Width over height of a pixel
     """
 
     focal_px: float
@@ -74,6 +76,7 @@ class Sensor(NamedTuple):
     field: Floats
     zero_point_mag: float
     magnitude_sigma: float
+    aspect: float = 1.0
 
 
 class FlatCentroids(NamedTuple):
@@ -137,7 +140,9 @@ def detections_of(
         weight[n, 1] = xx * scale
         weight[n, 2] = -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
-    tangent = undistorted(lights.xy_px, focal_px, center_x, center_y, sensor.distortion)
+    tangent = undistorted(
+        lights.xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
+    )
     # Detections are sorted by brightness: the middle one is the median.
     limit_mag = mag[count // 2] if count else np.nan
     return Detections(

@@ -1,17 +1,12 @@
-"""Errors that exceed the model: a solution's matches, lens and covariance where its residuals are too great.
+"""Errors that exceed the model: a solution's matches and covariance where its residuals are too great.
 
-The claimed centroid errors may be too small, and the lens may have drifted from its calibration. Both show in the
-chi-square of the residuals, but only in part: matches beyond the gate are lost. `refit` therefore takes these steps:
-
-1. Multiply the errors by several factors and match the field again with each; keep the factor of most evidence
-   (`widened`).
-2. Fit the focal length and the first radial distortion coefficient with the attitude (`with_lens`).
-3. Multiply the covariance by the factor that the remaining residuals imply (`least_squares.variance_factor`).
+The claimed centroid errors may be too small. This shows in the chi-square of the residuals, but only in part: matches
+beyond the gate are lost. `widened` therefore multiplies the errors by several factors, matches the field again with
+each, and keeps the factor of most evidence. `lens_fit` then fits the camera, where the residuals remain too great.
 
 `with_companions` increases the errors of catalog stars whose residuals indicate a companion.
 """
 
-from dataclasses import replace
 from math import log, log10, sqrt
 from typing import NamedTuple
 
@@ -28,7 +23,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
-from estimator.core.least_squares import PRIOR_RIGHT, variance_factor
+from estimator.core.least_squares import PRIOR_RIGHT
 from estimator.identification import star_evidence, star_quads
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import (
@@ -49,22 +44,6 @@ TRIED = 2.0 ** np.arange(7)  # factors of the variances that are tried
 # log10 of the prior odds of each larger factor against the claimed errors.
 PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
-# Prior standard deviations of the lens: relative focal length, and relative distortion at the corner.
-FOCAL_PRIOR = 0.01
-CORNER_PRIOR = 0.01
-LENS_ROUNDS = 4
-SHEAR_CHANCE = 1e-4  # probability of random residuals that look sheared
-
-
-def variance_of(residual: Floats, parameters: int) -> float:
-    """Return the factor of the claimed variances, from (K, 2) residuals in standard deviations after a fit.
-
-    Parameters
-    ----------
-    parameters
-        Number of parameters of the fit
-    """
-    return variance_factor(float(np.sum(residual**2)), max(residual.size - parameters, 1))
 
 
 @jit
@@ -250,153 +229,13 @@ class Refit(NamedTuple):
     variance
         Factor of the claimed variances
     sheared
-        Whether the field is stretched or sheared, as by a rolling shutter: the attitude is then
-        unusable
+        Whether the field is sheared, as by a rolling shutter: the attitude is then unusable
     """
 
     solution: Solution
     camera: Camera
     variance: float
     sheared: bool = False
-
-
-def refit(
-    solution: Solution,
-    detections: Detections,
-    sky: SkyIndex,
-    camera: Camera,
-    xy_px: Floats,
-    fit_lens: bool,
-    variance: float = 0.0,
-) -> Refit:
-    """Match, fit and scale a solution again by its residuals: the numbered steps of the module.
-
-    Parameters
-    ----------
-    detections
-        Detections with the errors of the model, and with the focal uncertainty with which the
-        solution was found
-    camera
-        Camera of the solution
-    xy_px
-        (N, 2) centroids
-    fit_lens
-        Whether the lens may be fitted
-    variance
-        Factor of the variances if step 1 has been done (`widened`); else 0
-    """
-    # 1. Matches
-    if not variance:
-        R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
-        solution, variance = widened(solution, R_cam_from_ref, detections, sky)
-    # 2. and 3. Lens
-    if fit_lens and variance >= TELLING and len(solution.star) >= LENS_MATCHES:
-        return with_lens(solution, detections, sky, camera, xy_px, variance)
-    return Refit(solution, camera, variance)
-
-
-def with_lens(
-    solution: Solution,
-    detections: Detections,
-    sky: SkyIndex,
-    camera: Camera,
-    xy_px: Floats,
-    variance: float,
-) -> Refit:
-    """Fit attitude, focal length and the first radial distortion coefficient to the matches of a solution.
-
-    The tangents t change by J w with a small rotation w, by t with the logarithm of the focal length, and by |t|^2 t
-    with the coefficient. The two lens parameters have normal priors about the calibration. Each round:
-
-    1. Linearize, and divide residuals and slopes by their errors (whiten).
-    2. Solve the normal equations of the five unknowns, and apply the step (Gauss-Newton).
-    3. Compute the factor of the variances from the remaining residuals.
-    4. Reject matches beyond GATE_SIGMA of these errors.
-
-    The covariance is that of the attitude, with the lens unknown.
-    """
-    cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-    keep = np.ones(len(solution.star), bool)
-    information = information_of(detections.weight[solution.observed])
-    whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
-    vectors_ref = sky.vectors[solution.star]
-    xy_px = xy_px[solution.observed]
-    corner2 = float(np.sum(np.square(detections.field[[0, 2]])))
-    prior = np.diag([0.0, 0.0, 0.0, 1 / FOCAL_PRIOR**2, (corner2 / CORNER_PRIOR) ** 2])
-    lens = camera
-    change = np.zeros(5)
-    for _ in range(LENS_ROUNDS):
-        # 1. Linearization
-        tangent, by_unknowns = _linearize(cam_from_ref.apply(vectors_ref))
-        slopes = whiten @ by_unknowns
-        residual = (whiten @ (lens.tangents(xy_px) - tangent)[:, :, None])[:, :, 0]
-        # 2. Step
-        kept = slopes[keep].reshape(-1, 5)
-        count = int(keep.sum())
-        normal = kept.T @ kept / variance + prior
-        gradient = kept.T @ residual[keep].ravel() / variance - prior @ change
-        step = np.linalg.solve(normal, gradient)
-        change[3:] += step[3:]
-        cam_from_ref = Rotation.from_rotvec(step[:3]) * cam_from_ref
-        lens = _lens_of(camera, *change[3:])
-        # 3. Factor of the variances
-        distance2 = np.sum((residual - slopes @ step) ** 2, axis=1)
-        chi2 = float(distance2[keep].sum())
-        found = variance_factor(chi2, 2 * count - 5)
-        # 4. Gate
-        near = distance2 <= GATE_SIGMA**2 * found
-        if near.sum() < LENS_MATCHES:
-            break
-        keep = near
-        variance = found
-    rest = (residual - slopes @ step)[keep]
-    sheared = _is_sheared(whiten[keep], tangent[keep], slopes[keep], rest)
-    left = lens.tangents(xy_px[keep]) - _tangents(cam_from_ref.apply(vectors_ref[keep]))
-    covariance = np.linalg.inv(kept.T @ kept / variance + prior)
-    fitted = solution._replace(
-        observed=solution.observed[keep],
-        star=solution.star[keep],
-        cam_from_ref_xyzw=cam_from_ref.as_quat(),
-        covariance_rad2=np.asarray(covariance[:3, :3], dtype=float),
-        rms=float(np.sqrt(np.mean(left**2))),
-        chi2=chi2 / (2 * count - 5),
-    )
-    return Refit(fitted, lens, variance, sheared)
-
-
-def _linearize(seen_cam: Floats) -> tuple[Floats, Floats]:
-    """Return the (K, 2) tangents of directions, and their (K, 2, 5) derivatives by the unknowns of `with_lens`."""
-    view = geometry(seen_cam, seen_cam)
-    radial = view.tangent * np.sum(view.tangent**2, axis=1)[:, None]
-    by_unknowns = [view.jacobian, view.tangent[:, :, None], radial[:, :, None]]
-    return view.tangent, np.concatenate(by_unknowns, axis=2)
-
-
-def _is_sheared(whiten: Floats, tangent: Floats, slopes: Floats, residual: Floats) -> bool:
-    """Return whether a stretch (x, -y) and a shear (y, x) of the field explain the residuals of K matches.
-
-    This is an F-test, which does not depend on the size of the errors: with m degrees of freedom left, random residuals
-    keep no more than the share q of their chi-square with the probability q^(m/2).
-    """
-    x, y = tangent.T
-    change = np.stack([np.stack([x, -y], axis=1), np.stack([y, x], axis=1)], axis=2)
-    design = np.concatenate([slopes, whiten @ change], axis=2).reshape(-1, 7)
-    errors = residual.ravel()
-    solved, _, _, _ = np.linalg.lstsq(design, errors, rcond=None)
-    share = np.sum((errors - design @ solved) ** 2) / np.sum(errors**2)
-    return bool(share ** ((len(errors) - 7) / 2) < SHEAR_CHANCE)
-
-
-def _tangents(seen_cam: Floats) -> Floats:
-    """Return the (K, 2) tangents (x / z, y / z) of (K, 3) vectors in camera axes."""
-    return np.asarray(seen_cam[:, :2] / seen_cam[:, 2:])
-
-
-def _lens_of(camera: Camera, log_focal: float, k1: float) -> Camera:
-    """Return the camera with its log focal length and first distortion coefficient changed by these amounts."""
-    focal_px = camera.focal_px * float(np.exp(log_focal))
-    distortion = (camera.distortion[0] + float(k1), *camera.distortion[1:])
-    return replace(camera, focal_px=focal_px, distortion=distortion)
 
 
 # Errors of catalog stars with a companion: a double star is not where its catalog entry is.

@@ -1,49 +1,46 @@
-"""Match of a field of stars to the full catalog, with a fit of the attitude and, where it is uncertain, of the lens.
+"""Match of a field of stars to the full catalog, with a fit of the attitude and, where it is wrong, of the camera.
 
-From a candidate attitude, `FieldMatcher.refine` takes these steps:
-
-1. Predict the pixels of the catalog stars, and match mutual nearest neighbors within a radius.
-2. Fit the lens, if it is uncertain, and the attitude; repeat with a smaller radius.
-3. Accept the match if it is significant: the expected number of matches this good by chance follows from the binomial
-   distribution (`log10_chance`).
-4. Compute the covariance, with the errors that the residuals imply.
-
-`misfits` uses the same predictions to find whether the camera model explains the whole field or only a part of it.
+`FieldMatcher.fits` finds whether the camera model explains a solution and all detections near stars. If not,
+`FieldMatcher.with_lens` extends the solution over the field with a fit of the camera (`lens_fit`), and `misfits` finds
+whether that explains the whole field or only a part of it.
+The match of candidates that have no evidence of their own is accepted if it is significant: the expected number of
+matches this good by chance follows from the binomial distribution (`log10_chance`).
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.attitude.systematic import focal_error_px, with_focal_error
 from estimator.catalog.catalog import StarCatalog
-from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
-from estimator.core.least_squares import fit_soft_l1
-from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.core.types import Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import mutual_nearest
+from estimator.identification.star_detections import information_of
 from estimator.identification.star_evidence import Solution
-from estimator.trackers import misfit
-from estimator.trackers.pipeline import Settings, direction_sigma_rad
+from estimator.identification.star_search import WRONG_FOCAL
+from estimator.trackers import lens_fit
+from estimator.trackers.misfit import Refit, residuals_too_great
 
 NO_MATCH = "no identification beyond chance"
+MISFIT = "the camera model does not fit the field"
+SHEARED = f"{MISFIT}: it is sheared, as by a rolling shutter of a camera that turns"
+PARTIAL = f"{MISFIT}: only a part of the stars matches; calibrate the lens"
 # Least number of near misses per match for a wrong camera model; centroid errors that are claimed three times too small
 # give up to 0.75.
 MISFIT_SHARE = 0.8
-# Largest radial distortion of an undistorted lens, in standard deviations
-MAX_DISTORTION_SIGMA = 1.5
+# Largest distance of a near miss, as a share of half the diagonal: of a calibrated and of an uncertain camera
+NEAR = 0.008
+NEAR_UNCERTAIN = 0.03
+RADIUS_PX = 2.5  # of a match, for its chance
+KEPT_VARIANCE = 4.0  # factor of the variances to which a search's evidence holds after the fit of the camera
 # A detection brighter than its star by this much is a mismatch: colors, variables and doubles explain less.
 TOO_BRIGHT_MAG = 2.0
-BEHIND = 1e-3  # least z of a direction in the lens fit
-# The lens fit ends at a step that lowers the loss by this fraction: sqrt(N / 10^6) standard deviations for N stars.
-CONVERGED_FALL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,19 +53,14 @@ class FieldMatcher:
         On-board calibration
     stars
         Catalog stars with apparent directions and magnitudes
-    sky
-        Index of the same stars
     focal_uncertainty
-        Relative uncertainty of the focal length; unless it is 0, the lens is fitted with the
-        attitude
+        Relative uncertainty of the focal length
     patterns
         Number of patterns that were searched, for the expected number of chance matches
     """
 
     camera: Camera
     stars: StarCatalog
-    sky: SkyIndex
-    settings: Settings
     focal_uncertainty: float
     patterns: int
 
@@ -77,59 +69,65 @@ class FieldMatcher:
         """Directions of the stars, to find those of a field."""
         return cKDTree(self.stars.vectors)
 
-    @property
-    def lens_radii_px(self) -> list[float]:
-        """Matching radii with an uncertain lens: the first allow for its error at the corner; each fit reduces it."""
-        reach_px = np.hypot(self.camera.width_px, self.camera.height_px) / 2
-        return [0.008 * reach_px + 2, 0.004 * reach_px + 2, 4, 3, 2.5, 2.5]
+    @cached_property
+    def prior(self) -> Floats:
+        """Standard deviations of the priors of a camera's fit (`lens_fit.prior_sigma`)."""
+        return lens_fit.prior_sigma(self.camera, self.focal_uncertainty)
 
-    def refine(
-        self, centroids: Centroids, camera: Camera, cam_from_ref: Rotation
-    ) -> Attitude:
-        """Refine a candidate attitude, or refuse it: the numbered steps of the module.
+    def with_lens(
+        self,
+        solution: Solution,
+        centroids: Centroids,
+        weight: Floats,
+        variance: float,
+        exact: bool = True,
+    ) -> Refit:
+        """Extend a solution over the field with a fit of the camera (`lens_fit.grow`).
 
-        If the focal length is uncertain, each round also fits the camera (`fit_camera`), and the result must be within
-        1.2 times the uncertainty.
+        Parameters
+        ----------
+        solution
+            Solution by some of the stars
+        weight
+            (N, 3) inverse covariances of the tangents, as `Detections.weight`
+        variance
+            Factor of the claimed variances
+        exact
+            Whether the solution's evidence is by these errors
         """
-        fit_lens = self.focal_uncertainty > 0
-        for radius_px in self.lens_radii_px if fit_lens else [3, 2.5, 2.5]:
-            # 1. Matches
-            observed, star = self.nearest(centroids, camera, cam_from_ref, radius_px)
-            if len(observed) < MIN_MATCHES:
-                return Attitude(NO_MATCH)
-            # 2. Lens and attitude
-            xy = centroids.xy_px[observed]
-            vectors = self.stars.vectors[star]
-            if fit_lens:
-                camera, cam_from_ref = fit_camera(camera, cam_from_ref, xy, vectors)
-            rays = camera.rays(xy)
-            centroid_rad = direction_sigma_rad(
-                centroids.take(observed), camera, self.settings
+        sights, start, pairs = self._start(solution, centroids, weight, variance)
+        lens, (observed, star), chi2 = sights.grow(start, pairs, self.prior)
+        camera = lens.camera
+        dex = solution.dex
+        if self.focal_uncertainty or not exact:
+            chance = log10_chance(
+                observed,
+                len(centroids),
+                len(self.in_field(camera, lens.cam_from_ref)[0]),
+                RADIUS_PX,
+                camera,
+                self.patterns,
+                int(np.count_nonzero(np.diag(lens.covariance))) // 2,
             )
-            sigma_rad = np.hypot(centroid_rad, focal_error_px(camera, xy) / camera.focal_px)
-            try:
-                cam_from_ref = SOLVERS[self.settings.solver](rays, vectors, sigma_rad)
-            except ValueError as error:
-                return Attitude(f"no attitude: {error}")
-        # 3. Significance
-        rows, _ = self.in_field(camera, cam_from_ref)
-        chance = log10_chance(
-            observed, len(centroids), len(rows), radius_px, camera, self.patterns
+            # A few stars that are kept, with their claimed errors, have their evidence by the search.
+            kept = len(star) >= len(solution.star) and lens.variance < KEPT_VARIANCE
+            dex = max(-chance, dex if kept else -np.inf)
+            # The field, not the focal length: a distortion changes what a focal length means.
+            change = abs(self.camera.fov_rad / camera.fov_rad - 1)
+            if change > 1.2 * (self.focal_uncertainty or WRONG_FOCAL):
+                dex = -np.inf
+        residual_px = centroids.xy_px[observed] - lens.project(self.stars.vectors[star])[0]
+        fitted = Solution(
+            observed,
+            star,
+            lens.cam_from_ref.as_quat(),
+            lens.covariance_rad2,
+            solution.focal_ratio,
+            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            chi2,
+            dex,
         )
-        if chance > ACCEPT_LOG10_CHANCE:
-            return Attitude(NO_MATCH)
-        # The field, not the focal length: a distortion changes what a focal length means.
-        if (
-            abs(self.camera.fov_rad / camera.fov_rad - 1)
-            > 1.2 * self.focal_uncertainty + 1e-9
-        ):
-            return Attitude(NO_MATCH)
-        # 4. Covariance
-        match = StarMatch(observed, star, cam_from_ref, chance, self.stars.v_mag[star])
-        parameters = 5 if fit_lens else 3
-        return solved_attitude(
-            match, vectors, xy, camera, sigma_rad, self.settings.solver, parameters
-        )
+        return Refit(fitted, camera, lens.variance, lens.sheared)
 
     def in_field(self, camera: Camera, cam_from_ref: Rotation) -> tuple[NDArray, Floats]:
         """Return rows and pixels of the catalog stars on the sensor, brightest first."""
@@ -162,38 +160,44 @@ class FieldMatcher:
         plausible = excess_mag < max(TOO_BRIGHT_MAG, 4 * float(np.median(np.abs(excess_mag))))
         return observed[plausible], star[plausible]
 
-    def fits(self, solution: Solution, centroids: Centroids, sigma_px: Floats) -> bool:
-        """Return whether an undistorted lens explains a solution.
+    def _start(
+        self, solution: Solution, centroids: Centroids, weight: Floats, variance: float
+    ) -> tuple[lens_fit.Sights, lens_fit.Lens, NDArray]:
+        """Return centroids and a solution as input of the fit of the camera; parameters as of `with_lens`."""
+        information = information_of(weight) / self.camera.focal_px**2
+        whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
+        change = np.zeros(lens_fit.UNKNOWNS)
+        change[lens_fit.FOCAL] = np.log(solution.focal_ratio)
+        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        unknown = np.zeros(2 * change.shape)
+        return (
+            lens_fit.Sights(
+                centroids.xy_px, whiten, self.stars.vectors, partial(self.nearest, centroids)
+            ),
+            lens_fit.Lens(self.camera, cam_from_ref, change, unknown, variance),
+            np.array([solution.observed, solution.star]),
+        )
+
+    def fits(self, solution: Solution, centroids: Centroids, weight: Floats) -> bool:
+        """Return whether a camera with another focal length explains a solution.
 
         1. The residuals have their expected size.
-        2. They have no significant part q = r^3 - c r from a radial distortion; c makes q orthogonal to r, which a
-           focal length explains.
+        2. They ask for none of the other unknowns of the fit of the camera (`lens_fit.needed_of`).
         3. No more unmatched detections than by chance are near stars.
         """
         # 1. Size
-        count = len(solution.star)
-        observed = solution.observed
-        if solution.chi2 > 1 + 1 / np.sqrt(count):
+        if residuals_too_great(solution):
             return False
-        # 2. Radial distortion: the projection of the residuals on q over its standard deviation
-        camera = self.camera.zoomed(solution.focal_ratio)
-        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-        xy_px = centroids.xy_px[observed]
-        residual_px = xy_px - camera.pixels(
-            cam_from_ref.apply(self.stars.vectors[solution.star])
-        )
-        offset = (xy_px - camera.center_px) / camera.focal_px
-        r2 = np.sum(offset**2, axis=1)
-        q = r2 - np.sum(r2**2) / np.sum(r2)  # over r
-        projection = np.sum(q * np.sum(offset * residual_px, axis=1))
-        score = projection / np.sqrt(np.sum(q**2 * r2 * sigma_px[observed] ** 2))
-        if abs(score) > MAX_DISTORTION_SIGMA:
+        # 2. Unknowns
+        sights, start, pairs = self._start(solution, centroids, weight, 1.0)
+        lens, _, _ = sights.fit(start, pairs, self.prior, False, 1)
+        if lens.needed(self.prior)[lens_fit.ASPECT :].any():
             return False
         # 3. Near misses
-        near, by_chance = self.near_misses(solution, centroids)
+        near, by_chance = self.near_misses(start.camera, solution, centroids)
         return near <= 1 + 2 * by_chance
 
-    def misfits(self, solution: Solution, centroids: Centroids) -> bool:
+    def misfits(self, camera: Camera, solution: Solution, centroids: Centroids) -> bool:
         """Return whether stars that just miss a detection are about as many as stars that match one.
 
         The camera model is then wrong (a rotating camera with a rolling shutter, a strong distortion). The stars that
@@ -202,55 +206,34 @@ class FieldMatcher:
         matched = len(solution.star)
         if len(centroids) - matched < MISFIT_SHARE * matched:
             return False
-        near, by_chance = self.near_misses(solution, centroids)
+        near, by_chance = self.near_misses(camera, solution, centroids)
         return bool(near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance)))
 
-    def near_misses(self, solution: Solution, centroids: Centroids) -> tuple[int, float]:
+    def reason_against(self, refitted: Refit, centroids: Centroids) -> str:
+        """Return the reason to refuse a solution with its camera; empty if there is none."""
+        solution, camera, _, sheared = refitted
+        if solution.dex < -ACCEPT_LOG10_CHANCE:
+            return NO_MATCH
+        if sheared:
+            return SHEARED
+        return PARTIAL if self.misfits(camera, solution, centroids) else ""
+
+    def near_misses(
+        self, camera: Camera, solution: Solution, centroids: Centroids
+    ) -> tuple[int, float]:
         """Return the number of unmatched detections beside a star, and the number expected by chance."""
-        gate_rad = min(self.lens_radii_px[0] / self.camera.focal_px, 0.05)
-        tangent = self.camera.tangents(centroids.xy_px)
-        gates = np.full(len(centroids), gate_rad)
-        R = Rotation.from_quat(solution.cam_from_ref_xyzw).as_matrix()
-        near = misfit.count_near(
-            tangent, self.sky, R, solution.focal_ratio, solution.observed, gates
-        )
-        # The gates of all stars cover the share N pi gate^2 / (4 pi) of the sky.
-        covered = min(len(self.stars) * gate_rad**2 / 4, 1.0)
-        return near, (len(centroids) - len(solution.star)) * covered
-
-
-def solved_attitude(
-    match: StarMatch,
-    vectors_ref: Floats,
-    xy_px: Floats,
-    camera: Camera,
-    sigma_rad: Floats,
-    solver: str,
-    parameters: int,
-) -> Attitude:
-    """Return the attitude of K matches with its covariance, for the errors that the residuals imply.
-
-    Parameters
-    ----------
-    vectors_ref, xy_px, sigma_rad
-        (K, 3) directions of the stars, (K, 2) centroids, and their (K,) claimed errors
-    solver
-        Solver of the attitude
-    parameters
-        Number of parameters of the fit
-    """
-    seen_cam = match.cam_from_ref.apply(vectors_ref)
-    residual_px = camera.pixels(seen_cam) - xy_px
-    residual = residual_px / (camera.focal_px * sigma_rad)[:, None]
-    sigma_rad = sigma_rad * np.sqrt(misfit.variance_of(residual, parameters))
-    covariance_rad2 = covariance(camera.rays(xy_px), sigma_rad, solver)
-    covariance_rad2, common_rad2 = with_focal_error(
-        covariance_rad2, camera, xy_px, seen_cam, sigma_rad
-    )
-    rms_px = float(np.sqrt(np.mean(residual_px**2)))
-    return Attitude(
-        "solved", match.cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
-    )
+        size_px = self.camera.width_px, self.camera.height_px
+        share = NEAR_UNCERTAIN if self.focal_uncertainty else NEAR
+        gate_px = share * np.hypot(*size_px) / 2 + 2
+        cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        _, star_px = self.in_field(camera, cam_from_ref)
+        others_px = np.delete(centroids.xy_px, solution.observed, axis=0)
+        if not len(star_px):
+            return 0, 0.0
+        distance_px, _ = cKDTree(star_px).query(others_px)
+        # The gates of all stars cover this share of the sensor.
+        covered = min(len(star_px) * np.pi * gate_px**2 / np.prod(size_px), 1.0)
+        return int(np.sum(distance_px < gate_px)), len(others_px) * covered
 
 
 def log10_chance(
@@ -260,13 +243,14 @@ def log10_chance(
     radius_px: float,
     camera: Camera,
     patterns: int,
+    defining: int = 2,
 ) -> float:
     """Return log10 of the expected number of matches this good by chance, over all patterns tried.
 
     A false blob falls within the radius of a predicted star with the probability p, the fraction of the sensor that the
-    circles cover. Two matches define the attitude and do not count. Faint blobs are mostly false, so the binomial tail
-    is computed among the brightest 15, 30, 60 and all of the blobs; the result is the least of these, multiplied by
-    their number.
+    circles cover. The matches that define attitude and camera do not count. Faint blobs are mostly false, so the
+    binomial tail is computed among the brightest 15, 30, 60 and all of the blobs; the result is the least of these,
+    multiplied by their number.
 
     Parameters
     ----------
@@ -278,6 +262,8 @@ def log10_chance(
         Matching radius
     patterns
         Number of patterns that were tried
+    defining
+        Number of matches that define attitude and camera
     """
     # Covered fraction, with circles that may overlap
     p = 1 - np.exp(-predicted * np.pi * radius_px**2 / (camera.width_px * camera.height_px))
@@ -285,38 +271,5 @@ def log10_chance(
     tails = []
     for count in counts:
         matches = int((observed < count).sum())
-        tails.append(log10_tail(max(count - 2, 0), matches - 2, p))
+        tails.append(log10_tail(max(count - defining, 0), matches - defining, p))
     return float(min(tails) + np.log10(len(counts)) + np.log10(patterns))
-
-
-def fit_camera(
-    camera: Camera, cam_from_ref: Rotation, xy_px: Floats, vectors_ref: Floats
-) -> tuple[Camera, Rotation]:
-    """Fit attitude, focal length and (with 12 stars or more) the first radial distortion coefficient to the pixels.
-
-    The fit is robust (soft L1 loss beyond one pixel), so that a wrong match has little effect on the lens.
-    """
-    count = 5 if len(xy_px) >= 12 else 4
-    k1 = camera.distortion[0]
-    start = np.zeros(count)
-    start[4:] = k1
-    R_cam_from_ref = cam_from_ref.as_matrix()
-
-    def residual(p: Floats) -> Floats:
-        # As `Camera.pixels`, without its checks: this runs a hundred times a frame.
-        x, y, z = Rotation.from_rotvec(p[:3]).as_matrix() @ R_cam_from_ref @ vectors_ref.T
-        tangent = np.column_stack([x, y]) / np.maximum(z, BEHIND)[:, None]
-        radial = 1 + (p[4] if count == 5 else k1) * np.sum(tangent**2, axis=1)
-        pixels = camera.focal_px * np.exp(p[3]) * radial[:, None] * tangent + camera.center_px
-        return (pixels - xy_px).ravel()
-
-    # Rotation (rad), log focal length, k1
-    scale = np.array([1e-3, 1e-3, 1e-3, 1e-2, 0.3])[:count]
-    found = fit_soft_l1(residual, start, scale, CONVERGED_FALL)
-    k1 = float(found[4]) if count == 5 else k1
-    lens = replace(
-        camera,
-        focal_px=camera.focal_px * float(np.exp(found[3])),
-        distortion=(k1, 0.0, 0.0, 0.0, 0.0),
-    )
-    return lens, Rotation.from_rotvec(found[:3]) * cam_from_ref

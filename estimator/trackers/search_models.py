@@ -7,6 +7,9 @@ from estimator.identification.star_search import WRONG_FOCAL
 # Least centroid error of a star, for a calibrated lens and the catalog's positions
 MIN_ERROR_PX = 0.005
 
+# Largest error of an uncertain focal length, in units of the uncertainty that was given: users give round numbers.
+FOCAL_MARGIN = 1.1
+
 
 class SearchModel(NamedTuple):
     """Error model and effort of one search.
@@ -23,6 +26,8 @@ class SearchModel(NamedTuple):
         Whether quads are searched in place of pairs
     focal_uncertainty
         Relative uncertainty of the focal length, if it is larger than that of the tracker
+    aspect
+        Assumed width over height of a pixel, relative to the camera's
     """
 
     min_error_px: float
@@ -30,12 +35,15 @@ class SearchModel(NamedTuple):
     max_checks: int
     by_quads: bool = False
     focal_uncertainty: float = 0.0
+    aspect: float = 1.0
 
 
 WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, WRONG_FOCAL)
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
     WRONG_FOCAL_SEARCH,
+    # A wrong camera model: `lens_fit` then extends the match.
+    SearchModel(0.5, 0.003, 50_000),
     SearchModel(MIN_ERROR_PX, 0.0, 400_000),
 )
 UNCALIBRATED_SEARCHES = (
@@ -44,6 +52,7 @@ UNCALIBRATED_SEARCHES = (
     SearchModel(0.5, 0.0, 100_000, True),
     SearchModel(1.0, 0.005, 100_000, True),
     SearchModel(2.0, 0.01, 100_000, True),
+    *(SearchModel(1.0, 0.01, 50_000, True, aspect=ratio) for ratio in (0.93, 1.07)),
     SearchModel(0.5, 0.0, 100_000),
     SearchModel(1.0, 0.005, 200_000),
     SearchModel(2.0, 0.01, 100_000),

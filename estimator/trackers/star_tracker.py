@@ -3,9 +3,10 @@
 The stages are detection and centroiding (`pipeline`), identification, and solution. The default identifier computes
 identity, attitude and covariance in one step by Bayesian evidence, from quads of stars
 (`identification/star_quads.py`) and then from pairs (`identification/star_search.py`). If the focal length is
-uncertain, the longer search by quads is first, and the focal length and the first radial distortion coefficient are
-fitted to each frame's stars. Quads also find a calibrated focal length that is wrong. The candidates of a published
-identifier (`registry`) are matched to the full catalog, refined, and accepted if the match is significant.
+uncertain, the longer search by quads is first, and the camera is fitted to each frame's stars (`lens_fit`), as it is
+where a calibrated camera does not fit the whole field. Quads also find a calibrated focal length that is wrong. The
+candidates of a published identifier (`registry`) are matched to the full catalog, refined, and accepted if the match
+is significant.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
+from estimator.attitude.wahba import matrix_of
 from estimator.catalog import catalog, index_file, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
@@ -50,13 +52,13 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
 )
-from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
+from estimator.trackers.refinement import NO_MATCH, SHEARED, FieldMatcher
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
+    FOCAL_MARGIN,
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
-    WRONG_FOCAL_SEARCH,
     SearchModel,
 )
 
@@ -142,9 +144,7 @@ class StarTracker(FrameTracker):
                 bright, longest_rad, magnitude=None if unknown else magnitude
             )
             patterns = len(self.index.pair)
-        self.field_matcher = FieldMatcher(
-            camera, self.stars, self.sky, settings, focal_uncertainty, patterns
-        )
+        self.field_matcher = FieldMatcher(camera, self.stars, focal_uncertainty, patterns)
 
     @functools.cached_property
     def sensor(self) -> Sensor:
@@ -160,6 +160,7 @@ class StarTracker(FrameTracker):
             field,
             np.nan if zero_mag is None else zero_mag,
             self.settings.magnitude_sigma,
+            self.camera.aspect,
         )
 
     @functools.cached_property
@@ -357,7 +358,7 @@ class StarTracker(FrameTracker):
                 # The paper's rule has accepted this match: it is not tested with the whole field.
                 attitude = self.solve_matches(centroids, match.observed, match.star)
             else:
-                attitude = self.field_matcher.refine(centroids, camera, match.cam_from_ref)
+                attitude = self._in_field(centroids, camera, match)
             clock.lap("solve")
             if attitude.solved:
                 return attitude
@@ -372,6 +373,25 @@ class StarTracker(FrameTracker):
             settings.cos_error,
         )
         return Attitude(f"{NO_MATCH}: {why}")
+
+    def _in_field(self, centroids: Centroids, camera: Camera, match: StarMatch) -> Attitude:
+        """Solve the candidate of a published identifier with the whole field and, if it is uncertain, with the lens."""
+        matcher = self.field_matcher
+        candidate = Solution(
+            match.observed,
+            match.star,
+            match.cam_from_ref.as_quat(),
+            np.zeros((3, 3)),
+            camera.focal_px / self.camera.focal_px,
+            0.0,
+            1.0,
+            -match.log10_chance,
+        )
+        sigma_px = self.sigma_px(centroids, 0.0)
+        weight = self.detections(centroids, sigma_px).weight
+        refitted = matcher.with_lens(candidate, centroids, weight, 1.0, False)
+        reason = matcher.reason_against(refitted, centroids)
+        return Attitude(reason) if reason else self.attitude_of(centroids, refitted, sigma_px)
 
     def solve_matches(self, centroids: Centroids, observed: Ints, star: Ints) -> Attitude:
         """Solve the attitude for given matches from any source (the truth included), without identification.
@@ -395,15 +415,29 @@ class StarTracker(FrameTracker):
         )
         xy_px = centroids.xy_px[observed]
         vectors = self.stars.vectors[star]
-        sigma_rad = self.sigma_px(centroids)[observed] / self.camera.focal_px
+        sigma_px = self.sigma_px(centroids)
+        sigma_rad = sigma_px[observed] / self.camera.focal_px
         solver = self.settings.solver
+        rays = self.camera.rays(xy_px)
         try:
-            cam_from_ref = SOLVERS[solver](self.camera.rays(xy_px), vectors, sigma_rad)
+            cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
-        # Covariance, with the errors that the residuals imply
-        match = StarMatch(observed, star, cam_from_ref, float("nan"), self.stars.v_mag[star])
-        return solved_attitude(match, vectors, xy_px, self.camera, sigma_rad, solver, 3)
+        # Errors that the residuals imply
+        residual_px = self.camera.pixels(cam_from_ref.apply(vectors)) - xy_px
+        chi2 = float(np.sum((residual_px / sigma_px[observed, None]) ** 2))
+        variance = variance_factor(chi2, max(2 * len(star) - 3, 1))
+        solution = Solution(
+            observed,
+            star,
+            cam_from_ref.as_quat(),
+            covariance(rays, np.sqrt(variance) * sigma_rad, solver),
+            1.0,
+            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            chi2,
+            float("nan"),
+        )
+        return self.attitude_of(centroids, Refit(solution, self.camera, variance), sigma_px)
 
     def sigma_px(
         self,
@@ -437,7 +471,7 @@ class StarTracker(FrameTracker):
         focal_uncertainty
             Relative uncertainty of the focal length, if it is larger than that of the tracker
         """
-        uncertainty = max(self.focal_uncertainty, focal_uncertainty)
+        uncertainty = max(FOCAL_MARGIN * self.focal_uncertainty, focal_uncertainty)
         return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_by_evidence(
@@ -447,49 +481,32 @@ class StarTracker(FrameTracker):
 
         Each search, until one gives an attitude:
 
-        1. Search with this model of the errors (`_search`). With a calibrated camera and residuals that are too large,
-           also search for a wrong focal length.
+        1. Search with this model of the errors (`_search`).
         2. Match and fit again by the residuals (`refit`).
-        3. Drop the solution of a calibrated camera that fits only a part of the field, and a sheared field.
-        4. With an uncertain focal length, fit the lens to all stars, unless an undistorted one explains the solution.
-           If that fit fails, a search without relative_error returns the solution; otherwise the next search follows.
+        3. Drop the solution if the camera model fits only a part of the field or a sheared one; with a fitted camera,
+           also a field of view outside of its bounds, and a match that is not beyond chance.
         """
+        status = NO_MATCH
         for model in searches:
             # 1. Search
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution, variance = self._search(centroids, sigma_px, model)
-            calibrated = not (self.focal_uncertainty or model.by_quads)
-            if calibrated and not variance and misfit.residuals_too_great(solution):
-                # With a wrong focal length a part of the stars may match, at a wrong attitude.
-                other, _ = self._search(centroids, sigma_px, WRONG_FOCAL_SEARCH)
-                if other.dex > solution.dex + star_search.WRONG_FOCAL_DEX:
-                    solution = other
             clock.lap("identify")
             if not len(solution.star):
                 continue
             # 2. Residuals
             refitted = self.refit(centroids, solution, sigma_px, variance)
             # 3. Wrong camera model
-            partial = not self.focal_uncertainty and self.field_matcher.misfits(
-                refitted.solution, centroids
-            )
-            if partial or refitted.sheared:
-                continue
-            attitude = self.attitude_of(centroids, refitted, sigma_px)
-            # 4. Lens
-            if self.focal_uncertainty and not (
-                model.min_error_px == MIN_ERROR_PX
-                and self.field_matcher.fits(solution, centroids, sigma_px)
-            ):
-                zoomed = self.camera.zoomed(solution.focal_ratio)
-                start = Rotation.from_quat(solution.cam_from_ref_xyzw)
-                fitted = self.field_matcher.refine(centroids, zoomed, start)
-                if fitted.solved or model.relative_error:
-                    attitude = fitted
-            clock.lap("solve")
-            if attitude.solved:
+            reason = self.field_matcher.reason_against(refitted, centroids)
+            if not reason:
+                attitude = self.attitude_of(centroids, refitted, sigma_px)
+                clock.lap("solve")
                 return attitude
-        return Attitude(NO_MATCH)
+            status = reason if status == NO_MATCH else status
+            clock.lap("solve")
+            if reason == SHEARED:
+                break
+        return Attitude(status)
 
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
@@ -510,6 +527,7 @@ class StarTracker(FrameTracker):
             return star_quads.quads_or_pairs(detections, *index, *effort), 0.0
         if not model.by_quads:
             return star_search.lost_in_space(detections, self.sky, *effort), 0.0
+        detections = detections._replace(tangent=detections.tangent / [1.0, model.aspect])
         found = star_quads.identify(detections, *index, *effort, not self.focal_uncertainty)
         return found, 0.0
 
@@ -520,7 +538,12 @@ class StarTracker(FrameTracker):
         sigma_px: Floats,
         variance: float = 0.0,
     ) -> Refit:
-        """Return a solution with the errors and, of a calibrated global shutter, the lens that its residuals imply.
+        """Return a solution with the errors and the camera that its residuals and the field imply.
+
+        1. Match again with the errors of most evidence (`misfit`).
+        2. Fit the camera with the match of the whole field (`FieldMatcher.with_lens`), unless the camera model explains
+           the solution. That of a calibrated camera is doubted if the errors are larger than claimed, or if stars just
+           miss detections.
 
         Parameters
         ----------
@@ -529,27 +552,50 @@ class StarTracker(FrameTracker):
         variance
             Factor of the variances if the solution has been matched again already; else 0
         """
+        matcher = self.field_matcher
         same_focal = solution.focal_ratio == 1
         camera = self.camera if same_focal else self.camera.zoomed(solution.focal_ratio)
-        if not len(solution.star) or 0 < variance < misfit.TELLING:
-            return Refit(solution, camera, variance or 1.0)
+        if not len(solution.star):
+            return Refit(solution, camera, 1.0)
+        # 1. Errors
         uncertainty = 0.0 if same_focal else star_search.WRONG_FOCAL
         detections = self.detections(centroids, sigma_px, uncertainty)
+        own_px = self.sigma_px(centroids)
+        exact = np.array_equal(own_px, sigma_px)
+        known = exact and not self.focal_uncertainty
         if not variance:
-            solution, detections = misfit.with_companions(solution, detections, self.sky)
+            if exact:
+                solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
-            if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
+            whole = len(solution.star) == len(centroids)
+            if whole and solution.chi2 < misfit.DOUBTFUL and known:
                 return Refit(solution, camera, 1.0)
-        if self.focal_uncertainty or self.camera.row_time_s:
-            # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
-            dof = max(2 * len(solution.star) - 4, 1)
-            variance = variance_factor(dof * solution.chi2, dof)
-            scaled = solution._replace(covariance_rad2=variance * solution.covariance_rad2)
-            return Refit(scaled, camera, variance)
-        fit_lens = not self.camera.focal_sigma
-        return misfit.refit(
-            solution, detections, self.sky, camera, centroids.xy_px, fit_lens, variance
-        )
+            if known and not self.camera.row_time_s:
+                R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+                solution, variance = misfit.widened(
+                    solution, R_cam_from_ref, detections, self.sky
+                )
+            else:
+                # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
+                dof = max(2 * len(solution.star) - 4, 1)
+                variance = variance_factor(dof * solution.chi2, dof)
+                scaled = variance * solution.covariance_rad2
+                solution = solution._replace(covariance_rad2=scaled)
+        # 2. Camera
+        weight = detections.weight if exact else self.detections(centroids, own_px).weight
+        if self.focal_uncertainty:
+            fits = exact and matcher.fits(solution, centroids, weight)
+        else:
+            fixed = bool(self.camera.focal_sigma or self.camera.row_time_s)
+            few = len(solution.star) < misfit.LENS_MATCHES
+            small = exact and variance < misfit.TELLING
+            fits = (
+                fixed or few or (small and not matcher.misfits(camera, solution, centroids))
+            )
+        if fits:
+            return Refit(solution, camera, variance)
+        start = variance if known else 1.0
+        return matcher.with_lens(solution, centroids, weight, start, exact)
 
     def attitude_of(
         self, centroids: Centroids, refitted: Refit, sigma_px: Floats

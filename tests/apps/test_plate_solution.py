@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -19,8 +21,10 @@ import skysim
 from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Clock
+from estimator.trackers.star_tracker import StarTracker
 from skysim.apps import plate_solver
 from skysim.apps.cli import main
+from skysim.apps.plate_solver.plate_solution import camera_notes
 from skysim.apps.plate_solver.solver import solve_centroids
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
@@ -48,7 +52,9 @@ def turning(count: int) -> tuple[list[np.ndarray], Rotation]:
 
 
 @pytest.mark.parametrize("flipped", [False, True])
-@pytest.mark.parametrize("camera", [PLAIN, CAMERA])
+@pytest.mark.parametrize(
+    "camera", [PLAIN, CAMERA, replace(PLAIN, aspect=0.93), replace(CAMERA, aspect=1.04)]
+)
 def test_astropy_reads_the_header_to_a_tenth_of_an_arcsecond(
     camera: Camera, flipped: bool
 ) -> None:
@@ -65,6 +71,30 @@ def test_astropy_reads_the_header_to_a_tenth_of_an_arcsecond(
     ).T
     found = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     assert np.linalg.norm(found - expected, axis=1).max() < 0.1 * ARCSEC_RAD
+
+
+@pytest.mark.parametrize("aspect", [0.96, 1.04])
+def test_pixels_that_are_not_square_are_fitted_and_noted(
+    tmp_path: Path, aspect: float
+) -> None:
+    """A picture that is stretched along one of its sides."""
+    frame, truth = render(loader.load("shefex2", {"exposure.frames": "1"}), 0)[:2]
+    height, width = frame.image_dn.shape
+    stretched = max(aspect, 1.0) * height, max(1 / aspect, 1.0) * width
+    size_px = round(stretched[1]), round(stretched[0])
+    path = tmp_path / "frame.png"
+    cv2.imwrite(str(path), cv2.resize(frame.image_dn, size_px))
+    field_deg = np.degrees(2 * np.arctan((width - 1) / 2 / (25 / 9.9e-3)))
+    found = skysim.solve(path, fov_deg=1.02 * field_deg, time_utc=datetime(2012, 6, 22, 21))
+    assert found.status == "solved"
+    assert found.pixel_aspect == pytest.approx(aspect, abs=3e-3)
+    noted = re.search(r"pixel aspect ([0-9.]+)", found.hint)
+    assert noted is not None
+    assert float(noted[1]) == pytest.approx(aspect, abs=3e-3)
+    turn = Rotation.from_quat(found.cam_from_icrs_xyzw) * truth.cam_from_lab.inv()
+    assert turn.magnitude() < 1e-3
+    wider = replace(PLAIN, focal_px=0.9 * PLAIN.focal_px)
+    assert "field differs by" in camera_notes(wider, StarTracker.for_sky(PLAIN))[0]
 
 
 def test_a_solution_has_the_attitude_its_covariance_and_the_stars(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from skysim.apps.plate_solver.dome_pictures import (
 from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
+    camera_notes,
     solution_fields,
     wcs_header,
 )
@@ -484,13 +485,15 @@ def outcome_fields(
         solved = solution_fields(report) | attitude_fields(
             report, outcome.tracker, solver.stars
         )
-        return seen | solved | {"hint": assumption}
+        assert report.attitude.camera is not None
+        notes = camera_notes(report.attitude.camera, outcome.tracker)
+        return seen | solved | {"hint": "; ".join([assumption] * bool(assumption) + notes)}
     rows_known = len({one.flipped for one in outcome.tried}) == 1
     refusal = diagnosis.Refusal(
         pixels, report.centroids, tuple(solvers), date_utc, rows_known
     )
-    notes = outcome.tried[0].assumption
-    hint = diagnosis.likely_cause(refusal) + f" ({notes})" * bool(notes)
+    assumed = outcome.tried[0].assumption
+    hint = diagnosis.likely_cause(refusal) + f" ({assumed})" * bool(assumed)
     return seen | {"hint": hint}
 
 

@@ -14,6 +14,8 @@ from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 
+NOTED_STRETCH = 0.002  # relative to square pixels
+
 
 @dataclass(frozen=True, slots=True)
 class PlateSolution:
@@ -32,7 +34,9 @@ class PlateSolution:
     covariance_rad2
         3 rows of the covariance of the small rotation about the camera axes
     focal_px, center_px, distortion
-        Fitted camera: focal length, principal point, and k1, k2, p1, p2, k3 in OpenCV's order
+        Fitted camera: focal length along x, principal point, and k1, k2, p1, p2, k3 in OpenCV's order
+    pixel_aspect
+        Width over height of a pixel
     log10_chance
         Logarithm of the expected number of equally good chance matches
     matches
@@ -64,6 +68,7 @@ class PlateSolution:
     focal_px: float | None = None
     center_px: tuple[float, float] | None = None
     distortion: tuple[float, ...] | None = None
+    pixel_aspect: float | None = None
     log10_chance: float | None = None
     matches: int = 0
     rms_arcsec: float | None = None
@@ -133,12 +138,24 @@ def attitude_fields(
         "focal_px": attitude.camera.focal_px,
         "center_px": attitude.camera.center_px,
         "distortion": attitude.camera.distortion,
+        "pixel_aspect": attitude.camera.aspect,
         "log10_chance": attitude.match.log10_chance,
         "stars": tuple(
             dict(zip(columns, row, strict=True))
             for row in zip(*columns.values(), strict=True)
         ),
     }
+
+
+def camera_notes(fitted: Camera, tracker: StarTracker) -> list[str]:
+    """What a fitted camera has that was not given: pixels that are not square, a field outside of its bounds."""
+    notes = []
+    if abs(fitted.aspect / tracker.camera.aspect - 1) > NOTED_STRETCH:
+        notes.append(f"pixel aspect {fitted.aspect:.3f} (width over height)")
+    wider = fitted.fov_rad / tracker.camera.fov_rad - 1
+    if abs(wider) > tracker.focal_uncertainty:
+        notes.append(f"the field differs by {100 * wider:+.1f} % from the one given")
+    return notes
 
 
 def star_name(number: int) -> str:
@@ -168,6 +185,12 @@ def wcs_header(attitude: Attitude, flipped: bool) -> Any:
     size_px = camera.width_px, camera.height_px
     lens = OpencvCalibration(*size_px, camera.focal_px, camera.center_px, camera.distortion)
     cards = wcs.header(lens, attitude.cam_from_ref)
+    # From square pixels to the camera's: y is longer by the aspect.
+    for name in cards:
+        if name in ("CD1_2", "CD2_2"):
+            cards[name] /= camera.aspect
+        elif name[0] in "AB" and name[-1].isdigit():
+            cards[name] *= camera.aspect ** (name.startswith("B") - int(name[-1]))
     if flipped:
         cards["CRPIX2"] = camera.height_px + 1 - cards["CRPIX2"]
         for name in cards:

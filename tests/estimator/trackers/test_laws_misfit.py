@@ -131,7 +131,7 @@ def test_wider_errors_in_closed_form_match_the_full_evaluation(
     assert quick.chi2 == pytest.approx(slow.chi2, rel=1e-2)
 
 
-@law(misfit.refit, misfit.with_lens, misfit.variance_of, StarTracker.refit, slow=True)
+@law(StarTracker.refit, slow=True)
 @given(seed=some.integers(0, 10**6), claimed=some.floats(0.2, 3.0))
 def test_the_covariance_is_never_below_the_model_s(
     tracker: StarTracker, seed: int, claimed: float
@@ -142,6 +142,3 @@ def test_the_covariance_is_never_below_the_model_s(
         seen = centroids.take(answer.match.observed)
         model = covariance(CAMERA.rays(seen.xy_px), tracker.sigma_px(seen) / CAMERA.focal_px)
         assert (np.diag(answer.covariance_rad2) > 0.8 * np.diag(model)).all()
-    residual = np.random.default_rng(seed).standard_normal((50, 2)) / claimed
-    assert misfit.variance_of(residual, 3) >= 1
-    assert claimed > 0.5 or abs(misfit.variance_of(residual, 3) * claimed**2 - 1) < 0.8
