@@ -352,7 +352,7 @@ class StarTracker(FrameTracker):
             self.camera,
             self.index,
             self.focal_uncertainty,
-            settings.centroid_sigma_px,
+            settings.searched_sigma_px,
             settings.acceptance,
             cos_error=settings.cos_error,
             compared=compared,
@@ -423,7 +423,7 @@ class StarTracker(FrameTracker):
         distance from the image center. The error of a calibrated focal length is the least relative_error.
         """
         sigma_px = np.hypot(
-            centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px)
+            centroids.sigma_px, max(self.settings.searched_sigma_px, min_error_px)
         )
         relative_error = max(relative_error, self.camera.focal_sigma)
         if relative_error == 0:
@@ -543,7 +543,7 @@ class StarTracker(FrameTracker):
             solution, detections = misfit.with_companions(solution, detections, self.sky)
             # A few stars may fit by luck within gates that are too narrow for the others.
             if len(solution.star) == len(centroids) and solution.chi2 < misfit.DOUBTFUL:
-                return Refit(solution, camera, 1.0)
+                return Refit(solution, camera, 1.0, detections=detections)
         if self.focal_uncertainty or self.camera.row_time_s:
             # The lens or the rate is fitted afterwards: matches beyond the gate belong to it.
             dof = max(2 * len(solution.star) - 4, 1)
@@ -559,7 +559,21 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, refitted: Refit, sigma_px: Floats
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
-        solution, camera, variance, _ = refitted
+        solution, camera, variance, _, detections = refitted
+        lens_is_fitted = camera.distortion != self.camera.distortion
+        if self.settings.centroid_sigma_px is None and not lens_is_fitted:
+            sigma_px = self.sigma_px(centroids)
+            if detections is None:
+                uncertainty = 0.0 if solution.focal_ratio == 1 else star_search.WRONG_FOCAL
+                detections = self.detections(centroids, sigma_px, uncertainty)
+            searched_px = self.settings.searched_sigma_px
+            solution, floor_px2 = misfit.with_floor(
+                solution, detections, self.sky, searched_px, self.camera.focal_px
+            )
+            variance = 1.0
+            sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
+            if solution.focal_ratio != 1:
+                camera = self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         common_rad2 = None
