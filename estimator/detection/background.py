@@ -98,7 +98,7 @@ def cleaned(
     """
     blobs = detect(image, *options, priors)
     # 1. Sky
-    if is_steep(blobs.background):
+    if is_steep(blobs.background.level, blobs.background.noise):
         image = flattened(image, priors.saturation)
         blobs = detect(image, *options, priors)
     # 2. Smear
@@ -108,11 +108,12 @@ def cleaned(
     return image, blobs
 
 
-def is_steep(background: Background) -> bool:
+@jit
+def is_steep(level: Floats, noise: Floats) -> bool:
     """Return whether the level changes by more than the noise from one tile to the next in a part of the frame."""
-    level = background.level
-    change = np.abs(np.diff(level, axis=0)[:, 1:]) + np.abs(np.diff(level, axis=1)[1:])
-    return np.count_nonzero(change > background.noise[1:, 1:]) > STEEP * change.size
+    corner = level[1:, 1:]
+    change = np.abs(corner - level[:-1, 1:]) + np.abs(corner - level[1:, :-1])
+    return bool(np.count_nonzero(change > noise[1:, 1:]) > STEEP * change.size)
 
 
 def flattened(image: NDArray, saturation: float) -> NDArray:

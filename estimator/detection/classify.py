@@ -53,7 +53,7 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
     out = np.zeros(len(boxes), bool)
     heights = boxes[:, 3] - boxes[:, 1]
     middle = (boxes[:, :2] + boxes[:, 2:]) / 2
-    for n in np.flatnonzero(heights + 1 >= MIN_HEIGHT_PX):
+    for n in np.flatnonzero(heights + 1 >= MIN_HEIGHT_PX).tolist():
         if out[n]:
             continue
         # 1. Line of text
@@ -368,14 +368,14 @@ def _count_pieces(lines: Floats, x: float, y: float) -> int:
     along = lines[:, 0] * x + lines[:, 1] * y
     across = np.abs(lines[:, 1] * x - lines[:, 0] * y)
     longest = (1 + SAME_LINE) * (x * x + y * y)
-    return np.count_nonzero((across < SAME_LINE * along) & (along < longest))
+    return int(np.count_nonzero((across < SAME_LINE * along) & (along < longest)))
 
 
 @jit
 def _count_same(lines: Floats, x: float, y: float) -> int:
     """Return the number of lines that differ from the line (x, y) by less than SAME_LINE of it."""
     off = np.hypot(lines[:, 0] - x, lines[:, 1] - y)
-    return np.count_nonzero(off < SAME_LINE * hypot(x, y))
+    return int(np.count_nonzero(off < SAME_LINE * hypot(x, y)))
 
 
 @jit

@@ -128,8 +128,10 @@ def _classified(
     if blobs.streak_px is None:
         # 3. Round stars or too few. With very few stars, the others may be streaks too faint for the round filter.
         stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR & priors.reject == 0))
-        large = np.any(blobs.area_px >= LARGE_PX) or is_steep(background)
+        large = np.any(blobs.area_px >= LARGE_PX)
         if priors.streak_px is not None or stars >= FEW_STARS or large:
+            return blobs
+        if is_steep(background.level, background.noise):
             return blobs
         faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
         if len(faint) <= stars + 1:
@@ -368,19 +370,19 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
         raise ImageError(
             f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels"
         )
-    bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    bad = np.zeros(image.shape, bool)
+    bad[y, x] = True
     # A wider neighborhood only if the near one has no good pixel
-    for column, row in bad:
+    for column, row in zip(x.tolist(), y.tolist(), strict=True):
         for reach in (1, 2):
-            good = [
-                image[v, u]
-                for v in range(max(row - reach, 0), min(row + reach + 1, height))
-                for u in range(max(column - reach, 0), min(column + reach + 1, width))
-                if (u, v) not in bad
+            near = np.s_[
+                max(row - reach, 0) : row + reach + 1,
+                max(column - reach, 0) : column + reach + 1,
             ]
-            if good:
+            good = image[near][~bad[near]]
+            if len(good):
                 break
-        repaired[row, column] = np.median(good if good else image[::8, ::8])
+        repaired[row, column] = np.median(good if len(good) else image[::8, ::8])
     return repaired
 
 

@@ -166,18 +166,15 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     chi2 / 2 (1 - 1 / v) + (p / 2 - n) ln v.
     """
     count = len(solution.star)
-    dex = np.empty(len(TRIED))
-    best = 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
-    for n in range(len(TRIED)):
-        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (
-            parameters / 2 - count
-        ) * log10(TRIED[n])
-        dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
-        best = n if dex[n] > dex[best] else best
-    variance = _mean_factor(dex, dex[best])
-    best_dex = dex[best] - (PRIOR_WRONG_DEX if best else 0.0)
-    return with_errors(solution, variance, solution.chi2 / TRIED[best], best_dex), variance
+    gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED)
+    gain_dex += (parameters / 2 - count) * np.log10(TRIED)
+    found_dex = gain_dex.copy()
+    gain_dex[1:] += PRIOR_WRONG_DEX
+    best = np.argmax(gain_dex)
+    variance = _mean_factor(gain_dex, gain_dex[best])
+    dex = solution.dex + found_dex[best]
+    return with_errors(solution, variance, solution.chi2 / TRIED[best], dex), variance
 
 
 @jit
