@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,15 @@ from skysim.core.paths import CATALOGS
 from skysim.results.metrics import WRONG_RAD
 from tests.helpers.drawn_frames import SETUPS, CameraSetup, render
 
+# Bright stars with readout smear, by the light of the shift over that of the exposure, and dawn up to saturation
+BRIGHT = replace(SETUPS[1], zero_e=40 * SETUPS[1].zero_e)
+HOSTILE = (
+    *(
+        replace(BRIGHT, name=f"readout smear of {100 * share:g} %", leak=share / 1024)
+        for share in (0.06, 0.5)
+    ),
+    replace(SETUPS[1], name="dawn up to saturation", zero_e=4 * SETUPS[1].zero_e, dawn_e=8e4),
+)
 Solve = Callable[[NDArray], Rotation | None]
 
 
@@ -127,7 +137,7 @@ def scores(
 ) -> Iterator[tuple[CameraSetup, dict[str, dict[str, float]]]]:
     """Each set-up with the scores of its solvers."""
     stars = catalog.read(CATALOGS / "hipparcos_hp6.5.ecsv")
-    for setup in SETUPS:
+    for setup in SETUPS + HOSTILE:
         deep = catalog.brighter_than(stars, setup.deepest)
         frames = [render(setup, deep, np.random.default_rng([seed, n])) for n in range(count)]
         solvers = {

@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
+from scipy.spatial.transform import Rotation
 
 from benchmarks.lost_in_space import DENSE, SHEFEX, Field, Workload, field
 from benchmarks.rolling import row
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
+from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.results import metrics
@@ -74,6 +76,53 @@ WORKS = tuple(
 )
 
 
+# True floors of the centroids' errors, their own noise, and numbers of stars, for the default settings
+FLOORS_PX = 0.01, 0.03, 0.1, 0.3
+OWN_PX = 0.01, 0.1, 0.5
+STARS = 4, 6, 10, 30
+
+
+def floors(count: int) -> list[dict[str, Any]]:
+    """Rows of the default settings, whose floor is estimated from each frame: all floors and noises together."""
+    work = WORKS[-1]
+    camera = work.camera
+    stars = catalog.brighter_than(catalog.hipparcos(), work.limit_mag)
+    tracker = StarTracker(camera, stars, stars.vectors, Settings(zero_point_mag=0.0))
+    rows = []
+    for kept in STARS:
+        for floor_px in FLOORS_PX:
+            frames = (
+                lights(
+                    stars, camera, kept, floor_px, own_px, np.random.default_rng([SEED, n])
+                )
+                for own_px in OWN_PX
+                for n in range(count)
+            )
+            name = f"floor of {floor_px:g} px by the frame, {kept} stars"
+            rows += _rows(name, scores(tracker, frames), count * len(OWN_PX))
+    return rows
+
+
+def lights(
+    stars: catalog.StarCatalog,
+    camera: Camera,
+    kept: int,
+    floor_px: float,
+    own_px: float,
+    rng: np.random.Generator,
+) -> Field:
+    """The brightest stars of a random field that has as many, with noise that is told and a floor that is not."""
+    inside = np.empty(0, int)
+    while len(inside) < kept:
+        truth = Rotation.random(rng=rng)
+        xy_px = np.nan_to_num(camera.pixels(truth.apply(stars.vectors)), nan=-1e9)
+        inside = np.flatnonzero(camera.contains(xy_px, 5.0))[:kept]
+    sigma_px = own_px * rng.uniform(0.5, 1.5, kept)
+    error_px = np.hypot(sigma_px, floor_px)[:, None] * rng.standard_normal((kept, 2))
+    light = 10 ** (-0.4 * stars.v_mag[inside])
+    return Field(Centroids(xy_px[inside] + error_px, sigma_px, light), truth, inside)
+
+
 def measure(
     works: tuple[Workload, ...] = WORKS,
     conditions: tuple[Condition, ...] = CONDITIONS,
@@ -95,7 +144,7 @@ def measure(
                 for n in range(count)
             )
             rows += _rows(f"{work.name}, {condition.name}", scores(tracker, frames), count)
-    return rows
+    return rows + floors(count // 2)
 
 
 def scores(tracker: StarTracker, frames: Iterator[Field]) -> Floats:

@@ -21,6 +21,7 @@ PRIORS = {
     "saturation": Allowed(-np.inf, np.inf, "a number; inf if unknown"),
     "turn_rad": Allowed(-1e300, 1e300, "a finite number"),
     "intensity_threshold": Allowed(1e-300, 1.0, "above 0, up to 1"),
+    "reject": Allowed(-1, 1e9, "bits of detection.classify.Flag, or -1", True),
 }
 
 
@@ -40,6 +41,9 @@ class FramePriors:
         streak_px; as in Blobs
     intensity_threshold
         Threshold of the detector `thesis`, as a share of full scale
+    reject
+        Flags of `detection.classify.Flag` whose blobs are no stars; -1: all of NO_STAR. Text is searched only if its
+        flag is among them
 
     Raises
     ------
@@ -51,6 +55,7 @@ class FramePriors:
     saturation: float = float("inf")
     turn_rad: float = 0.0
     intensity_threshold: float = THESIS_INTENSITY
+    reject: int = -1
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "streak_px", checks.pixel_step("streak_px", self.streak_px))
@@ -143,6 +148,8 @@ class Blobs:
     turn_rad
         Rotation of the stars about the frame's center c during the exposure, from the pixels' x
         to y: a star at (x, y) is smeared by streak_px + turn_rad (c_y - y, x - c_x)
+    highest_px
+        Height of the highest box among all blobs that were found; a column of readout smear is as high as the frame
     """
 
     box_px: Ints
@@ -154,6 +161,7 @@ class Blobs:
     flag: Ints
     streak_px: Step | None = None
     turn_rad: float = 0.0
+    highest_px: int = 0
 
     def __len__(self) -> int:
         return len(self.flux)

@@ -12,13 +12,18 @@ Between the tile centers level and noise are interpolated bilinearly (`interpola
 The noise is measured on the filtered image. For white noise it is FILTERED_NOISE times the noise of a raw pixel.
 """
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter, uniform_filter
 
 from estimator.core.checks import Floats
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.jit import jit
-from estimator.core.types import Background
+from estimator.core.types import Background, Blobs, FramePriors
 
 TILE_PX = 64
 SAMPLE_ROWS = (
@@ -30,6 +35,15 @@ INITIAL_SAMPLES = (
 CLIP_SIGMA = 3.0
 # Variance of a unit Gaussian truncated at 3 sigma: 1 - 6 phi(3) / (2 Phi(3) - 1).
 CLIPPED_VARIANCE = 0.9733
+# Share of the tiles beside which the level changes by more than the noise in a steep sky
+STEEP = 0.05
+# Bins of pixels, and squares of bins, in which a steep sky is measured; the share of saturated bins in them
+BIN_PX = 4
+WINDOW = 5
+CROWDED = 0.5
+TINY = 1e-6
+HIGH = 0.125  # height of a blob over the frame's that may be a column of readout smear
+SMEAR_ROWS = 128  # rows from which the smear of a column is estimated
 FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of floats
 # Ratio of the standard deviations of white noise after and before the binomial filter: (1 + 4 + 1) / 16.
 FILTERED_NOISE = 0.375
@@ -74,19 +88,133 @@ def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
     )
 
 
+def cleaned(
+    detect: Callable[..., Blobs], image: NDArray, priors: FramePriors, *options: Any
+) -> tuple[NDArray, Blobs]:
+    """Return the blobs that a detector finds, and their image without a steep sky and without readout smear.
+
+    1. If the sky is steep, subtract a finer model of it (`flattened`).
+    2. If there are high blobs, as the columns of bright stars, subtract the smear (`without_smear`).
+    """
+    blobs = detect(image, *options, priors)
+    # 1. Sky
+    if is_steep(blobs.background.level, blobs.background.noise):
+        image = flattened(image, priors.saturation)
+        blobs = detect(image, *options, priors)
+    # 2. Smear
+    if blobs.highest_px > HIGH * len(image):
+        image, equal = without_smear(image, priors.saturation)
+        blobs = blobs if equal is image else detect(equal, *options, priors)
+    return image, blobs
+
+
+@jit
+def is_steep(level: Floats, noise: Floats) -> bool:
+    """Return whether the level changes by more than the noise from one tile to the next in a part of the frame."""
+    corner = level[1:, 1:]
+    change = np.abs(corner - level[:-1, 1:]) + np.abs(corner - level[1:, :-1])
+    return bool(np.count_nonzero(change > noise[1:, 1:]) > STEEP * change.size)
+
+
+def flattened(image: NDArray, saturation: float) -> NDArray:
+    """Return the image with a level sky, in its own type: twilight is too steep and too curved for tiles.
+
+    1. Average bins of BIN_PX, and take the means M over squares of WINDOW bins. They are wrong by the curvature of the
+       sky, 2 M - M M is not.
+    2. Replace the light of stars, CLIP_SIGMA above it, by this sky, and average again.
+    3. Subtract the sky. Where more than CROWDED of the bins are saturated there is none to measure: such squares become
+       dark, and all that are as near as the means reach.
+    """
+    # 1. Means
+    height, width = image.shape
+    padding = ((0, -height % BIN_PX), (0, -width % BIN_PX))
+    light = np.pad(image, padding, mode="edge").astype(np.float32)
+    bins = light.reshape(len(light) // BIN_PX, BIN_PX, -1, BIN_PX).mean(axis=(1, 3))
+    mean = partial(uniform_filter, size=WINDOW, mode="nearest")
+    once = mean(bins)
+    sky = 2 * once - mean(once)
+    # 2. Stars
+    excess = bins - sky
+    star = excess > CLIP_SIGMA * np.sqrt(np.maximum(mean(excess * excess), 0.0))
+    once = mean(np.where(star, sky, bins))
+    # 3. Difference
+    excess = _excess(light, (2 * once - mean(once)).astype(float))[:height, :width]
+    top = min(saturation, float(image.max()))
+    full = mean((bins >= top).astype(float)) > CROWDED
+    dark = mean(mean(full.astype(float))) > TINY
+    excess[image >= top] = top
+    dark = np.kron(dark, np.ones((BIN_PX, BIN_PX), bool))[:height, :width]
+    y, x = np.nonzero(dark)
+    noise = (
+        FILTERED_NOISE / 2 * np.quantile(np.abs(excess[~dark][::7]), 0.95) if len(y) else 0.0
+    )
+    excess[y, x] = noise * (-1.0) ** (y // BIN_PX + x // BIN_PX)
+    excess -= min(float(excess.min()), 0.0)
+    return (excess if image.dtype.kind == "f" else np.rint(excess)).astype(image.dtype)
+
+
+@jit
+def _excess(light: NDArray, sky: Floats) -> NDArray:
+    """Return an image less the grid of its sky."""
+    height, width = light.shape
+    out = np.empty_like(light)
+    for y in range(height):
+        for x in range(width):
+            out[y, x] = light[y, x] - interpolate(sky, height, width, y, x)
+    return out
+
+
+def without_smear(image: NDArray, saturation: float) -> tuple[NDArray, NDArray]:
+    """Return the image without the columns of its readout smear, and the same with equal noise in all columns.
+
+    A chip that is read out under light adds to each pixel the same share of its column's light: a bright star has a
+    trail over the whole frame, which joins the blobs of its column. Its photon noise remains when it is subtracted,
+    and a detector with one threshold finds blobs in it.
+
+    1. Average the middle three quarters of the values of each column, which stars do not reach, in SMEAR_ROWS rows.
+    2. Compare it with the median of its neighbors. The column is smeared where it is brighter by more than CLIP_SIGMA.
+    3. Subtract the difference d. Whole numbers become floor((y + 1) d) - floor(y d) at row y, which is d in the mean.
+       Saturated pixels are left.
+    4. Divide the contrast of a smeared column by the ratio of its deviation to that of the median column.
+    """
+    # 1. Columns
+    height = len(image)
+    rows = np.sort(image[:: max(height // SMEAR_ROWS, 1)], axis=0)
+    tail = len(rows) // 8
+    column = rows[tail : len(rows) - tail].mean(axis=0)
+    noise = rows[tail : len(rows) - tail].std(axis=0)
+    # 2. Smear
+    base = median_filter(column, TILE_PX + 1, mode="nearest")
+    excess = column - base
+    smeared = excess > CLIP_SIGMA * SIGMA_PER_MAD * np.median(np.abs(excess))
+    if not smeared.any():
+        return image, image
+    # 3. Difference
+    light = image[:, smeared]
+    less = np.tile(excess[smeared], (height, 1))
+    if image.dtype.kind != "f":
+        less = np.diff(np.floor(np.cumsum(less, axis=0)), axis=0, prepend=0.0)
+    less[light >= saturation] = 0.0
+    plain = image.copy()
+    plain[:, smeared] = light = np.maximum(light - less, image.min())
+    # 4. Noise
+    equal = plain.copy()
+    contrast = np.minimum(np.median(noise) / np.maximum(noise[smeared], 1e-9), 1.0)
+    even = np.rint(base[smeared] + contrast * (light - base[smeared]))
+    equal[:, smeared] = np.where(light >= saturation, light, even)
+    return plain, equal
+
+
 @jit
 def filtered(image: NDArray, y: int, x: int) -> float:
     """Return the 3x3 binomial filter [1 2 1] x [1 2 1] / 16 at one pixel; the edge rows and columns are repeated."""
     height, width = image.shape
-    up = max(y - 1, 0)
-    down = min(y + 1, height - 1)
-    left = max(x - 1, 0)
-    right = min(x + 1, width - 1)
-    total = 4.0 * image[y, x]
-    total += 2.0 * (float(image[up, x]) + image[down, x] + image[y, left] + image[y, right])
-    total += (
-        float(image[up, left]) + image[up, right] + image[down, left] + image[down, right]
-    )
+    total = 0.0
+    for down in range(-1, 2):
+        row = image[min(max(y + down, 0), height - 1)]
+        for right in range(-1, 2):
+            share = (2 - abs(down)) * (2 - abs(right))
+            total += share * float(row[min(max(x + right, 0), width - 1)])
     return total / 16.0
 
 
@@ -183,42 +311,8 @@ def _tiles(
 
 @jit
 def median(values: Floats) -> float:
-    """Return the median of an array without NaN. NumPy's checks of arguments would take longer than a short array."""
-    return _median_in_place(values.flatten())
-
-
-@jit
-def _median_in_place(values: NDArray) -> float:
-    """Return the median of (N,) values by Hoare's selection (C. A. R. Hoare, Comm. ACM 4, 321 (1961)); reorders them.
-
-    Each round partitions the values from `low` to `high` at a pivot, and keeps the part that contains the middle one.
-    """
-    half = len(values) // 2
-    low = 0
-    high = len(values) - 1
-    while low < high:
-        # Partition: values before i are at most the pivot, those after j at least.
-        pivot = values[half]
-        i = low
-        j = high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i = i + 1
-                j = j - 1
-        low = i if j < half else low
-        high = j if half < i else high
-    if len(values) % 2:
-        return values[half]
-    # An even number: the mean of the middle value and the largest one before it
-    below = -np.inf
-    for k in range(half):
-        below = max(below, values[k])
-    return (below + values[half]) / 2 if half else np.nan
+    """Return the median of an array without NaN; outside of compiled code, NumPy's checks would take longer."""
+    return float(np.median(values))
 
 
 @jit

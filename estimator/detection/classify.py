@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
-from estimator.detection.background import FILTERED_NOISE, filtered, interpolate, median
+from estimator.detection.background import FILTERED_NOISE, filtered, interpolate
 
 # Text burned into a picture: dates, names of cameras, exposure times.
 
@@ -39,7 +39,6 @@ UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
 MARGIN = 0.5  # margin around a line of text over the height
 
 
-@jit
 def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
     """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks.
 
@@ -47,85 +46,50 @@ def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
     differ in width, as letters do and disks or streaks do not. What is between them (points, hyphens, parts of letters)
     belongs to it.
 
-    1. Grow a line from each blob that is high enough for a letter (`_grow`).
+    1. Grow a line from each blob that is high enough for a letter (`_line_of_text`).
     2. Accept it if it has enough letters of different widths.
     3. Mark its letters, and the smaller blobs within its box and a margin.
     """
-    out = np.zeros(len(boxes), np.bool_)
-    letter = np.zeros(len(boxes), np.bool_)
-    line = np.empty(4, np.int64)
-    for n in range(len(boxes)):
-        height = boxes[n, 3] - boxes[n, 1] + 1
-        if out[n] or height < MIN_HEIGHT_PX:
+    out = np.zeros(len(boxes), bool)
+    heights = boxes[:, 3] - boxes[:, 1]
+    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
+    for n in np.flatnonzero(heights + 1 >= MIN_HEIGHT_PX).tolist():
+        if out[n]:
             continue
         # 1. Line of text
-        letter[:] = False
-        letter[n] = True
-        for side in range(4):
-            line[side] = boxes[n, side]
-        count, narrow, wide = _grow(boxes, peak, n, letter, line)
+        letters = _line_of_text(boxes, peak, n)
         # 2. Letters
-        if count < MIN_LETTERS or wide < UNEQUAL_WIDTH * narrow:
+        width = boxes[letters, 2] - boxes[letters, 0] + 1
+        if len(letters) < MIN_LETTERS or width.max() < UNEQUAL_WIDTH * width.min():
             continue
         # 3. Marks
-        margin = MARGIN * height
-        for k in range(len(boxes)):
-            x = (boxes[k, 0] + boxes[k, 2]) / 2
-            y = (boxes[k, 1] + boxes[k, 3]) / 2
-            beside = (
-                line[0] - margin < x < line[2] + margin
-                and line[1] - margin < y < line[3] + margin
-            )
-            out[k] |= letter[k] or (beside and boxes[k, 3] - boxes[k, 1] < 2 * height)
+        margin = MARGIN * (heights[n] + 1)
+        low = boxes[letters, :2].min(axis=0) - margin
+        high = boxes[letters, 2:].max(axis=0) + margin
+        beside = np.all((low < middle) & (middle < high), axis=1)
+        out |= beside & (heights < 2 * (heights[n] + 1))
+        out[letters] = True
     return out
 
 
-@jit
-def _grow(
-    boxes: Ints, peak: Floats, first: int, letter: NDArray, line: Ints
-) -> tuple[int, int, int]:
-    """Extend a line of text from its first letter, in place; return the number of letters and their extreme widths.
+def _line_of_text(boxes: Ints, peak: Floats, first: int) -> Ints:
+    """Return the rows of the blobs that form a line of text with its letter `first`.
 
-    Parameters
-    ----------
-    first
-        Number of the first letter's blob
-    letter
-        (N,) whether a blob is a letter of the line
-    line
-        (4,) box of the line
+    1. Select the blobs of the same height, near the line, and equally bright.
+    2. Divide them at wide gaps, and take the part with the first letter.
     """
-    top = boxes[first, 1]
-    base = boxes[first, 3]
-    height = base - top + 1
-    count = 1
-    narrow = wide = boxes[first, 2] - boxes[first, 0] + 1
+    # 1. Equal blobs
+    x0, top, x1, base = boxes.T
+    height = base[first] - top[first] + 1
     near_px = max(SAME_HEIGHT * height, 1.5)
-    # Each letter widens the line, so that the next one may be near enough.
-    found = True
-    while found:
-        found = False
-        for m in range(len(boxes)):
-            # The same height, near the line, and equally bright
-            if (
-                letter[m]
-                or abs(boxes[m, 1] - top) > near_px
-                or abs(boxes[m, 3] - base) > near_px
-            ):
-                continue
-            if max(boxes[m, 0] - line[2], line[0] - boxes[m, 2]) > GAP * height:
-                continue
-            if abs(peak[m] - peak[first]) > SAME_PEAK * abs(peak[first]):
-                continue
-            letter[m] = True
-            found = True
-            count += 1
-            line[0], line[1] = min(line[0], boxes[m, 0]), min(line[1], boxes[m, 1])
-            line[2], line[3] = max(line[2], boxes[m, 2]), max(line[3], boxes[m, 3])
-            width = boxes[m, 2] - boxes[m, 0] + 1
-            narrow = min(narrow, width)
-            wide = max(wide, width)
-    return count, narrow, wide
+    like = (np.abs(top - top[first]) <= near_px) & (np.abs(base - base[first]) <= near_px)
+    like &= np.abs(peak - peak[first]) <= SAME_PEAK * np.abs(peak[first])
+    # 2. Gaps
+    rows = np.flatnonzero(like)
+    rows = rows[np.argsort(x0[rows], kind="stable")]
+    wide = x0[rows[1:]] - np.maximum.accumulate(x1[rows])[:-1] > GAP * height
+    part = np.concatenate([[0], np.cumsum(wide)])
+    return rows[part == part[rows == first]]
 
 
 # Classification.
@@ -135,6 +99,7 @@ def _grow(
 MIN_NEIGHBOR_RATIO = 0.25
 # Largest width of a star over the frame's shorter side; the Moon and trees are wider.
 MAX_SIZE_FRACTION = 0.05
+LARGE = 0.125  # area of a box over the frame's whose shape is not measured
 MAX_NOISE_RATIO = 4.0  # largest local noise over the frame's median noise
 CLEAR_SIGMA = 10.0  # peak in sigmas of a pixel that makes a blob's shape significant
 VOTING_BLOBS = 15  # number of brightest blobs that decide whether the frame is smeared
@@ -202,12 +167,13 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     background = blobs.background
     # 1. Shapes
     shape = _shapes(image, blobs.box_px, background.level, background.noise)
-    # 2. Text. Streaks of a known length have boxes of one height, as letters do.
+    # 2. Text, in photographs. Streaks of a known length have boxes of one height, as letters do.
     text = np.zeros(len(blobs), bool)
     streak_px = priors.streak_px
     turn_rad = priors.turn_rad
     if streak_px is None:
-        text = find_captions(blobs.box_px, blobs.peak)
+        if priors.reject & TEXT:
+            text = find_captions(blobs.box_px, blobs.peak)
         # 3. and 4. Shared streaks. Columns of readout smear are no streaks: a blob across half the frame does not vote.
         x0, y0, x1, y1 = blobs.box_px.T
         votes = ~text & (x1 - x0 < image.shape[1] / 2) & (y1 - y0 < image.shape[0] / 2)
@@ -282,8 +248,8 @@ def _flags(
         Least noise, from quantization
     """
     height, width = size
-    typical_noise = max(median(noise), step)
-    typical_width2 = median(shape[:, 2])
+    typical_noise = max(np.median(noise), step)
+    typical_width2 = np.median(shape[:, 2])
     center = (width - 1) / 2, (height - 1) / 2
     flag = np.zeros(len(shape), np.int64)
     for n in range(len(shape)):
@@ -382,8 +348,8 @@ def _common_line(lines: Floats) -> tuple[float, float]:
     """
     # 1. Median
     voting = lines[:VOTING_BLOBS]
-    x = median(voting[:, 0])
-    y = median(voting[:, 1])
+    x = np.median(voting[:, 0])
+    y = np.median(voting[:, 1])
     if _count_same(voting, x, y) > VOTES * len(voting):
         return x, y
     # 2. Broken streaks
@@ -399,22 +365,17 @@ def _common_line(lines: Floats) -> tuple[float, float]:
 @jit
 def _count_pieces(lines: Floats, x: float, y: float) -> int:
     """Return the number of lines that are parallel to the line (x, y) and no longer."""
-    pieces = 0
-    square = hypot(x, y)
-    for n in range(len(lines)):
-        along = lines[n, 0] * x + lines[n, 1] * y
-        across = lines[n, 1] * x - lines[n, 0] * y
-        pieces += abs(across) < SAME_LINE * along < SAME_LINE * (1 + SAME_LINE) * square**2
-    return pieces
+    along = lines[:, 0] * x + lines[:, 1] * y
+    across = np.abs(lines[:, 1] * x - lines[:, 0] * y)
+    longest = (1 + SAME_LINE) * (x * x + y * y)
+    return int(np.count_nonzero((across < SAME_LINE * along) & (along < longest)))
 
 
 @jit
 def _count_same(lines: Floats, x: float, y: float) -> int:
     """Return the number of lines that differ from the line (x, y) by less than SAME_LINE of it."""
-    same = 0
-    for n in range(len(lines)):
-        same += hypot(lines[n, 0] - x, lines[n, 1] - y) < SAME_LINE * hypot(x, y)
-    return same
+    off = np.hypot(lines[:, 0] - x, lines[:, 1] - y)
+    return int(np.count_nonzero(off < SAME_LINE * hypot(x, y)))
 
 
 @jit
@@ -542,6 +503,8 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
     out = np.zeros((len(boxes), 5))
     for n in range(len(boxes)):
         x0, y0, x1, y1 = boxes[n]
+        if (x1 - x0) * (y1 - y0) > LARGE * image.size:
+            continue  # it is too large for a star or a streak
         total = x_sum = y_sum = xx = yy = xy = 0.0
         peak_light = -np.inf
         peak_x = x0

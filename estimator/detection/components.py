@@ -14,7 +14,7 @@ dominate the cost. So each row is first compared, in vector instructions, with a
 grid cell (the smallest of the cell's four corners); the exact threshold is computed only for pixels above the bound.
 """
 
-from math import floor, sqrt
+from math import floor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -335,15 +335,10 @@ def accumulate_blobs(
         total = sums[blob[n]]
         box[0], box[1] = min(box[0], x0), min(box[1], y)
         box[2], box[3] = max(box[2], x1), max(box[3], y)
-        total[AREA] += x1 - x0 + 1
         for x in range(x0, x1 + 1):
             sky = interpolate(level, height, width, y, x)
             smooth = filtered(image, y, x)
-            light = image[y, x] - sky
-            total[FLUX] += light
-            total[X] += light * x
-            total[Y] += light * y
-            total[PEAK] = max(total[PEAK], float(image[y, x]))
+            _add(image, sky, y, x, total)
             if smooth - sky > total[TOP]:
                 total[TOP] = smooth - sky
                 total[TOP_X] = x
@@ -368,56 +363,94 @@ def brightest_blobs(
     least `min_total_px` pixels in all, with a flux of at least `min_flux_per_root_px` sqrt(area). Its position is
     (sum(I x), sum(I y)) / sum(I).
     """
-    rows = np.empty(len(sums), np.int64)
-    count = 0
-    for n in range(len(sums)):
-        area = sums[n, AREA]
-        flux = sums[n, FLUX]
-        significant = area >= min_total_px and flux >= min_flux_per_root_px * sqrt(area)
-        if flux > 0 and (sums[n, STRONG] >= min_strong_px or significant):
-            rows[count] = n
-            count += 1
-    # The brightest of the accepted blobs
-    rows = _by_flux(sums, rows[:count])
-    kept = min(count, max_blobs)
-    box = np.empty((kept, 4), np.int64)
-    xy = np.empty((kept, 2))
-    flux = np.empty(kept)
-    peak = np.empty(kept)
-    area_px = np.empty(kept, np.int64)
-    for k in range(kept):
-        total = sums[rows[k]]
-        for side in range(4):
-            box[k, side] = boxes[rows[k], side]
-        xy[k, 0] = total[X] / total[FLUX]
-        xy[k, 1] = total[Y] / total[FLUX]
-        flux[k] = total[FLUX]
-        peak[k] = total[PEAK]
-        area_px[k] = int(total[AREA])
-    return box, xy, flux, peak, area_px, count
+    area = sums[:, AREA]
+    flux = sums[:, FLUX]
+    significant = (area >= min_total_px) & (flux >= min_flux_per_root_px * np.sqrt(area))
+    strong = sums[:, STRONG] >= min_strong_px
+    accepted = np.flatnonzero((flux > 0) & (strong | significant))
+    # The brightest of the accepted blobs; those of equal flux keep their order.
+    order = np.argsort(-flux[accepted], kind="mergesort")
+    rows = accepted[order[:max_blobs]]
+    kept = sums[rows]
+    flux = kept[:, FLUX].copy()
+    xy = kept[:, X : Y + 1] / kept[:, FLUX : FLUX + 1]
+    area_px = kept[:, AREA].astype(np.int64)
+    return (
+        boxes[rows].astype(np.int64),
+        xy,
+        flux,
+        kept[:, PEAK].copy(),
+        area_px,
+        len(accepted),
+    )
 
 
 @jit
-def _by_flux(sums: Floats, rows: Ints) -> Ints:
-    """Return the (N,) rows in decreasing order of flux; those of equal flux keep their order."""
-    # A merge sort from the bottom: sorted parts of 1, 2, 4, ... rows.
-    count = len(rows)
-    length = 1
-    merged = np.empty(count, np.int64)
-    while length < count:
-        for start in range(0, count, 2 * length):
-            middle = min(start + length, count)
-            end = min(start + 2 * length, count)
-            # Merge two sorted parts, start to middle and middle to end.
-            i = start
-            j = middle
-            for k in range(start, end):
-                if i < middle and (j == end or sums[rows[i], FLUX] >= sums[rows[j], FLUX]):
-                    merged[k] = rows[i]
-                    i = i + 1
-                else:
-                    merged[k] = rows[j]
-                    j = j + 1
-        rows, merged = merged, rows
-        length *= 2
-    return rows
+def _add(image: NDArray, sky: float, y: int, x: int, total: Floats) -> None:
+    """Add a pixel to the sums of a blob."""
+    light = image[y, x] - sky
+    total[AREA] += 1
+    total[FLUX] += light
+    total[X] += light * x
+    total[Y] += light * y
+    total[PEAK] = max(total[PEAK], float(image[y, x]))
+
+
+@jit
+def flood_fill(
+    image: NDArray,
+    level: Floats,
+    threshold: Floats,
+    smooth: bool,
+    y: int,
+    x: int,
+    assigned: NDArray,
+    stack: NDArray,
+    box: Ints,
+    total: Floats,
+) -> None:
+    """Sum the pixels above a threshold grid that are connected to (y, x) by sides or corners, and mark them `assigned`.
+
+    This is the recursive centroiding of the SHEFEX-2 paper with an explicit stack instead of recursion.
+
+    Parameters
+    ----------
+    level
+        Grid of the sky level
+    smooth
+        Whether the filtered image is compared with the threshold, else the image
+    assigned
+        (H, W) whether a pixel belongs to an object
+    stack
+        (M, 2) buffer: the object ends at M pixels
+    """
+    height, width = image.shape
+    box[0] = x
+    box[1] = y
+    box[2] = x
+    box[3] = y
+    total[:] = 0.0
+    total[PEAK] = -np.inf
+    # The stack holds the pixels of the object: those that are summed, then those that are not yet.
+    stack[0, 0] = y
+    stack[0, 1] = x
+    assigned[y, x] = 1
+    count = 1
+    summed = 0
+    while summed < count:
+        v, u = stack[summed]
+        summed += 1
+        _add(image, interpolate(level, height, width, v, u), v, u, total)
+        box[0], box[1] = min(box[0], u), min(box[1], v)
+        box[2], box[3] = max(box[2], u), max(box[3], v)
+        # Its eight neighbors, inside the image
+        for b in range(max(v - 1, 0), min(v + 2, height)):
+            for a in range(max(u - 1, 0), min(u + 2, width)):
+                if assigned[b, a] or count == len(stack):
+                    continue
+                value = filtered(image, b, a) if smooth else float(image[b, a])
+                if value > interpolate(threshold, height, width, b, a):
+                    assigned[b, a] = 1
+                    stack[count, 0] = b
+                    stack[count, 1] = a
+                    count += 1

@@ -16,16 +16,23 @@ and raises ImageError for an image that cannot be used (see `check_image`).
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from estimator.core.checks import Floats, Ints, native, number, of_type
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
-from estimator.detection.background import FILTERED_NOISE, estimate_background, median
+from estimator.detection.background import (
+    FILTERED_NOISE,
+    estimate_background,
+    is_steep,
+    median,
+)
 from estimator.detection.components import (
     Ints32,
     accumulate_blobs,
@@ -93,7 +100,7 @@ def default(
     if len(blobs) <= max_blobs:
         return blobs
     # The brightest that may be stars, and as many others as there is room for
-    star = blobs.flag & classify.NO_STAR == 0
+    star = blobs.flag & classify.NO_STAR & priors.reject == 0
     kept = star & (np.cumsum(star) <= max_blobs)
     room = max_blobs - np.count_nonzero(kept)
     return blobs.take(kept | (~star & (np.cumsum(~star) <= room)))
@@ -120,9 +127,11 @@ def _classified(
     blobs = classify.classify(image, blobs, priors)
     if blobs.streak_px is None:
         # 3. Round stars or too few. With very few stars, the others may be streaks too faint for the round filter.
-        stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR == 0))
+        stars = int(np.count_nonzero(blobs.flag & classify.NO_STAR & priors.reject == 0))
         large = np.any(blobs.area_px >= LARGE_PX)
         if priors.streak_px is not None or stars >= FEW_STARS or large:
+            return blobs
+        if is_steep(background.level, background.noise):
             return blobs
         faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
         if len(faint) <= stars + 1:
@@ -133,7 +142,7 @@ def _classified(
         if abs(blobs.turn_rad) > largest_turn_rad or longest_px > MAX_STREAK_PX:
             return blobs
         # The bright blobs have revealed the streak: detect again with the filter along it.
-        along = FramePriors(blobs.streak_px, priors.saturation, blobs.turn_rad)
+        along = replace(priors, streak_px=blobs.streak_px, turn_rad=blobs.turn_rad)
         streaks = _classified_streaks(image, background, threshold_sigma, max_blobs, along)
     # 4. Longer filters
     return in_full_length(image, streaks, threshold_sigma, max_blobs, priors)
@@ -151,32 +160,27 @@ def _classified_streaks(
     return classify.classify(image, streaks, along)
 
 
-def local(
+def _local(
+    flat: bool,
     image: NDArray,
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
     max_blobs: int = 200,
     priors: FramePriors = NO_PRIORS,
 ) -> Blobs:
-    """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
+    """Detect blobs `threshold_sigma` above the local sky, or one for the frame, after a 3x3 binomial filter."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
-    background = estimate_background(image)
-    return detect_blobs(
-        image, background, threshold_sigma * background.noise, min_area_px, max_blobs
-    )
+    sky = estimate_background(image)
+    if flat:
+        sky = flat_background(sky, image.shape)
+    return detect_blobs(image, sky, threshold_sigma * sky.noise, min_area_px, max_blobs)
 
 
-def components(
-    image: NDArray,
-    threshold_sigma: float = 5.0,
-    min_area_px: int = 3,
-    max_blobs: int = 200,
-    priors: FramePriors = NO_PRIORS,
-) -> Blobs:
-    """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
-    image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
-    flat = flat_background(estimate_background(image), image.shape)
-    return detect_blobs(image, flat, threshold_sigma * flat.noise, min_area_px, max_blobs)
+local = partial(_local, False)
+"""Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
+
+components = partial(_local, True)
+"""Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
 
 
 def thesis(
@@ -236,7 +240,7 @@ def _scan(
     level = float(flat.level[0, 0])
     noise = float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
-    return _to_blobs(boxes, sums, 0, max_blobs, flat)
+    return to_blobs(boxes, sums, 0, max_blobs, flat)
 
 
 sequential = partial(_scan, sequential_scan)
@@ -366,19 +370,19 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
         raise ImageError(
             f"the bad-pixel map reaches beyond the frame of {width}x{height} pixels"
         )
-    bad = set(zip(x.tolist(), y.tolist(), strict=True))
+    bad = np.zeros(image.shape, bool)
+    bad[y, x] = True
     # A wider neighborhood only if the near one has no good pixel
-    for column, row in bad:
+    for column, row in zip(x.tolist(), y.tolist(), strict=True):
         for reach in (1, 2):
-            good = [
-                image[v, u]
-                for v in range(max(row - reach, 0), min(row + reach + 1, height))
-                for u in range(max(column - reach, 0), min(column + reach + 1, width))
-                if (u, v) not in bad
+            near = np.s_[
+                max(row - reach, 0) : row + reach + 1,
+                max(column - reach, 0) : column + reach + 1,
             ]
-            if good:
+            good = image[near][~bad[near]]
+            if len(good):
                 break
-        repaired[row, column] = np.median(good if good else image[::8, ::8])
+        repaired[row, column] = np.median(good if len(good) else image[::8, ::8])
     return repaired
 
 
@@ -413,11 +417,11 @@ def detect_blobs(
         image, background.level, strong_level, runs, *label_runs(runs)
     )
     if grow_sigma is None:
-        return _to_blobs(boxes, sums, min_area_px, max_blobs, background)
+        return to_blobs(boxes, sums, min_area_px, max_blobs, background)
     # The threshold plus one sigma, in units of the image for one raw pixel
     min_flux = (median(above) + median(background.noise)) / FILTERED_NOISE
     grown_px = max(min_area_px, MIN_GROWN_PX)
-    return _to_blobs(boxes, sums, min_area_px, max_blobs, background, grown_px, min_flux)
+    return to_blobs(boxes, sums, min_area_px, max_blobs, background, grown_px, min_flux)
 
 
 def detect_streaks(
@@ -440,7 +444,7 @@ def detect_streaks(
     limit = background.level + above
     runs = runs_above(image, limit, taps)
     boxes, sums = accumulate_blobs(image, background.level, limit, runs, *label_runs(runs))
-    blobs = _to_blobs(
+    blobs = to_blobs(
         boxes, sums, MIN_STREAK_AREA_PX, max_blobs, background, MIN_STREAK_AREA_PX, 0.0
     )
     # Boxes of the streak's size
@@ -493,7 +497,7 @@ def in_full_length(
         x, y = LONGER * np.array(found.streak_px)
         if length_px < SHORTEST_PX or max(abs(x), abs(y)) > MAX_GROWN_PX:
             break
-        longer = FramePriors((float(x), float(y)), priors.saturation, found.turn_rad)
+        longer = replace(priors, streak_px=(float(x), float(y)), turn_rad=found.turn_rad)
         again = detect_streaks(image, found.background, threshold_sigma, max_blobs, longer)
         # 2. New streak
         again = classify.classify(image, again, priors)
@@ -503,7 +507,7 @@ def in_full_length(
     if found is first:
         return found
     # 3. Last detection
-    along = FramePriors(found.streak_px, priors.saturation, found.turn_rad)
+    along = replace(priors, streak_px=found.streak_px, turn_rad=found.turn_rad)
     return _classified_streaks(image, found.background, threshold_sigma, max_blobs, along)
 
 
@@ -521,13 +525,13 @@ def noise_factor(taps: Ints) -> float:
     """
     reach = int(np.abs(taps).max()) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
-    binomial = np.outer([1, 2, 1], [1, 2, 1]) / 16 / len(taps)
-    for x, y in taps + reach:
-        kernel[y - 1 : y + 2, x - 1 : x + 2] += binomial
+    np.add.at(kernel, tuple((taps + reach).T), 1 / len(taps))
+    for axis in (0, 1):
+        kernel = correlate1d(kernel, [0.25, 0.5, 0.25], axis)
     return float(np.sqrt(np.sum(kernel**2)))
 
 
-def _to_blobs(
+def to_blobs(
     boxes: Ints | Ints32,
     sums: Floats,
     min_area_px: int,
@@ -550,4 +554,6 @@ def _to_blobs(
         raise ImageError(
             f"over {MAX_BLOBS} blobs: the frame is noise or texture, not a star field"
         )
-    return Blobs(box, xy, flux, peak, area, background, np.zeros(len(flux), np.int64))
+    highest_px = int((box[:, 3] - box[:, 1]).max(initial=0))
+    flag = np.zeros(len(flux), np.int64)
+    return Blobs(box, xy, flux, peak, area, background, flag, highest_px=highest_px)

@@ -3,7 +3,7 @@
 It is used in tracking mode. For each window:
 
 1. Find the peak: the largest filtered value above the sky, in units of the local noise (`_brightest`).
-2. Collect the connected pixels above 3 sigma around it by flood fill (`_grow`).
+2. Collect the connected pixels above 3 sigma around it by flood fill (`flood_fill`).
 """
 
 import numpy as np
@@ -14,9 +14,11 @@ from estimator.core.jit import jit
 from estimator.core.types import NO_PRIORS, Blobs, FramePriors
 from estimator.detection.background import estimate_background, filtered, interpolate
 from estimator.detection.classify import classify
-from estimator.detection.detect import prepare_image
+from estimator.detection.components import FLUX, SUMS, flood_fill
+from estimator.detection.detect import prepare_image, to_blobs
 
 GROW_SIGMA = 3.0
+MAX_AREA_PX = 4096  # largest area of a blob
 
 
 def in_windows(
@@ -50,19 +52,7 @@ def in_windows(
     noise = background.noise
     rows = np.ascontiguousarray(center_px, dtype=float)
     boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
-    # Brightest first
-    order = np.argsort(-sums[:count, 1], kind="stable")
-    sums = sums[order]
-    flux = sums[:, 1]
-    blobs = Blobs(
-        boxes[order],
-        sums[:, 2:4] / flux[:, None],
-        flux,
-        sums[:, 4],
-        sums[:, 0].astype(np.int64),
-        background,
-        np.zeros(count, np.int64),
-    )
+    blobs = to_blobs(boxes[:count], sums[:count], 0, len(rows), background)
     return classify(image, blobs, priors)
 
 
@@ -75,13 +65,16 @@ def _brightest(
     noise: Floats,
     threshold_sigma: float,
 ) -> tuple[Ints, Floats, int]:
-    """Return boxes (N, 4), sums (N, 5: area, flux, flux x, flux y, peak) and the number of blobs in the first rows."""
+    """Return boxes (N, 4), sums (N, SUMS) and the number of blobs in the first rows."""
     height, width = image.shape
     # Lower bounds of the interpolated sky and noise, which suffice to reject most pixels.
     darkest = level.min()
     least = max(noise.min(), 1e-12)
     boxes = np.empty((len(center_px), 4), np.int64)
-    sums = np.zeros((len(center_px), 5))
+    sums = np.zeros((len(center_px), SUMS))
+    grow = level + GROW_SIGMA * noise
+    assigned = np.zeros(image.shape, np.uint8)
+    stack = np.empty((MAX_AREA_PX, 2), np.int32)
     count = 0
     for n in range(len(center_px)):
         x0, x1 = _span(center_px[n, 0], half_px, width)
@@ -108,8 +101,19 @@ def _brightest(
             new = new and not inside
         # 2. Connected pixels
         if new:
-            _grow(image, at_x, at_y, level, noise, boxes[count], sums[count])
-            count += sums[count, 1] > 0
+            flood_fill(
+                image,
+                level,
+                grow,
+                True,
+                at_y,
+                at_x,
+                assigned,
+                stack,
+                boxes[count],
+                sums[count],
+            )
+            count += sums[count, FLUX] > 0
     return boxes, sums, count
 
 
@@ -121,38 +125,3 @@ def _span(middle_px: float, half_px: float, size: int) -> tuple[int, int]:
     if not (high > -1 and low < size):
         return 0, -1
     return int(max(low, 0.0)), int(min(high, size - 1.0))
-
-
-@jit
-def _grow(
-    image: NDArray, x: int, y: int, level: Floats, noise: Floats, box: NDArray, total: NDArray
-) -> None:
-    """Sum the pixels connected to a peak into `box` and `total` by flood fill, up to 4096 pixels."""
-    height, width = image.shape
-    # Pixels to be summed, and all pixels that have ever been among them
-    stack = [(x, y)]
-    visited = {(x, y)}
-    box[0] = x
-    box[1] = y
-    box[2] = x
-    box[3] = y
-    total[:] = 0.0
-    while len(stack) > 0 and len(visited) < 4096:
-        px, py = stack.pop()
-        light = image[py, px] - interpolate(level, height, width, py, px)
-        total[0] += 1
-        total[1] += light
-        total[2] += light * px
-        total[3] += light * py
-        total[4] = max(total[4], float(image[py, px]))
-        box[0], box[1] = min(box[0], px), min(box[1], py)
-        box[2], box[3] = max(box[2], px), max(box[3], py)
-        # Its eight neighbors, inside the image
-        for qy in range(max(py - 1, 0), min(py + 2, height)):
-            for qx in range(max(px - 1, 0), min(px + 2, width)):
-                if (qx, qy) in visited:
-                    continue
-                above = filtered(image, qy, qx) - interpolate(level, height, width, qy, qx)
-                if above > GROW_SIGMA * interpolate(noise, height, width, qy, qx):
-                    visited.add((qx, qy))
-                    stack.append((qx, qy))

@@ -306,7 +306,7 @@ def _fit(
     """One weighted Gauss-Newton step of the attitude R (in place) and of the focal ratio f: steps 2 and 4.
 
     The step is info^-1 g, info = sum J^T W J, g = sum J^T W r, r the residuals, W their inverse covariances, and J the
-    derivatives of the tangents (`_slopes`).
+    derivatives of the tangents (`slopes`).
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def _fit(
     vectors_ref = sky.vectors
     for k in range(len(observed)):
         x, y = project(vectors_ref, R, star[k])
-        _slopes(x, y, f, d_x, d_y)
+        slopes(x, y, f, d_x, d_y)
         # Weighted sums of the derivatives; the matrix is symmetric, so that its lower triangle suffices.
         xx, yy, xy = vectors.row(weight, observed[k])
         residual_x = tangent[observed[k], 0] - f * x
@@ -357,7 +357,7 @@ def _fit(
 
 
 @jit
-def _slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
+def slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
     """Fill the derivatives (4,) of a star's tangents t with respect to a small rotation w and to log f.
 
     The model is t = f (x, y) / z with the star q = (x, y, z) in camera axes. The rotation changes q to q + w x q. With

@@ -129,7 +129,7 @@ def star_identifier(
         match = STAR_IDENTIFIERS[name](
             directions,
             pairs,
-            max(1.0, 4 * settings.centroid_sigma_px) / camera.focal_px,
+            max(1.0, 4 * settings.searched_sigma_px) / camera.focal_px,
             stretch=stretch,
             base_stars=settings.base_stars,
             missed_dex=settings.missed_dex,

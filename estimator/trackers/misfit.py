@@ -7,7 +7,7 @@ each, and keeps the factor of most evidence. `lens_fit` then fits the camera, wh
 `with_companions` increases the errors of catalog stars whose residuals indicate a companion.
 """
 
-from math import log, log10, sqrt
+from math import atan2, cos, log, log10, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
 from estimator.catalog.quad_index import QuadIndex
 from estimator.catalog.sky_index import SkyIndex, nearest
-from estimator.core import vectors
+from estimator.core import least_squares, vectors
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
@@ -133,12 +133,8 @@ def count_near(
 @jit
 def _mean_factor(dex: Floats, best_dex: float) -> float:
     """Return the mean of the factors TRIED, weighted by their Bayes factors 10^dex."""
-    total = weights = 0.0
-    for n in range(len(TRIED)):
-        weight = 10 ** (dex[n] - best_dex)
-        total += weight * TRIED[n]
-        weights += weight
-    return total / weights
+    weights = 10 ** (dex - best_dex)
+    return np.sum(weights * TRIED) / np.sum(weights)
 
 
 @jit
@@ -150,32 +146,25 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     chi2 / 2 (1 - 1 / v) + (p / 2 - n) ln v.
     """
     count = len(solution.star)
-    dex = np.empty(len(TRIED))
-    best = 0
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
-    for n in range(len(TRIED)):
-        gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n]) + (
-            parameters / 2 - count
-        ) * log10(TRIED[n])
-        dex[n] = solution.dex + gain_dex + (PRIOR_WRONG_DEX if n else 0.0)
-        best = n if dex[n] > dex[best] else best
-    variance = _mean_factor(dex, dex[best])
-    best_dex = dex[best] - (PRIOR_WRONG_DEX if best else 0.0)
-    return with_errors(solution, variance, solution.chi2 / TRIED[best], best_dex), variance
+    gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED)
+    gain_dex += (parameters / 2 - count) * np.log10(TRIED)
+    found_dex = gain_dex.copy()
+    gain_dex[1:] += PRIOR_WRONG_DEX
+    best = np.argmax(gain_dex)
+    variance = _mean_factor(gain_dex, gain_dex[best])
+    dex = solution.dex + found_dex[best]
+    return with_errors(solution, variance, solution.chi2 / TRIED[best], dex), variance
 
 
 @jit
 def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> Solution:
     """Return the solution with its covariance times a factor, and with another chi-square and evidence."""
-    covariance_rad2 = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            covariance_rad2[i, j] = solution.covariance_rad2[i, j] * factor
     return Solution(
         solution.observed,
         solution.star,
         solution.cam_from_ref_xyzw,
-        covariance_rad2,
+        solution.covariance_rad2 * factor,
         solution.focal_ratio,
         solution.rms,
         chi2,
@@ -230,12 +219,125 @@ class Refit(NamedTuple):
         Factor of the claimed variances
     sheared
         Whether the field is sheared, as by a rolling shutter: the attitude is then unusable
+    detections
+        Detections that the solution is of, with the errors of companions; None with a fitted camera
     """
 
     solution: Solution
     camera: Camera
     variance: float
     sheared: bool = False
+    detections: Detections | None = None
+
+
+# The least error of a centroid, however bright the star: of the pixels, the lens and the catalog.
+
+# Floors that are considered, with equal probabilities of equal ratios
+FLOORS_PX = np.geomspace(0.005, 1.28, 13)
+
+
+@jit
+def with_floor(
+    solution: Solution,
+    detections: Detections,
+    sky: SkyIndex,
+    searched_px: float,
+    focal_px: float,
+) -> tuple[Solution, float]:
+    """Return the solution with the floor of the errors that its residuals imply, and the mean square of it, px^2.
+
+    The variance of a residual along an axis is s_i + f^2, of the centroid's own noise and of a floor f that all share.
+    Integrated over the attitude, with design J, W = 1 / (s + f^2) and N = J^T W J, the likelihood of the floor is
+
+        L(f) = |W|^(1/2) |N|^(-1/2) exp(-(r^T W r - g^T N^-1 g) / 2),  g = J^T W r
+
+    (restricted likelihood: H. D. Patterson & R. Thompson, Biometrika 58, 545 (1971)). With few stars the prior, even
+    in ln f (Jeffreys), counts. The floor is averaged over, as in Gelman et al., Bayesian Data Analysis, section 3.2:
+
+    1. Turn each match to the axes of its error ellipse: rows of J and r, and the variances without `searched_px`.
+    2. For each of FLOORS_PX compute L, the step N^-1 g of the attitude and its covariance N^-1.
+    3. Apply the mean step. Its covariance is the mean of N^-1 plus the scatter of the steps.
+
+    Parameters
+    ----------
+    detections
+        Detections with the errors of the search, whose floor is searched_px
+    """
+    # 1. Rows
+    x, y, z, w = solution.cam_from_ref_xyzw
+    R = matrix_of((x, y, z, w))
+    size = 4 if detections.focal_uncertainty > 0 else 3
+    count = 2 * len(solution.star)
+    rows = np.empty((size + 1, count))
+    own_px2 = np.empty(count)
+    for k in range(count):
+        own_px2[k] = _principal_row(solution, detections, sky, R, k, focal_px, rows[:, k])
+    own_px2 = np.maximum(own_px2 - searched_px**2, 0.0)
+    # 2. Floors
+    floors = len(FLOORS_PX)
+    likelihood = np.empty(floors)
+    step = np.empty((floors, size))
+    inverse = np.empty((floors, size, size))
+    normal = np.empty((size + 1, size + 1))
+    for n in range(floors):
+        weight = 1 / (own_px2 + FLOORS_PX[n] ** 2)
+        least_squares.normal_equations(rows, weight, count, normal)
+        fall = least_squares.step(normal, step[n])
+        likelihood[n] = (np.sum(np.log(weight)) - normal[size, size] + fall) / 2
+        for i in range(size):
+            likelihood[n] -= log(normal[i, i])
+            inverse[n, i] = 0.0
+            inverse[n, i, i] = 1.0
+            least_squares.cholesky_solve(normal, inverse[n, i])
+    # 3. Means
+    share = np.exp(likelihood - likelihood.max())
+    share /= share.sum()
+    mean = step.T @ share
+    covariance_rad2 = np.zeros((3, 3))
+    for n in range(floors):
+        scatter = (step[n] - mean)[:3]
+        covariance_rad2 += share[n] * (inverse[n, :3, :3] + np.outer(scatter, scatter))
+    vectors.rotate_in_place(mean[:3], R)
+    ratio = solution.focal_ratio * (np.exp(mean[3]) if size == 4 else 1.0)
+    return Solution(
+        solution.observed,
+        solution.star,
+        vectors.quaternion_xyzw(R),
+        covariance_rad2,
+        ratio,
+        solution.rms,
+        solution.chi2,
+        solution.dex,
+    ), np.sum(share * FLOORS_PX**2)
+
+
+@jit
+def _principal_row(
+    solution: Solution,
+    detections: Detections,
+    sky: SkyIndex,
+    R: Floats,
+    k: int,
+    focal_px: float,
+    out: Floats,
+) -> float:
+    """Write slopes and residual along an axis of match k // 2's error ellipse, in pixels; return its variance, px^2."""
+    f = solution.focal_ratio
+    n = solution.observed[k // 2]
+    x, y = star_evidence.project(sky.vectors, R, solution.star[k // 2])
+    d_x = np.empty(4)
+    d_y = np.empty(4)
+    star_evidence.slopes(x, y, f, d_x, d_y)
+    # Eigenvalues of the inverse covariance [xx xy; xy yy], and the direction of the first
+    xx, yy, xy = vectors.row(detections.weight, n)
+    gap = sqrt((xx - yy) ** 2 / 4 + xy * xy)
+    angle = atan2(2 * xy, xx - yy) / 2 + (k % 2) * pi / 2
+    a = cos(angle) * focal_px
+    b = sin(angle) * focal_px
+    for i in range(len(out) - 1):
+        out[i] = a * d_x[i] + b * d_y[i]
+    out[-1] = a * (detections.tangent[n, 0] - f * x) + b * (detections.tangent[n, 1] - f * y)
+    return focal_px**2 / ((xx + yy) / 2 + (gap if k % 2 == 0 else -gap))
 
 
 # Errors of catalog stars with a companion: a double star is not where its catalog entry is.

@@ -37,8 +37,9 @@ from estimator.core.types import (
     RateEstimate,
 )
 from estimator.detection import classify
+from estimator.detection.background import cleaned
 from estimator.detection.bayer import PATTERNS, gray_from_bayer
-from estimator.detection.classify import NO_STAR, Flag
+from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS, in_row_order, replace_bad_pixels, to_native
 from estimator.identification.solver_options import ACCEPTANCES
 
@@ -51,6 +52,7 @@ MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could m
 BAD_PIXEL_SIGMA_PX = 0.06
 
 
+SEARCHED_SIGMA_PX = 0.1  # floor of the errors in searches, where none is set
 TINY = 1e-300
 GREATEST = 1e300
 POSITIVE = Allowed(TINY, GREATEST, "finite, above 0")
@@ -63,7 +65,7 @@ ALLOWED = {
     "intensity_threshold": Allowed(TINY, 1.0, "above 0, up to 1"),
     "gain_e_dn": Allowed(TINY, math.inf, "above 0; inf without photon noise"),
     "saturation": Allowed(TINY, math.inf, "above 0; inf if unknown"),
-    "centroid_sigma_px": NOT_NEGATIVE,
+    "centroid_sigma_px": NOT_NEGATIVE._replace(optional=True),
     "base_stars": COUNT,
     "searched_stars": COUNT,
     "field_stars": POSITIVE,
@@ -93,7 +95,8 @@ class Settings:
     saturation
         Least value of a saturated pixel; inf if unknown
     centroid_sigma_px
-        Standard deviation added in quadrature to a centroid's error, for errors beyond its noise
+        Standard deviation added in quadrature to a centroid's error, for errors beyond its noise; None: estimated from
+        each frame of stars (`trackers.misfit.with_floor`). The search then uses SEARCHED_SIGMA_PX
     base_stars
         Number of brightest blobs from which the published identifiers form patterns
     searched_stars
@@ -116,7 +119,7 @@ class Settings:
     assumed_deg
         Roll, pitch and yaw (3-2-1) of the vehicle by another sensor, for star identifiers under LEDs; None if unknown
     reject
-        Flags of `detection.classify.Flag` that exclude a blob
+        Flags of `detection.classify.Flag` that exclude a blob; NO_STAR, for photographs, also text and trees
     bad_px
         (K, 2) x and y of the sensor's bad pixels; None without a map
     bayer
@@ -139,7 +142,7 @@ class Settings:
     intensity_threshold: float = THESIS_INTENSITY
     gain_e_dn: float = 1.0
     saturation: float = float("inf")
-    centroid_sigma_px: float = 0.1
+    centroid_sigma_px: float | None = None
     base_stars: int = 20
     searched_stars: int = 80
     field_stars: float = 30.0
@@ -150,7 +153,7 @@ class Settings:
     acceptance: str = "evidence"
     cos_error: float | None = None
     assumed_deg: tuple[float, float, float] | None = None
-    reject: int = int(NO_STAR)
+    reject: int = int(Flag.HOT | Flag.TRACK | Flag.HUGE)
     bad_px: Ints | None = field(default=None, compare=False)
     bayer: str | None = None
 
@@ -158,6 +161,11 @@ class Settings:
         for name in named:
             checks.known("settings", name, cls.__slots__)
         return object.__new__(cls)
+
+    @property
+    def searched_sigma_px(self) -> float:
+        """The floor of the centroids' errors in searches and gates."""
+        return SEARCHED_SIGMA_PX if self.centroid_sigma_px is None else self.centroid_sigma_px
 
     def __post_init__(self) -> None:
         checks.store_numbers(self, "settings: ", ALLOWED)
@@ -256,10 +264,19 @@ def detect_and_centroid(
     image = monochrome(image, settings)
     # 2. Blobs
     priors = FramePriors(
-        streak_px, settings.saturation, turn_rad, settings.intensity_threshold
+        streak_px,
+        settings.saturation,
+        turn_rad,
+        settings.intensity_threshold,
+        settings.reject,
     )
-    blobs = DETECTORS[settings.detector](
-        image, settings.threshold_sigma, settings.min_area_px, settings.max_blobs, priors
+    image, blobs = cleaned(
+        DETECTORS[settings.detector],
+        image,
+        priors,
+        settings.threshold_sigma,
+        settings.min_area_px,
+        settings.max_blobs,
     )
     stars = away_from_border(blobs.box_px, camera) & (blobs.flag & settings.reject == 0)
     if not stars.all():
@@ -379,8 +396,8 @@ def brightest(centroids: Centroids, settings: Settings) -> Centroids:
 
 
 def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
-    """Return the (N,) standard deviation of a direction, rad, from the centroid's own error and centroid_sigma_px."""
-    return np.hypot(centroids.sigma_px, settings.centroid_sigma_px) / camera.focal_px
+    """Return the (N,) standard deviation of a direction, rad, from the centroid's own error and the floor."""
+    return np.hypot(centroids.sigma_px, settings.searched_sigma_px) / camera.focal_px
 
 
 def away_from_border(box_px: NDArray, camera: Camera) -> NDArray:

@@ -347,7 +347,7 @@ class StarTracker(FrameTracker):
             self.camera,
             self.index,
             self.focal_uncertainty,
-            settings.centroid_sigma_px,
+            settings.searched_sigma_px,
             settings.acceptance,
             cos_error=settings.cos_error,
             compared=compared,
@@ -437,7 +437,9 @@ class StarTracker(FrameTracker):
             chi2,
             float("nan"),
         )
-        return self.attitude_of(centroids, Refit(solution, self.camera, variance), sigma_px)
+        detections = self.detections(centroids, sigma_px)
+        refitted = Refit(solution, self.camera, variance, detections=detections)
+        return self.attitude_of(centroids, refitted, sigma_px)
 
     def sigma_px(
         self,
@@ -451,7 +453,7 @@ class StarTracker(FrameTracker):
         distance from the image center. The error of a calibrated focal length is the least relative_error.
         """
         sigma_px = np.hypot(
-            centroids.sigma_px, max(self.settings.centroid_sigma_px, min_error_px)
+            centroids.sigma_px, max(self.settings.searched_sigma_px, min_error_px)
         )
         relative_error = max(relative_error, self.camera.focal_sigma)
         if relative_error == 0:
@@ -569,7 +571,7 @@ class StarTracker(FrameTracker):
             # A few stars may fit by luck within gates that are too narrow for the others.
             whole = len(solution.star) == len(centroids)
             if whole and solution.chi2 < misfit.DOUBTFUL and known:
-                return Refit(solution, camera, 1.0)
+                return Refit(solution, camera, 1.0, detections=detections)
             if known and not self.camera.row_time_s:
                 R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
                 solution, variance = misfit.widened(
@@ -593,7 +595,8 @@ class StarTracker(FrameTracker):
                 fixed or few or (small and not matcher.misfits(camera, solution, centroids))
             )
         if fits:
-            return Refit(solution, camera, variance)
+            own = detections if exact else None
+            return Refit(solution, camera, variance, detections=own)
         start = variance if known else 1.0
         return matcher.with_lens(solution, centroids, weight, start, exact)
 
@@ -601,7 +604,16 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, refitted: Refit, sigma_px: Floats
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
-        solution, camera, variance, _ = refitted
+        solution, camera, variance, _, detections = refitted
+        if self.settings.centroid_sigma_px is None and detections is not None:
+            searched_px = self.settings.searched_sigma_px
+            solution, floor_px2 = misfit.with_floor(
+                solution, detections, self.sky, searched_px, self.camera.focal_px
+            )
+            variance = 1.0
+            sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
+            if solution.focal_ratio != 1:
+                camera = self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = rotation_of(solution.cam_from_ref_xyzw)
         covariance_rad2 = solution.covariance_rad2
         common_rad2 = None

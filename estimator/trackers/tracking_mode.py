@@ -21,6 +21,7 @@ from estimator.core.camera import check_frame
 from estimator.core.checks import Floats, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
+from estimator.detection.background import cleaned
 from estimator.detection.classify import Flag
 from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
@@ -335,7 +336,7 @@ class TrackingMode:
     ) -> tuple[Centroids, bool]:
         """Return the centroids of the detections in windows, and whether any of them is saturated."""
         settings = self.tracker.settings
-        priors = FramePriors(streak_px, settings.saturation)
+        priors = FramePriors(streak_px, settings.saturation, reject=settings.reject)
         # Long streaks need the streak filter: the whole frame is processed, and only the windows are used.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
             centroids = detect_and_centroid(
@@ -347,7 +348,9 @@ class TrackingMode:
             )
             return centroids.take(near.any(axis=1)), False
         image = monochrome(image, settings)
-        blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)
+        image, blobs = cleaned(
+            in_windows, image, priors, window_centers_px, self.reach_px, WINDOW_SIGMA
+        )
         blobs = blobs.take(blobs.flag & settings.reject == 0)
         clock.lap("detect")
         centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)

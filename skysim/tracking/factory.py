@@ -57,6 +57,7 @@ from skysim.tracking.tracker_interface import Leds, Setup, Stars
 
 # Settings of the tracker from a scene.
 
+DOME_SIGMA_PX = 0.2  # floor of the centroids' errors under a dome, where none is set
 # Default algorithms under a dome; under stars each stage has one with the name "default".
 DOME_ALGORITHMS = {
     "detector": "local",
@@ -97,7 +98,7 @@ def assumed_settings(scene: Scene) -> Settings:
         intensity_threshold=config.intensity_threshold,
         gain_e_dn=scene.camera.detector.gain_e_dn,
         saturation=saturation_dn(scene.camera.detector),
-        centroid_sigma_px=config.centroid_sigma_px,
+        centroid_sigma_px=config.centroid_sigma_px or (DOME_SIGMA_PX if scene.dome else None),
         acceptance=config.acceptance,
         cos_error=config.cos_error,
         bayer=scene.camera.detector.bayer,

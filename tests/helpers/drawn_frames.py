@@ -25,6 +25,7 @@ class CameraSetup:
     zero_e : electrons of a star of magnitude 0; deepest : magnitude of the faintest star drawn
     gain_e : electrons per count; depth : maximum count
     leak   : share of a column's light in each of its pixels: readout smear
+    dawn_e : electrons of the sky in the brightest corner, over a gradient along x and y
     nuisances : whether there are hot pixels, cosmic rays, a satellite's trail, false stars and a gradient of the sky
     """
 
@@ -39,6 +40,7 @@ class CameraSetup:
     psf_px: float = 0.7
     streak_px: float = 0.0
     leak: float = 0.0
+    dawn_e: float = 0.0
     nuisances: bool = False
 
 
@@ -131,6 +133,8 @@ def render(
         streak,
         setup.psf_px,
     )
+    height, width = light.shape
+    light += setup.dawn_e * np.linspace(0, 1, width) * np.linspace(0.5, 1, height)[:, None]
     if setup.nuisances:
         disturb(light, setup, rng)
     light += setup.leak * light.sum(axis=0)

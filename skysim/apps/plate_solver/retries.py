@@ -72,12 +72,12 @@ def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
 
 def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids:
     """Centroids of a binned picture in pixels of the original; the floor of their errors is in binned pixels."""
-    floor_px2 = settings.centroid_sigma_px**2 * np.eye(2)
+    floor_px = settings.searched_sigma_px
     out = replace(
         centroids,
         xy_px=factor * centroids.xy_px + (factor - 1) / 2,
-        sigma_px=factor * np.hypot(centroids.sigma_px, settings.centroid_sigma_px),
-        covariance_px2=factor**2 * (covariance_of(centroids) + floor_px2),
+        sigma_px=factor * np.hypot(centroids.sigma_px, floor_px),
+        covariance_px2=factor**2 * (covariance_of(centroids) + floor_px**2 * np.eye(2)),
         streak_px=None,
         streak_covariance_px2=None,
     )

@@ -32,6 +32,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
+from estimator.detection.classify import NO_STAR
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.refinement import NO_MATCH
@@ -52,6 +53,7 @@ FOV_UNCERTAINTY = (
 )
 FOV_LIMITS_DEG = 1.0, 120.0
 CATALOG = CATALOGS / "gaia_v8.0.ecsv"
+PHOTOGRAPH = Settings(reject=NO_STAR)  # text and trees are no stars
 THREADS = min(os.cpu_count() or 1, 8)
 DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
 
@@ -295,7 +297,7 @@ def make_solver(
     time_utc, warning = validated_date(time_utc)
     if warning:
         raise InputError("solve.time_utc", warning)
-    camera, settings = read_camera(camera_file) if camera_file else (None, Settings())
+    camera, settings = read_camera(camera_file) if camera_file else (None, PHOTOGRAPH)
     if stages:
         check_stages(stages)
         settings = replace(settings, **stages)  # type: ignore[arg-type]
@@ -358,12 +360,14 @@ def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
         lens = opencv.read(path)
         size_px = lens.width_px, lens.height_px
         camera = Camera(*size_px, lens.focal_px, lens.center_px, lens.distortion)
-        return KnownCamera(camera), Settings()
+        return KnownCamera(camera), PHOTOGRAPH
     is_file = path.suffix or path.exists()  # else the name of a shipped scene
     file = path if is_file else loader.find(str(path))
     config = loader.load_camera(file)
     detector = config.detector
-    settings = Settings(gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector))
+    settings = replace(
+        PHOTOGRAPH, gain_e_dn=detector.gain_e_dn, saturation=saturation_dn(detector)
+    )
     light = loader.read(file)[0].get("light")
     is_dome = isinstance(light, dict) and light.get("kind") == "dome"
     dome = path if is_dome else None

@@ -23,6 +23,7 @@ from skysim.simulation.lab import Lab
 from skysim.sources.dome import surface
 from skysim.sources.dome.layouts import led_list, registry
 from skysim.tracking import onboard_model
+from skysim.tracking.factory import DOME_SIGMA_PX
 
 BLUR_PX = 3.0  # width of an image's blurred edge
 
@@ -177,7 +178,7 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
         if light.led.code
         else None
     )
-    floor_px = scene.tracker.centroid_sigma_px
+    floor_px = scene.tracker.centroid_sigma_px or DOME_SIGMA_PX
     disk_m = light.led.disk_diameter_m
     return CalibrationPrior(
         camera, leds, lever, floor_px, disk_m, levels / levels.max(), code

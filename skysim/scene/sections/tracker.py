@@ -191,6 +191,9 @@ class TrackerConfig(ConfigModel):
     cos_error
         Tolerance of the cosine of an angle between two stars, for the identifier `shefex` (Samaan & Theil 2011, eq. 3:
         c |cos FOV - cos(FOV - centroid error)|; they chose 5.5e-5). If left out, from centroid_sigma_px
+    centroid_sigma_px
+        Least error that the tracker claims for a centroid. If left out, under the stars it is estimated from the
+        residuals of each frame, and under a dome it is 0.2
     intensity_threshold
         Threshold of the detector `thesis` and of `skysim calibrate`, as a share of full scale (Padro 2012: 0.04)
     catalog
@@ -244,7 +247,7 @@ class TrackerConfig(ConfigModel):
     intensity_threshold: InnerFraction = 0.04
     catalog: str = "hipparcos_hp6.5"
     limit_mag: Number = 6.0
-    centroid_sigma_px: Positive = 0.2
+    centroid_sigma_px: Positive | None = None
     assumed_focal_length_m: PositiveLength | None = None
     assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
     assumed_row_time_s: Delay | None = None

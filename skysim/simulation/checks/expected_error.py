@@ -36,6 +36,7 @@ camera's position, so its J_i has three more columns. Errors of star places are 
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -300,6 +301,7 @@ def of_common(gain: Floats, displacement_px: Floats) -> Floats:
 def believed_px2(view: View, context: Context, prnu: float | None = None) -> Floats:
     """(n, 2, 2) covariance of each image position that the tracker believes: centroid, floor and LED survey.
 
+    A floor that is estimated from each frame is 0 here: nothing else disturbs the centroids.
     Only the fit of streaks tells the star tracker the directions of its errors.
     """
     settings = context.settings
@@ -311,13 +313,17 @@ def believed_px2(view: View, context: Context, prnu: float | None = None) -> Flo
     if beliefs.dome:
         camera, leds, lever = beliefs.dome
         survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
-    added_px2 = settings.centroid_sigma_px**2 + survey_px**2
+    added_px2 = (settings.centroid_sigma_px or 0.0) ** 2 + survey_px**2
     return own + added_px2[:, None, None] * np.eye(2)
 
 
 def believed_sigma_px(view: View, context: Context) -> Floats:
-    """(n,) standard deviation of each image position that the tracker believes, see `believed_px2`."""
-    return np.sqrt(np.trace(believed_px2(view, context), axis1=1, axis2=2) / 2)
+    """(n,) standard deviation of each image position in the tracker's gates: `believed_px2` with the search's floor."""
+    floor_px = context.settings.searched_sigma_px
+    searching = replace(
+        context, settings=replace(context.settings, centroid_sigma_px=floor_px)
+    )
+    return np.sqrt(np.trace(believed_px2(view, searching), axis1=1, axis2=2) / 2)
 
 
 def within_gate(view: View, context: Context) -> View:

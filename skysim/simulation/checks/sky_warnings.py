@@ -189,18 +189,19 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
 
 
 def claimed(plan: Plan) -> float:
-    """The expected NEES over the whole sky with the tracker's least centroid error; NaN under other lights."""
-    if not plan.scene.stars:
+    """The expected NEES over the whole sky with the tracker's least centroid error; NaN without one."""
+    floor_px = plan.settings.centroid_sigma_px
+    if not plan.scene.stars or floor_px is None:
         return math.nan
-    return expected_nees(plan.reach, plan, plan.settings.centroid_sigma_px)
+    return expected_nees(plan.reach, plan, floor_px)
 
 
 def fact(plan: Plan) -> Fact | None:
-    """The fact about the expected NEES; None under other lights."""
+    """The fact about the expected NEES; None under other lights, and if the floor is estimated from each frame."""
     nees = claimed(plan)
     if math.isnan(nees):
         return None
-    floor_px = plan.settings.centroid_sigma_px
+    floor_px = plan.settings.searched_sigma_px
     rates = attitudes.rates_text(plan.reach.attitudes)
     text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
@@ -215,7 +216,7 @@ def floor_too_small(plan: Plan) -> str:
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
     if factor <= MAX_FACTOR:
         return ""
-    low = plan.settings.centroid_sigma_px
+    low = plan.settings.searched_sigma_px
     high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)

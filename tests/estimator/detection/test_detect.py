@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import ndimage, stats
 from scipy.special import erf
 
@@ -373,3 +374,50 @@ def test_a_field_that_only_rolls_is_not_line_filtered() -> None:
     image, _ = field_of_stars(4)
     turning = replace(detect.default(image), streak_px=(0.0, 0.0), turn_rad=0.01)
     assert detect.in_full_length(image, turning, 5.0, 99, FramePriors()) is turning
+
+
+def skies(rng: np.random.Generator) -> tuple[NDArray, NDArray]:
+    """The light of 12 stars, sigma 0.8 px, in a frame of 200 x 240 pixels, and their places; none near another."""
+    xy = np.array([(x, y) for x in (30.0, 90.0, 150.0, 210.0) for y in (30.0, 95.0, 160.0)])
+    xy += rng.uniform(-9, 9, xy.shape)
+    y, x = np.mgrid[:200, :240]
+    light = np.zeros((200, 240))
+    for star in xy:
+        light += 2e4 * np.exp(-((x - star[0]) ** 2 + (y - star[1]) ** 2) / 2 / 0.8**2)
+    return light, xy
+
+
+def centroids_px(image: NDArray, saturation: float) -> NDArray:
+    """Places of the lights in an image, as a tracker finds them."""
+    camera = Camera.from_fov(240, 200, 0.2)
+    settings = Settings(saturation=saturation)
+    return detect_and_centroid(image, camera, settings, Clock()).xy_px
+
+
+@pytest.mark.parametrize("share", [0.06, 0.5])
+def test_readout_smear_neither_hides_nor_moves_a_light(share: float) -> None:
+    """The share of its column's light that each pixel gets in the shift is not seen as a light."""
+    rng = np.random.default_rng(3)
+    light, xy = skies(rng)
+    light = light + 100 + share / 200 * light.sum(axis=0)
+    image = np.rint(rng.poisson(light) + rng.normal(100, 5, light.shape)).astype(np.uint16)
+    found = centroids_px(image, np.inf)
+    off = np.abs(found[:, None] - xy)
+    assert len(found) == len(xy)
+    assert off.max(axis=2).min(axis=1).max() < 0.05
+    near = off.max(axis=2).argmin(axis=1)
+    assert abs(np.mean(found - xy[near])) < 0.005
+
+
+def test_stars_are_found_in_a_sky_that_rises_to_saturation() -> None:
+    """All that are below the saturated part of the frame, and nothing else; the noise rises with the sky."""
+    rng = np.random.default_rng(4)
+    light, xy = skies(rng)
+    light = light + 6e4 * (np.linspace(0, 1.1, 240) ** 2)
+    noisy = rng.poisson(light) + rng.normal(100, 5, light.shape)
+    image = np.minimum(np.rint(noisy), 50_000).astype(np.uint16)
+    found = centroids_px(image, 50_000.0)
+    below = xy[xy[:, 0] < 170]
+    off = np.abs(found[:, None] - below).max(axis=2)
+    assert off.min(axis=0).max() < 0.2
+    assert np.abs(found[:, None] - xy).max(axis=2).min(axis=1).max() < 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from estimator.detection import components
 from tests.helpers.interpreted import interpreted
 
 WINDOWS = interpreted("estimator.detection.windows")
@@ -29,12 +30,23 @@ def test_a_blob_holds_all_pixels_connected_with_its_peak() -> None:
         for number in range(1, label.max() + 1):
             y, x = np.nonzero(label == number)
             box = np.empty(4, np.int64)
-            total = np.empty(5)
-            WINDOWS._grow(image, x[0], y[0], SKY, SKY + 1, box, total)
-            light = image[y, x]
-            np.testing.assert_allclose(
-                total, [len(x), light.sum(), light @ x, light @ y, light.max()], rtol=1e-12
+            total = np.empty(WINDOWS.SUMS)
+            assigned = np.zeros(image.shape, np.uint8)
+            stack = np.empty((image.size, 2), np.int32)
+            above_sky = SKY + WINDOWS.GROW_SIGMA
+            WINDOWS.flood_fill(
+                image, SKY, above_sky, True, y[0], x[0], assigned, stack, box, total
             )
+            light = image[y, x]
+            sums = [len(x), light.sum(), light @ x, light @ y, light.max()]
+            at = [
+                components.AREA,
+                components.FLUX,
+                components.X,
+                components.Y,
+                components.PEAK,
+            ]
+            np.testing.assert_allclose(total[at], sums, rtol=1e-12)
             assert box.tolist() == [x.min(), y.min(), x.max(), y.max()]
             touched |= [x.min() == 0, y.min() == 0, x.max() == 16, y.max() == 12]
     assert touched.all()

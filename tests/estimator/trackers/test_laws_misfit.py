@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from scipy import stats
+from scipy import linalg, stats
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.solvers import covariance
+from estimator.attitude.systematic import geometry
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -142,3 +143,68 @@ def test_the_covariance_is_never_below_the_model_s(
         seen = centroids.take(answer.match.observed)
         model = covariance(CAMERA.rays(seen.xy_px), tracker.sigma_px(seen) / CAMERA.focal_px)
         assert (np.diag(answer.covariance_rad2) > 0.8 * np.diag(model)).all()
+
+
+def test_the_floor_of_the_errors_has_the_restricted_likelihood(tracker: StarTracker) -> None:
+    """Against the density of error contrasts, which do not depend on the attitude, and a fit with each floor."""
+    _, centroids = field(tracker, 2, CAMERA, 0.5)
+    detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    found = star_search.lost_in_space(detections, tracker.sky, 80, 100_000)
+    answer, floor_px2 = misfit.with_floor(
+        found, detections, tracker.sky, 0.0, CAMERA.focal_px
+    )
+    # Linear model of the matches, in pixels
+    seen = Rotation.from_quat(found.cam_from_ref_xyzw).apply(tracker.sky.vectors[found.star])
+    view = geometry(seen, seen)
+    design = CAMERA.focal_px * view.jacobian.reshape(-1, 3)
+    tangents = CAMERA.tangents(centroids.xy_px[found.observed])
+    error_px = CAMERA.focal_px * (tangents - view.tangent).ravel()
+    own_px2 = np.repeat(tracker.sigma_px(centroids)[found.observed] ** 2, 2)
+    contrasts = linalg.null_space(design.T)
+    log_density = []
+    fits = []
+    for floor_px in misfit.FLOORS_PX:
+        covariance_px2 = np.diag(own_px2 + floor_px**2)
+        left = stats.multivariate_normal(cov=contrasts.T @ covariance_px2 @ contrasts)
+        log_density.append(left.logpdf(contrasts.T @ error_px))
+        weighted = np.linalg.inv(covariance_px2) @ design
+        fits.append(
+            np.linalg.inv(design.T @ weighted)
+            @ np.column_stack([weighted.T @ error_px, np.eye(3)])
+        )
+    share = np.exp(np.array(log_density) - max(log_density))
+    share /= share.sum()
+    assert floor_px2 == pytest.approx(share @ misfit.FLOORS_PX**2, rel=1e-4)
+    steps, inverses = np.array(fits)[:, :, 0], np.array(fits)[:, :, 1:]
+    mean = share @ steps
+    scatter = steps - mean
+    wanted = np.einsum("f,fij->ij", share, inverses) + (share * scatter.T) @ scatter
+    np.testing.assert_allclose(
+        answer.covariance_rad2, wanted, rtol=1e-3, atol=1e-5 * wanted.max()
+    )
+    moved = (
+        Rotation.from_quat(answer.cam_from_ref_xyzw)
+        * Rotation.from_quat(found.cam_from_ref_xyzw).inv()
+    )
+    np.testing.assert_allclose(moved.as_rotvec(), mean, atol=1e-3 * np.sqrt(wanted.max()))
+
+
+@pytest.mark.parametrize("floor_px", [0.01, 0.1])
+def test_the_default_settings_claim_what_the_frame_shows(floor_px: float) -> None:
+    """An honest mean NEES where the errors have a floor that nobody told, below and at that of the search."""
+    stars = catalog.brighter_than(catalog.hipparcos(), 5.0)
+    eye = StarTracker(CAMERA, stars, stars.vectors, Settings(zero_point_mag=0.0))
+    nees = []
+    for seed in range(FIELDS):
+        truth, centroids = field(eye, seed, CAMERA)
+        rng = np.random.default_rng([8, seed])
+        noise_px = rng.standard_normal(centroids.xy_px.shape) * np.hypot(floor_px, 0.02)
+        true_px = np.nan_to_num(CAMERA.pixels(truth.apply(eye.stars.vectors)), nan=-1e9)
+        true_px = true_px[CAMERA.contains(true_px)]
+        some = Centroids(true_px + noise_px, np.full(len(true_px), 0.02), centroids.flux)
+        answer = eye.solve_centroids(some)
+        if answer.cam_from_ref is not None:
+            error = (answer.cam_from_ref * truth.inv()).as_rotvec()
+            nees.append(error @ np.linalg.solve(answer.covariance_rad2, error))
+    assert len(nees) > 0.9 * FIELDS
+    assert abs(np.mean(nees) - 3) < 0.5 + MEAN_SIGMA
