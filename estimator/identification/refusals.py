@@ -4,6 +4,8 @@ from math import inf
 
 from estimator.identification.chance import MIN_MATCHES
 
+AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
+
 # Identifiers whose papers accept a match by a rule of their own (see `solver_options.Options.acceptance`).
 OWN_RULE = ("saa", "shefex", "master_star", "fialho_1", "fialho_2", "fialho_3", "fialho_4")
 CROWDED = 1.5  # lights per catalog star in a field from which the lights are too many

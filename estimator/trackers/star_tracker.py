@@ -51,6 +51,7 @@ from estimator.trackers.pipeline import (
     check_algorithms,
 )
 from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
+from estimator.trackers.rivals import with_rivals
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
@@ -327,12 +328,18 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, clock: Clock, effort: int | None
     ) -> Attitude:
         """Identify and solve centroids of one time."""
+        compared = np.zeros(1, np.int64)
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_by_evidence(centroids, searches, clock)
-        compared = np.zeros(1, np.int64)
-        attitude = self._identify_by_paper(centroids, clock, compared)
-        return replace(attitude, angles_compared=int(compared[0]) or None)
+            attitude = self._identify_by_evidence(centroids, searches, clock)
+        else:
+            attitude = self._identify_by_paper(centroids, clock, compared)
+            attitude = replace(attitude, angles_compared=int(compared[0]) or None)
+        attitude = with_rivals(
+            attitude, centroids, self.sigma_px, self.sensor, self.sky, self.field_matcher
+        )
+        clock.lap("identify")
+        return attitude
 
     def _identify_by_paper(
         self, centroids: Centroids, clock: Clock, compared: Ints
