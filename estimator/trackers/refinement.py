@@ -29,11 +29,11 @@ from estimator.core.least_squares import fit_soft_l1
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import mutual_nearest
+from estimator.identification.refusals import NO_MATCH
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings, direction_sigma_rad
 
-NO_MATCH = "no identification beyond chance"
 # Least number of near misses per match for a wrong camera model; centroid errors that are claimed three times too small
 # give up to 0.75.
 MISFIT_SHARE = 0.8

@@ -110,17 +110,22 @@ def with_rivals(
         return attitude
     skies = [attitude]
     lights = flat_centroids(centroids, errors_px(centroids))
-    lens = sensor._replace(
-        focal_px=camera.focal_px, center_px=camera.center_px, distortion=camera.distortion
-    )
+    # A lens that is fitted to a distorted reflection does not fit the stars.
+    cameras = (camera,) if camera == matcher.camera else (camera, matcher.camera)
     while len(skies) <= MOST_RIVALS and len(centroids) - len(matched) >= MIN_MATCHES:
         # 2. and 3. Search
-        found = find(lights, lens, sky, matched, match.star)
+        for lens in cameras:
+            view = sensor._replace(
+                focal_px=lens.focal_px, center_px=lens.center_px, distortion=lens.distortion
+            )
+            found = find(lights, view, sky, matched, match.star)
+            if len(found.star):
+                break
         if not len(found.star):
             break
         matched = np.concatenate([matched, found.observed])
         # 4. Second sky, or misfit
-        other = _attitude_of(found, camera, sky)
+        other = _attitude_of(found, lens, sky)
         turned_rad = (other.cam_from_ref * match.cam_from_ref.inv()).magnitude()
         twice = len(np.intersect1d(found.star, match.star))
         if turned_rad > SAME_RAD or twice >= MIN_EVIDENCE_MATCHES:

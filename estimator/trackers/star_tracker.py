@@ -33,7 +33,15 @@ from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from estimator.identification.refusals import advice
+from estimator.identification.refusals import (
+    BUDGET,
+    FALSE_LIGHTS,
+    NO_LIGHTS,
+    NO_MATCH,
+    NO_STARS,
+    WRONG_SCALE,
+    advice,
+)
 from estimator.identification.star_detections import (
     Detections,
     Sensor,
@@ -50,7 +58,7 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
 )
-from estimator.trackers.refinement import NO_MATCH, FieldMatcher, solved_attitude
+from estimator.trackers.refinement import FieldMatcher, solved_attitude
 from estimator.trackers.rivals import with_rivals
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
@@ -58,10 +66,9 @@ from estimator.trackers.search_models import (
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
     WRONG_FOCAL_SEARCH,
+    WRONG_SCALE_SEARCH,
     SearchModel,
 )
-
-NO_STARS = "too few stars detected"
 
 SETTINGS = Settings()
 
@@ -310,7 +317,7 @@ class StarTracker(FrameTracker):
             )
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS)
+            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lights = Lights(
             self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
@@ -332,6 +339,8 @@ class StarTracker(FrameTracker):
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             attitude = self._identify_by_evidence(centroids, searches, clock)
+            if effort is None and not attitude.solved and self._is_wrong_scale(centroids):
+                attitude = Attitude(WRONG_SCALE)
         else:
             attitude = self._identify_by_paper(centroids, clock, compared)
             attitude = replace(attitude, angles_compared=int(compared[0]) or None)
@@ -502,7 +511,13 @@ class StarTracker(FrameTracker):
             clock.lap("solve")
             if attitude.solved:
                 return attitude
-        return Attitude(NO_MATCH)
+        return Attitude(BUDGET if np.isnan(solution.dex) else FALSE_LIGHTS)
+
+    def _is_wrong_scale(self, centroids: Centroids) -> bool:
+        """Return whether a short search with a focal length that is hardly known finds a decisive one out of range."""
+        found, _ = self._search(centroids, self.sigma_px(centroids), WRONG_SCALE_SEARCH)
+        is_decisive = found.dex >= star_search.DECISIVE_DEX
+        return is_decisive and abs(found.focal_ratio - 1) > self.focal_uncertainty
 
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
