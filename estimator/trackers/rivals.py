@@ -26,7 +26,7 @@ significantly more matches is the true one.
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import hypot, sqrt
+from math import hypot, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,9 +104,15 @@ def with_rivals(
     camera = attitude.camera
     if match is None or camera is None:
         return attitude
-    # 1. Unmatched lights
+    # 1. Unmatched lights: another field may have half as many stars as the mean one.
     matched = match.observed
-    if not _is_comparable(len(matched), len(centroids) - len(matched), 0.5):
+    if len(centroids) - len(matched) < MIN_MATCHES:
+        return attitude
+    left, right, top, bottom = sensor.field
+    field_sr = (right - left) * (bottom - top)
+    poor_field = int(match.star.max()) * field_sr / (8 * pi)
+    share = max(len(matched) / (len(matched) + poor_field), 0.5)
+    if not _is_comparable(len(matched), len(centroids) - len(matched), share):
         return attitude
     skies = [attitude]
     lights = flat_centroids(centroids, errors_px(centroids))
