@@ -114,7 +114,7 @@ def with_rivals(
     share = max(len(matched) / (len(matched) + poor_field), 0.5)
     if not _is_comparable(len(matched), len(centroids) - len(matched), share):
         return attitude
-    skies = [attitude]
+    skies = [(match, attitude)]
     lights = flat_centroids(centroids, errors_px(centroids))
     # A lens that is fitted to a distorted reflection does not fit the stars.
     cameras = (camera,) if camera == matcher.camera else (camera, matcher.camera)
@@ -131,52 +131,41 @@ def with_rivals(
             break
         matched = np.concatenate([matched, found.observed])
         # 4. Second sky, or misfit
-        other = _attitude_of(found, lens, sky)
-        turned_rad = (other.cam_from_ref * match.cam_from_ref.inv()).magnitude()
+        cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw)
+        turned_rad = (cam_from_ref * match.cam_from_ref.inv()).magnitude()
         twice = len(np.intersect1d(found.star, match.star))
-        if turned_rad > SAME_RAD or twice >= MIN_EVIDENCE_MATCHES:
-            skies.append(other)
-    if len(skies) == 1:
-        return attitude
-    # 5. Comparison
-    skies.sort(key=_matches, reverse=True)
-    share = _share(matcher, *skies[:2])
-    if _is_comparable(_matches(skies[0]), _matches(skies[1]), share):
-        return Attitude(AMBIGUOUS, rivals=tuple(skies))
-    return replace(skies[0], rivals=tuple(skies[1:]))
+        if turned_rad < SAME_RAD and twice < MIN_EVIDENCE_MATCHES:
+            continue
+        v_mag = sky.mag[found.star]
+        other = StarMatch(found.observed, found.star, cam_from_ref, -found.dex, v_mag)
+        covariance_rad2 = max(found.chi2, 1.0) * found.covariance_rad2
+        rms_px = found.rms * lens.focal_px
+        solved = Attitude("solved", cam_from_ref, covariance_rad2, other, rms_px, lens)
+        skies.append((other, solved))
+    return _compared(skies, matcher, camera) if len(skies) > 1 else attitude
 
 
-def _attitude_of(solution: Solution, camera: Camera, sky: SkyIndex) -> Attitude:
-    """Attitude of a solution, with the errors that its residuals imply."""
-    cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-    match = StarMatch(
-        solution.observed, solution.star, cam_from_ref, -solution.dex, sky.mag[solution.star]
+def _compared(
+    skies: list[tuple[StarMatch, Attitude]], matcher: FieldMatcher, camera: Camera
+) -> Attitude:
+    """Return the attitude of most matches with its rivals, or the refusal of an ambiguous frame: step 5."""
+    skies.sort(key=lambda one: -len(one[0].star))
+    (first, best), (second, _) = skies[:2]
+    # The catalog's stars of both fields, down to the faintest match
+    faintest = max(first.star.max(), second.star.max())
+    rich, poor = (
+        np.count_nonzero(matcher.in_field(camera, one.cam_from_ref)[0] <= faintest)
+        for one in (first, second)
     )
-    covariance_rad2 = max(solution.chi2, 1.0) * solution.covariance_rad2
-    rms_px = solution.rms * camera.focal_px
-    return Attitude("solved", cam_from_ref, covariance_rad2, match, rms_px, camera)
-
-
-def _matches(attitude: Attitude) -> int:
-    """Number of matches of an attitude."""
-    return len(attitude.match.star) if attitude.match else 0
+    attitudes = tuple(one for _, one in skies)
+    if _is_comparable(len(first.star), len(second.star), rich / (rich + poor)):
+        return Attitude(AMBIGUOUS, rivals=attitudes)
+    return replace(best, rivals=attitudes[1:])
 
 
 def _is_comparable(matches: int, fewer: int, share: float) -> bool:
     """Whether a sky of fewer matches is comparable; `share` is the first one's share q of the catalog's stars."""
     return log10_tail(matches + fewer, matches, share) > LOG10_COMPARABLE
-
-
-def _share(matcher: FieldMatcher, first: Attitude, second: Attitude) -> float:
-    """Share of the first field in the catalog's stars of two fields, down to the faintest match."""
-    skies = first, second
-    faintest = max(int(one.match.star.max()) for one in skies if one.match)
-    counts = [
-        np.count_nonzero(matcher.in_field(one.camera, one.cam_from_ref)[0] <= faintest)
-        for one in skies
-        if one.camera and one.cam_from_ref
-    ]
-    return counts[0] / sum(counts)
 
 
 @jit
