@@ -11,7 +11,8 @@ an attitude leaves unmatched:
    has it: the other sky may be that of another field. This finds it where most unmatched lights are its stars.
 4. A rival has the evidence of an accepted attitude among the unmatched lights. A lens or a shutter that does not fit
    its model also leaves stars unmatched, which fit a second, slightly different attitude; but each star is then seen
-   once. Such a solution is no rival. Repeat from step 2 with the lights that are left.
+   once. Such a solution is no rival, and neither is one that the covariance of the first attitude covers. Repeat from
+   step 2 with the lights that are left.
 5. Compare the numbers of matches. If the weaker sky is comparable, the answer is ambiguous.
 
 If two skies had the same throughput, each of their n = n_A + n_B matched lights would belong to A with the probability
@@ -80,6 +81,7 @@ SHORT_PAIR = 0.04  # of the field size: shorter pairs hardly determine the roll
 THROUGHPUT_MAG = 1.5  # greatest difference of the brightness of two skies
 MAGNITUDE_SIGMA = 0.3  # least error of a difference of magnitudes
 TRUE_SKY_MAG = 0.25  # a sky no fainter than this against the calibration is no reflection
+SAME_SIGMAS = 5.0  # difference of attitudes that the covariance of the first one covers
 SAME_RAD = 0.1  # difference of attitudes that no misfit of the camera model causes
 
 
@@ -102,7 +104,8 @@ def with_rivals(
     """
     match = attitude.match
     camera = attitude.camera
-    if match is None or camera is None:
+    covariance_rad2 = attitude.covariance_rad2
+    if match is None or camera is None or covariance_rad2 is None:
         return attitude
     # 1. Unmatched lights: another field may have half as many stars as the mean one.
     matched = match.observed
@@ -131,18 +134,26 @@ def with_rivals(
             break
         matched = np.concatenate([matched, found.observed])
         # 4. Second sky, or misfit
-        cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw)
-        turned_rad = (cam_from_ref * match.cam_from_ref.inv()).magnitude()
-        twice = len(np.intersect1d(found.star, match.star))
-        if turned_rad < SAME_RAD and twice < MIN_EVIDENCE_MATCHES:
+        if not _is_second_sky(found, match, covariance_rad2):
             continue
+        cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw)
         v_mag = sky.mag[found.star]
         other = StarMatch(found.observed, found.star, cam_from_ref, -found.dex, v_mag)
-        covariance_rad2 = max(found.chi2, 1.0) * found.covariance_rad2
+        spread_rad2 = max(found.chi2, 1.0) * found.covariance_rad2
         rms_px = found.rms * lens.focal_px
-        solved = Attitude("solved", cam_from_ref, covariance_rad2, other, rms_px, lens)
+        solved = Attitude("solved", cam_from_ref, spread_rad2, other, rms_px, lens)
         skies.append((other, solved))
     return _compared(skies, matcher, camera) if len(skies) > 1 else attitude
+
+
+def _is_second_sky(found: Solution, match: StarMatch, covariance_rad2: Floats) -> bool:
+    """Return whether a solution is a second sky: step 4; `covariance_rad2` is that of the first one."""
+    cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw)
+    turn_rad = (cam_from_ref * match.cam_from_ref.inv()).as_rotvec()
+    distance2 = turn_rad @ np.linalg.solve(covariance_rad2 + found.covariance_rad2, turn_rad)
+    twice = len(np.intersect1d(found.star, match.star))
+    is_far = turn_rad @ turn_rad > SAME_RAD**2 or twice >= MIN_EVIDENCE_MATCHES
+    return bool(is_far and distance2 > SAME_SIGMAS**2)
 
 
 def _compared(
