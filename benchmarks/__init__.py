@@ -60,6 +60,7 @@ AREAS = {
     "dome_placement": Area("layouts of LEDs compared at independent attitudes"),
     "robust_hostile": Area("images that do not show the sky", {"count": 100}),
     "robust_no_sky": Area("answers to lights without a sky", {"count": 1000}),
+    "robust_two_skies": Area("a second sky in the frame", {"count": 320}),
     "robust_hour": Area("an hour of closed loop: memory, time stamps, wrong attitudes"),
     "oracles_frames": Area("our frames, solved by other tools", {"count": 10}),
     "oracles_galsim": Area("GalSim's frames, solved by ours", {"count": 9}),

@@ -1,8 +1,10 @@
 """False-alarm rate: how often the tracker answers frames that do not show the sky, or hardly.
 
-Answers and wrong ones for three kinds of frames, with the cameras of `lost_in_space`:
+Answers and wrong ones for five kinds of frames, with the cameras of `lost_in_space`:
 
     no star   : 3 to 30 lights at uniform random positions, with magnitudes of the catalog
+    lattice   : lights on a square lattice, turned by any angle, with errors of the noise; a tenth as many
+    clumps    : 5 to 90 lights in three clumps; a tenth as many
     mirrored  : a workload's field with its columns reversed, which no rotation of the sky gives; a tenth as many
     few stars : 3 to 5 stars of a field among 30 false lights; a tenth as many. An answer is right if it is within 10'
         of the truth, or of what the true identities of the stars give: three stars side by side hardly tell the roll
@@ -26,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.lost_in_space import WORKLOADS, Field, Workload, field, oracle, sky
 from benchmarks.timing import figure, verdict
 from estimator.catalog.catalog import StarCatalog
+from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -43,6 +46,39 @@ Frame = tuple[Centroids, tuple[Rotation, ...]]  # with the right answers
 def no_star(work: Workload, stars: StarCatalog, rng: np.random.Generator) -> Frame:
     """Lights at uniform random positions, brightest first."""
     return false_lights(work, stars, int(rng.integers(LIGHTS[0], LIGHTS[1] + 1)), rng), ()
+
+
+def lattice(work: Workload, stars: StarCatalog, rng: np.random.Generator) -> Frame:
+    """Lights on a lattice of 3 x 3 to 9 x 9 that fills half of the field or more."""
+    camera = work.camera
+    side = int(rng.integers(3, 10))
+    size_px = rng.uniform(0.5, 1.0) * min(camera.width_px, camera.height_px)
+    x, y = np.meshgrid(*2 * [np.linspace(-size_px / 2, size_px / 2, side)])
+    angle = rng.uniform(0, 2 * np.pi)
+    cos = np.cos(angle)
+    sin = np.sin(angle)
+    xy_px = np.column_stack([x.ravel(), y.ravel()]) @ [[cos, sin], [-sin, cos]]
+    return placed(work, stars, xy_px + camera.center_px, rng), ()
+
+
+def clumps(work: Workload, stars: StarCatalog, rng: np.random.Generator) -> Frame:
+    """Lights in three clumps, each a twentieth of the field wide."""
+    camera = work.camera
+    size_px = np.array([camera.width_px, camera.height_px])
+    middle_px = rng.uniform(0.1, 0.9, (3, 2)) * size_px
+    count = int(rng.integers(5, 91))
+    offset_px = 0.05 * camera.width_px * rng.standard_normal((count, 2))
+    return placed(work, stars, middle_px[rng.integers(0, 3, count)] + offset_px, rng), ()
+
+
+def placed(
+    work: Workload, stars: StarCatalog, xy_px: Floats, rng: np.random.Generator
+) -> Centroids:
+    """Lights at places with the noise of the workload and magnitudes of the catalog, brightest first."""
+    xy_px = xy_px + work.noise_px * rng.standard_normal(xy_px.shape)
+    xy_px = rng.permutation(xy_px[work.camera.contains(xy_px)])
+    mag = np.sort(rng.choice(stars.v_mag, len(xy_px)))
+    return Centroids(xy_px, np.full(len(mag), work.noise_px), 10 ** (-0.4 * mag))
 
 
 def mirrored(work: Workload, stars: StarCatalog, rng: np.random.Generator) -> Frame:
@@ -88,6 +124,8 @@ KINDS: dict[
     str, tuple[Callable[[Workload, StarCatalog, np.random.Generator], Frame], float]
 ] = {
     "no star": (no_star, 1.0),
+    "lattice": (lattice, 0.1),
+    "clumps": (clumps, 0.1),
     "mirrored": (mirrored, 0.1),
     "few stars": (few_stars, 0.1),
 }

@@ -355,6 +355,9 @@ class Attitude:
     constant_rad2
         (3, 3) part of systematic_rad2 that is one rotation of the camera in all frames, such as that by the error of
         its place; None if there is none
+    rivals
+        Attitudes of other skies in the frame, each with its own match and evidence, the most matches first. Those of a
+        solution are too weak to be the true one. Those of an ambiguous frame include the attitude that fits best
     """
 
     status: str
@@ -367,6 +370,7 @@ class Attitude:
     rate: RateEstimate | None = None
     angles_compared: int | None = None
     constant_rad2: Floats | None = None
+    rivals: tuple[Attitude, ...] = ()
 
     @property
     def solved(self) -> bool:

@@ -55,14 +55,13 @@ from estimator.identification.led_evidence import (
     same_identification,
 )
 from estimator.identification.led_index import DomeIndex, has_led_near
+from estimator.identification.refusals import AMBIGUOUS, NO_MATCH
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
 MIN_SEPARATION = (
     1e-9  # of a pair, in tangents: closer detections have no direction between them
 )
-AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
-NO_MATCH = "no identification beyond chance"
 
 
 def identify(

@@ -1,8 +1,21 @@
-"""What to change if an identifier refuses a field: each refusal names the setting that would help."""
+"""Reasons why a frame is not solved, one constant text each, and the setting that would help an identifier.
+
+A status depends on the frame only by its case, so that equal refusals are counted together.
+"""
 
 from math import inf
 
 from estimator.identification.chance import MIN_MATCHES
+
+NO_LIGHTS = "no lights detected"
+NO_STARS = "too few stars detected"
+NO_MATCH = "no identification beyond chance"
+# The search has tried all that it can try, or its effort is used up.
+FALSE_LIGHTS = f"{NO_MATCH}: too many false lights"
+BUDGET = f"{NO_MATCH}: the budget of the search is used up"
+# Evidence that is decisive at a focal length outside of the range that was given.
+WRONG_SCALE = "wrong scale: the stars match at another focal length"
+AMBIGUOUS = "ambiguous: another attitude fits the lights as well"
 
 # Identifiers whose papers accept a match by a rule of their own (see `solver_options.Options.acceptance`).
 OWN_RULE = ("saa", "shefex", "master_star", "fialho_1", "fialho_2", "fialho_3", "fialho_4")
@@ -17,8 +30,6 @@ def advice(
     cos_error: float | None = None,
 ) -> str:
     """The setting that would help a published identifier that has refused a field.
-
-    The text depends on the frame only by its case, so that equal refusals are counted together.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ class Solution(NamedTuple):
     chi2
         Sum of the squared Mahalanobis distances of the matches per degree of freedom
     dex
-        log10 of the Bayes factor
+        log10 of the Bayes factor; without a solution -inf, or NaN if the effort of the search is used up
     """
 
     observed: NDArray[np.int64]
@@ -112,10 +112,10 @@ class Solution(NamedTuple):
 
 
 @jit
-def no_hypothesis() -> Hypothesis:
-    """The empty hypothesis, with evidence -inf."""
+def no_hypothesis(dex: float = -np.inf) -> Hypothesis:
+    """The empty hypothesis, with evidence -inf; with NaN of a search whose effort is used up."""
     none = np.empty(0, np.int64)
-    return Hypothesis(none, none, np.eye(3), 1.0, np.eye(4), -np.inf)
+    return Hypothesis(none, none, np.eye(3), 1.0, np.eye(4), dex)
 
 
 @jit

@@ -184,7 +184,7 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     # 8. A weaker attitude must be significant, and clearly better than any other.
     if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
         return best
-    return no_hypothesis()
+    return no_hypothesis(np.nan if checks[0] > limit else -np.inf)
 
 
 @jit
@@ -478,7 +478,7 @@ def fit_to_all(
         if all detections together are not beyond chance
     """
     if not candidate.dex >= accept_dex:
-        return build_solution(detections, stars, no_hypothesis())
+        return build_solution(detections, stars, no_hypothesis(candidate.dex))
     chosen = detections
     full = no_hypothesis()
     # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.

@@ -24,13 +24,13 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
 from estimator.identification.led_codes import LedCode, LightTracks
+from estimator.identification.refusals import NO_LIGHTS
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import (
     Clock,
     Settings,
     direction_sigma_rad,
 )
-from estimator.trackers.star_tracker import NO_STARS
 
 COLLECTING = "codes: too few lights have been seen long enough"
 MISSED_FRAMES = 2  # missed frames after which a light's track ends, if LEDs are never dark
@@ -168,7 +168,7 @@ class CodedTracker(DomeTracker):
         self.templates[:, :, self.tracks.column] = templates
         self.spread[:, :, self.tracks.column] = spread
         if not len(centroids):
-            return Attitude(NO_STARS)
+            return Attitude(NO_LIGHTS)
         # 3. to 5. Names and attitude
         return self._solve_identified(centroids, self._identify_codes(centroids), clock)
 

@@ -44,8 +44,7 @@ from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.led_index import build_dome_index, inner_field
-from estimator.identification.led_search import NO_MATCH
-from estimator.identification.refusals import advice
+from estimator.identification.refusals import NO_LIGHTS, NO_MATCH, NO_STARS, advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
@@ -57,7 +56,6 @@ from estimator.trackers.pipeline import (
     direction_sigma_rad,
 )
 from estimator.trackers.rolling_shutter import Lights, solve_lights
-from estimator.trackers.star_tracker import NO_STARS
 
 # Least centroid error of an LED, for effects outside of survey and calibration
 MIN_ERROR_PX = 0.3
@@ -251,7 +249,7 @@ class DomeTracker(FrameTracker):
         centroids.check_values()
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS)
+            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)

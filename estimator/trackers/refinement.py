@@ -21,13 +21,13 @@ from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import mutual_nearest
+from estimator.identification.refusals import NO_MATCH, WRONG_SCALE
 from estimator.identification.star_detections import information_of
 from estimator.identification.star_evidence import Solution
 from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers import lens_fit
 from estimator.trackers.misfit import Refit, residuals_too_great
 
-NO_MATCH = "no identification beyond chance"
 MISFIT = "the camera model does not fit the field"
 SHEARED = f"{MISFIT}: it is sheared, as by a rolling shutter of a camera that turns"
 PARTIAL = f"{MISFIT}: only a part of the stars matches; calibrate the lens"
@@ -211,9 +211,9 @@ class FieldMatcher:
 
     def reason_against(self, refitted: Refit, centroids: Centroids) -> str:
         """Return the reason to refuse a solution with its camera; empty if there is none."""
-        solution, camera, _, sheared = refitted
+        solution, camera, _, sheared, _ = refitted
         if solution.dex < -ACCEPT_LOG10_CHANCE:
-            return NO_MATCH
+            return WRONG_SCALE if solution.dex == -np.inf else NO_MATCH
         if sheared:
             return SHEARED
         return PARTIAL if self.misfits(camera, solution, centroids) else ""

@@ -39,6 +39,8 @@ class SearchModel(NamedTuple):
 
 
 WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, WRONG_FOCAL)
+# Of a frame that is refused: whether it would be solved with another focal length
+WRONG_SCALE_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 10_000, True, 0.4)
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
     WRONG_FOCAL_SEARCH,

@@ -35,7 +35,15 @@ from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of
 from estimator.identification import star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from estimator.identification.refusals import advice
+from estimator.identification.refusals import (
+    BUDGET,
+    FALSE_LIGHTS,
+    NO_LIGHTS,
+    NO_MATCH,
+    NO_STARS,
+    WRONG_SCALE,
+    advice,
+)
 from estimator.identification.star_detections import (
     Detections,
     Sensor,
@@ -52,17 +60,17 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
 )
-from estimator.trackers.refinement import NO_MATCH, SHEARED, FieldMatcher
+from estimator.trackers.refinement import SHEARED, FieldMatcher
+from estimator.trackers.rivals import with_rivals
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
     FOCAL_MARGIN,
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
+    WRONG_SCALE_SEARCH,
     SearchModel,
 )
-
-NO_STARS = "too few stars detected"
 
 SETTINGS = Settings()
 
@@ -304,7 +312,7 @@ class StarTracker(FrameTracker):
             )
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS)
+            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lights = Lights(
             self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
@@ -322,12 +330,21 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, clock: Clock, effort: int | None
     ) -> Attitude:
         """Identify and solve centroids of one time."""
+        compared = np.zeros(1, np.int64)
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_by_evidence(centroids, searches, clock)
-        compared = np.zeros(1, np.int64)
-        attitude = self._identify_by_paper(centroids, clock, compared)
-        return replace(attitude, angles_compared=int(compared[0]) or None)
+            attitude = self._identify_by_evidence(centroids, searches, clock)
+            unnamed = effort is None and attitude.status in (BUDGET, FALSE_LIGHTS)
+            if unnamed and self._is_wrong_scale(centroids):
+                attitude = Attitude(WRONG_SCALE)
+        else:
+            attitude = self._identify_by_paper(centroids, clock, compared)
+            attitude = replace(attitude, angles_compared=int(compared[0]) or None)
+        attitude = with_rivals(
+            attitude, centroids, self.sigma_px, self.sensor, self.sky, self.field_matcher
+        )
+        clock.lap("identify")
+        return attitude
 
     def _identify_by_paper(
         self, centroids: Centroids, clock: Clock, compared: Ints
@@ -508,7 +525,15 @@ class StarTracker(FrameTracker):
             clock.lap("solve")
             if reason == SHEARED:
                 break
+        if status == NO_MATCH:
+            status = BUDGET if np.isnan(solution.dex) else FALSE_LIGHTS
         return Attitude(status)
+
+    def _is_wrong_scale(self, centroids: Centroids) -> bool:
+        """Return whether a short search with a focal length that is hardly known finds a decisive one out of range."""
+        found, _ = self._search(centroids, self.sigma_px(centroids), WRONG_SCALE_SEARCH)
+        is_decisive = found.dex >= star_search.DECISIVE_DEX
+        return is_decisive and abs(found.focal_ratio - 1) > self.focal_uncertainty
 
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel

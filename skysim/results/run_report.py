@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from estimator.trackers.star_tracker import NO_STARS
+from estimator.identification import refusals as reasons
 from skysim.core.types import FrameRow
 from skysim.results import metrics
 from skysim.results.plots import Picture, figure_png, stacked_axes
@@ -31,12 +31,22 @@ from skysim.results.report_blocks import (
 from skysim.results.requirements import NOT_MET, Judgment
 
 # Settings that help where the tracker's own refusal names none.
+BRIGHTER = (
+    "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)"
+)
+FEWER = (
+    "raise tracker.centroid_sigma_px if the camera or the map is less accurate than assumed, or leave out false lights"
+    " with tracker.brightest"
+)
 HELP = {
-    NO_STARS: "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
-    "no identification beyond chance": "raise tracker.centroid_sigma_px if the camera or the map is less accurate than"
-    " assumed, or leave out false lights with tracker.brightest",
-    "ambiguous: another attitude fits the lights as well": "tell the lights apart by tracker.brightness_sigma with"
-    " several levels in light.layout, or make the layout irregular",
+    reasons.NO_LIGHTS: BRIGHTER,
+    reasons.NO_STARS: BRIGHTER,
+    reasons.NO_MATCH: FEWER,
+    reasons.FALSE_LIGHTS: FEWER,
+    reasons.BUDGET: FEWER,
+    reasons.WRONG_SCALE: "correct the focal length that the tracker assumes",
+    reasons.AMBIGUOUS: "tell LEDs apart by tracker.brightness_sigma with several levels in light.layout, or make the"
+    " layout irregular; keep reflections of the stars out of the field",
 }
 MOTION = {  # sentences of the motion's statistics, by the statistic that a scene must have
     "pointing_deg_worst": "pointing: worst {pointing_deg_worst:.3g}°, at the end {pointing_deg_end:.2g}°; "
@@ -257,7 +267,8 @@ def refusals(rows: Sequence[FrameRow], findings: Sequence[str]) -> list[str]:
     Whether stars are too few in too long or too short an exposure is known to the check, by its `findings`.
     """
     exposure = [line for line in findings if line.startswith("exposure.time: ")]
-    advice = HELP | ({NO_STARS: exposure[0]} if exposure else {})
+    darkness = dict.fromkeys((reasons.NO_LIGHTS, reasons.NO_STARS), *exposure[:1])
+    advice = HELP | (darkness if exposure else {})
     counts = Counter(row.status for row in rows if row.status in HELP)
     return [f"{count} frames: {status}; {advice[status]}" for status, count in counts.items()]
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
+from estimator.identification.refusals import NO_MATCH, NO_STARS
 from estimator.trackers.pipeline import Clock
-from estimator.trackers.refinement import NO_MATCH
-from estimator.trackers.star_tracker import NO_STARS
 from skysim.apps import plate_solver
 from skysim.apps.plate_solver import solver as searching
 from skysim.core.constants import ARCSEC_RAD

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from estimator.attitude.dome_map import project
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_EVIDENCE_MATCHES
-from estimator.identification.led_search import NO_MATCH
+from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Report
 from skysim.apps.plate_solver import diagnosis
 from skysim.apps.plate_solver.solver import KnownCamera

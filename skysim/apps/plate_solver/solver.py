@@ -34,8 +34,8 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.detection.classify import NO_STAR
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE
+from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
-from estimator.trackers.refinement import NO_MATCH
 from estimator.trackers.search_models import QUAD_SEARCHES
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name

@@ -162,4 +162,4 @@ def test_four_stars_among_twice_as_many_false_ones_are_refused(tmp_path: Path) -
     """A mirrored sky that once had an answer: 4 of 12 lights on stars, a chance of one in ten thousand by itself."""
     name, shot, answer, _, _ = hostile.Judge(tmp_path).take(68, 14)
     assert (name, shot.skies) == ("mirrored", ())
-    assert answer["status"] == "no identification beyond chance"
+    assert answer["status"].startswith("no identification beyond chance")
