@@ -108,7 +108,6 @@ def streak(
     1. Fit the streaks. If none converges (a frame that is not smeared), all blobs are fitted by `gaussian_fit`.
     2. Fit the blobs that are not streaks by a Gaussian, if the streaks are no longer than half its window; those that
        fail, and longer ones, keep their center of gravity.
-    3. Correct the centers of streaks that a roll has bent.
     """
     image = prepare(image, blobs, gain_e_dn, priors)
     # 1. Streaks
@@ -131,11 +130,6 @@ def streak(
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
     # Covariance of the streaks without their priors
     own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
-    if blobs.turn_rad:
-        # 3. A streak v that a roll w bends is an arc. Its mean is off its middle by a 24th of the acceleration w J v,
-        # with J a rotation by 90 degrees.
-        x, y = _frame_streaks(image, blobs, priors).T
-        rows[:, :2] -= blobs.turn_rad / 24 * np.column_stack([-y, x])
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 

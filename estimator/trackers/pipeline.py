@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.rate import center_streak_px
+from estimator.attitude.rate import at_mean_attitude, center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
@@ -278,7 +278,9 @@ def detect_and_centroid(
         camera.contains(centroids.xy_px) & (sigma_px > 0) & (sigma_px < MAX_CENTROID_SIGMA_PX)
     )
     valid &= (centroids.flux > 0) & (centroids.flux < np.inf)
-    return centroids if valid.all() else centroids.take(valid)
+    if not valid.all():
+        centroids = centroids.take(valid)
+    return at_mean_attitude(camera, centroids)
 
 
 def monochrome(image: NDArray, settings: Settings) -> NDArray:
