@@ -8,6 +8,7 @@ All centroiders have the parameters of `cog`, and raise ImageError for unusable 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +134,54 @@ def streak(
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
 
 
+def known_streaks(
+    image: NDArray,
+    blobs: Blobs,
+    centroids: Centroids,
+    streak_px: Floats,
+    gain_e_dn: float,
+    priors: FramePriors,
+) -> Centroids:
+    """Fit the centers of streaks again, with the streak vectors that all streaks of the frame together determine.
+
+    Noise breaks a faint streak into fragments, and a fit of one star alone may take a fragment for the whole. With its
+    length known, both ends determine the center: their likelihood falls twice as steeply (`_end_variance_px2`).
+
+    1. Fit every streak of a known vector; begin again where the center has moved, with the pixels around it.
+    2. Of two fits at one place, which are fragments of one streak, keep the first, of the brighter blob. Those that
+       fail are no whole streaks. The errors of all these are NaN.
+
+    Parameters
+    ----------
+    centroids
+        Centroids of the blobs
+    streak_px
+        (N, 2) vector of each blob's streak
+    """
+    image = prepare(image, blobs, gain_e_dn, priors)
+    # 1. Fits
+    xy_px = centroids.xy_px
+    for _ in range(STREAK_ROUNDS):
+        rows = _fit_around(image, blobs, xy_px, streak_px, gain_e_dn, priors, TIGHT)
+        moved = np.hypot(*(rows[:, :2] - xy_px).T) > MOVED_PX
+        if not moved.any():
+            break
+        xy_px = np.where(moved[:, None], rows[:, :2], xy_px)
+    # 2. Fragments
+    offset_px = np.abs(rows[:, None, :2] - rows[:, :2]).max(axis=2)
+    again = np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)
+    rows[again] = np.nan
+    sigma_px = np.sqrt((rows[:, 5] + rows[:, 6]) / 2)
+    covariance_px2 = rows[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
+    return replace(
+        centroids,
+        xy_px=rows[:, :2],
+        sigma_px=sigma_px,
+        flux=rows[:, 2],
+        covariance_px2=covariance_px2,
+    )
+
+
 def disk(
     image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
 ) -> Centroids:
@@ -187,6 +236,10 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
 
 
 STREAK_ROUNDS = 4  # largest number of fits of a frame's streaks
+# Factor of the priors of a streak that is known from all others.
+TIGHT = 0.02
+MOVED_PX = 1.0  # a center farther from its start is fitted again
+ONE_PLACE_PX = 2.0  # two fits that are nearer than this are of one streak
 MIN_STREAKS = 3  # least number of fitted streaks whose median replaces the frame's streak
 
 CENTROIDERS: dict[str, Centroider] = {
@@ -227,20 +280,42 @@ def _fit_streaks(
     the expected one: the ends of faint streaks are below the threshold, so their moments make them too short.
     """
     expected_px = _frame_streaks(image, blobs, priors)
-    sky = blobs.background
     rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
         length_px = np.hypot(*expected_px.T)
         if np.all(length_px < streak_fit.MIN_STREAK_PX):
             break
-        scene = image, blobs.xy_px, blobs.box_px, sky.level, sky.noise
-        rows = streak_fit.fit_all(*scene, expected_px, float(gain_e_dn), priors.saturation)
+        rows = _fit_around(image, blobs, blobs.xy_px, expected_px, gain_e_dn, priors)
         # The streaks without their priors, as those depend on the expected streak.
         shift_px = _median_shift(rows[:, 8:10], expected_px)
         if np.hypot(*shift_px) < streak_fit.length_sigma_px(float(np.median(length_px))) / 4:
             break
         expected_px = expected_px + shift_px
     return rows
+
+
+def _fit_around(
+    image: NDArray,
+    blobs: Blobs,
+    xy_px: Floats,
+    expected_px: Floats,
+    gain_e_dn: float,
+    priors: FramePriors,
+    tightness: float = 1.0,
+) -> Floats:
+    """Return the rows of `streak_fit.fit_all` around expected centers and streaks (N, 2)."""
+    sky = blobs.background
+    return streak_fit.fit_all(
+        image,
+        xy_px,
+        blobs.box_px,
+        sky.level,
+        sky.noise,
+        expected_px,
+        float(gain_e_dn),
+        priors.saturation,
+        tightness,
+    )
 
 
 def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:

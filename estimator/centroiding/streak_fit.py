@@ -19,7 +19,7 @@ from math import cos, erf, exp, hypot, pi, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.centroiding.moments import belongs_to_neighbor, neighbors
+from estimator.centroiding.moments import neighbors
 from estimator.core import least_squares
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
@@ -30,6 +30,9 @@ MARGIN_PX = 4
 MAX_HALF_WINDOW_PX = 96
 REACH_PX = (
     4.5  # largest distance of a pixel from the initial line; farther ones contain only sky
+)
+CORE_PX = (
+    2.0  # pixels nearer than this belong to a streak even if they are nearer to another one
 )
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
@@ -60,6 +63,7 @@ def fit_all(
     streaks: Floats,
     gain_e_dn: float,
     saturation: float,
+    tightness: float = 1.0,
 ) -> Floats:
     """Fit every blob around its expected streak; return (N, 13), NaN if it is not a streak.
 
@@ -70,6 +74,8 @@ def fit_all(
     ----------
     streaks
         (N, 2) expected streak (dx, dy) of each blob, px
+    tightness
+        Factor of the priors' standard deviations: below 1 where the streaks are known better than by a frame's median
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
@@ -101,9 +107,11 @@ def fit_all(
         p[ANGLE] = angle
         p[WIDTH] = width_px
         p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
-        own = (boxes, buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)], n)
-        count = _select_pixels(image, own, (x0, y0, x1, y1), saturation, p, pixels)
-        if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
+        near = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        offsets = _offsets_of_others(xy, near, n, p)
+        count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
+        data = pixels[:, :count]
+        if p[FLUX] > 0 and _fit(data, sigma, gain_e_dn, tightness, rows, weight, p, out[n]):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
 
@@ -119,9 +127,26 @@ def _largest_window(streaks: Floats) -> int:
 
 
 @jit
+def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
+    """Return the (K, 2) offsets of nearby blobs from blob n, without those that may be fragments of its streak."""
+    offsets = np.empty((len(near), 2))
+    count = 0
+    for m in near:
+        x = xy[m, 0] - xy[n, 0]
+        y = xy[m, 1] - xy[n, 1]
+        along = x * cos(p[ANGLE]) + y * sin(p[ANGLE])
+        across = y * cos(p[ANGLE]) - x * sin(p[ANGLE])
+        if abs(across) > CORE_PX or abs(along) > p[LENGTH]:
+            offsets[count, 0] = x
+            offsets[count, 1] = y
+            count += 1
+    return offsets[:count]
+
+
+@jit
 def _select_pixels(
     image: NDArray,
-    blob: tuple[Ints, Ints, int],
+    offsets: Floats,
     window: tuple[int, int, int, int],
     saturation: float,
     p: Floats,
@@ -131,8 +156,8 @@ def _select_pixels(
 
     Parameters
     ----------
-    blob
-        Boxes of all blobs, the rows of its neighbors, and its own row
+    offsets
+        (K, 2) offsets of other streaks, whose pixels are left out
     window
         x0, y0, x1, y1
     p
@@ -140,15 +165,19 @@ def _select_pixels(
     pixels
         (3, K) x, y and value of the pixels, written in place
     """
-    boxes, neighbor_rows, n = blob
     x0, y0, x1, y1 = window
     p[FLUX] = 0.0
     count = 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
-            if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(
-                boxes, neighbor_rows, n, x, y
-            ):
+            distance = _distance_to_line(p, x, y)
+            if distance > REACH_PX:
+                continue
+            own = True
+            for k in range(len(offsets)):
+                other = _distance_to_line(p, x - offsets[k, 0], y - offsets[k, 1])
+                own = own and (distance < CORE_PX or distance <= other)
+            if not own:
                 continue
             p[FLUX] += image[y, x] - p[SKY]
             if image[y, x] < saturation:
@@ -189,6 +218,7 @@ def _fit(
     pixels: Floats,
     noise: float,
     gain_e_dn: float,
+    tightness: float,
     rows: Floats,
     weight: Floats,
     p: Floats,
@@ -203,7 +233,7 @@ def _fit(
     3. Apply the step, shortened to about a pixel, and give up far from the start.
     4. At convergence, read the center's covariance from the inverse normal matrix. Where the model does not fit (two
        crossing streaks) the residuals inflate it. Add the error of the ends (`_write_streak`).
-    5. Compute the streak's vector without its priors (`_own_vector`).
+    5. Compute the streak's vector without its priors (`_own_vector`), unless they are tight.
 
     Parameters
     ----------
@@ -211,6 +241,8 @@ def _fit(
         (3, K) x, y and value of the pixels used
     noise
         Standard deviation of a pixel of the sky
+    tightness
+        Factor of the priors' standard deviations
     rows, weight
         Work arrays for `_rows`
     p
@@ -227,7 +259,7 @@ def _fit(
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         # 2. Step
         least_squares.normal_equations(rows, weight, count, normal)
-        _add_priors(normal, p, start)
+        _add_priors(normal, p, start, tightness)
         fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
@@ -242,17 +274,19 @@ def _fit(
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
             _write_streak(normal, p, misfit, end_variance_px2, step, out)
             # 5. The streak's own vector
-            _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
+            if tightness == 1:
+                _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
             return True
     return False
 
 
 @jit
-def _add_priors(normal: Floats, p: Floats, start: Floats) -> None:
+def _add_priors(normal: Floats, p: Floats, start: Floats, tightness: float) -> None:
     """Add the priors on length, direction and width to the normal matrix."""
-    length_sigma = length_sigma_px(start[LENGTH])
+    length_sigma = tightness * length_sigma_px(start[LENGTH])
     least_squares.add_prior(normal, LENGTH, start[LENGTH] - p[LENGTH], length_sigma)
-    least_squares.add_prior(normal, ANGLE, start[ANGLE] - p[ANGLE], ANGLE_RAD)
+    angle_sigma = tightness * ANGLE_RAD
+    least_squares.add_prior(normal, ANGLE, start[ANGLE] - p[ANGLE], angle_sigma)
     width_sigma = WIDTH_FRACTION * start[WIDTH]
     least_squares.add_prior(normal, WIDTH, start[WIDTH] - p[WIDTH], width_sigma)
 
