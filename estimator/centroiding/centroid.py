@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
-from estimator.detection.classify import streaks_px
+from estimator.detection.classify import VOTING_BLOBS, streaks_px
 from estimator.detection.detect import check_pixel_type, to_native
 
 Centroider = Callable[..., Centroids]  # (image, blobs, gain_e_dn, priors)
@@ -160,17 +160,17 @@ def known_streaks(
     """
     image = prepare(image, blobs, gain_e_dn, priors)
     # 1. Fits
-    xy_px = centroids.xy_px
+    rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
+    xy_px = centroids.xy_px.copy()
+    moved = np.arange(len(blobs))
     for _ in range(STREAK_ROUNDS):
-        rows = _fit_around(image, blobs, xy_px, streak_px, gain_e_dn, priors, TIGHT)
-        moved = np.hypot(*(rows[:, :2] - xy_px).T) > MOVED_PX
-        if not moved.any():
-            break
-        xy_px = np.where(moved[:, None], rows[:, :2], xy_px)
+        again = _fit_around(image, blobs, xy_px, streak_px, moved, gain_e_dn, priors, TIGHT)
+        rows[moved] = again[moved]
+        moved = np.flatnonzero(np.hypot(*(rows[:, :2] - xy_px).T) > MOVED_PX)
+        xy_px[moved] = rows[moved, :2]
     # 2. Fragments
     offset_px = np.abs(rows[:, None, :2] - rows[:, :2]).max(axis=2)
-    again = np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)
-    rows[again] = np.nan
+    rows[np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)] = np.nan
     sigma_px = np.sqrt((rows[:, 5] + rows[:, 6]) / 2)
     covariance_px2 = rows[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
     return replace(
@@ -235,7 +235,7 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
     return to_native(image)
 
 
-STREAK_ROUNDS = 4  # largest number of fits of a frame's streaks
+STREAK_ROUNDS = 4  # largest number of fits of a streak
 # Factor of the priors of a streak that is known from all others.
 TIGHT = 0.02
 MOVED_PX = 1.0  # a center farther from its start is fitted again
@@ -276,22 +276,21 @@ def _fit_streaks(
 ) -> Floats:
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared.
 
-    Without a streak from the gyro, the fit is repeated with the median of the fitted streaks until that agrees with
-    the expected one: the ends of faint streaks are below the threshold, so their moments make them too short.
+    Without a streak from the gyro, the brightest blobs are first fitted with the median of their fitted streaks until
+    that agrees with the expected one: the ends of faint streaks are below the threshold, so their moments make them too short.
     """
     expected_px = _frame_streaks(image, blobs, priors)
-    rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
-    for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
-        length_px = np.hypot(*expected_px.T)
-        if np.all(length_px < streak_fit.MIN_STREAK_PX):
-            break
-        rows = _fit_around(image, blobs, blobs.xy_px, expected_px, gain_e_dn, priors)
+    some = np.arange(min(VOTING_BLOBS, len(blobs)))
+    for _ in range(0 if priors.streak_px else STREAK_ROUNDS):
+        rows = _fit_around(image, blobs, blobs.xy_px, expected_px, some, gain_e_dn, priors)
         # The streaks without their priors, as those depend on the expected streak.
-        shift_px = _median_shift(rows[:, 8:10], expected_px)
-        if np.hypot(*shift_px) < streak_fit.length_sigma_px(float(np.median(length_px))) / 4:
+        shift_px = _median_shift(rows[some, 8:10], expected_px[some])
+        length_px = float(np.median(np.hypot(*expected_px.T)))
+        if np.hypot(*shift_px) < streak_fit.length_sigma_px(length_px) / 4:
             break
         expected_px = expected_px + shift_px
-    return rows
+    every = np.arange(len(blobs))
+    return _fit_around(image, blobs, blobs.xy_px, expected_px, every, gain_e_dn, priors)
 
 
 def _fit_around(
@@ -299,19 +298,22 @@ def _fit_around(
     blobs: Blobs,
     xy_px: Floats,
     expected_px: Floats,
+    which: Ints,
     gain_e_dn: float,
     priors: FramePriors,
     tightness: float = 1.0,
 ) -> Floats:
-    """Return the rows of `streak_fit.fit_all` around expected centers and streaks (N, 2)."""
+    """Return the rows of `streak_fit.fit_all` around centers and streaks (N, 2), NaN but for the blobs `which`."""
     sky = blobs.background
+    chosen_px = np.zeros_like(expected_px)
+    chosen_px[which] = expected_px[which]
     return streak_fit.fit_all(
         image,
         xy_px,
         blobs.box_px,
         sky.level,
         sky.noise,
-        expected_px,
+        chosen_px,
         float(gain_e_dn),
         priors.saturation,
         tightness,
