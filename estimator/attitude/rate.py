@@ -202,7 +202,7 @@ def from_streaks(
 def image_paths(
     camera: Camera, centroids: Centroids, exposure_s: float
 ) -> tuple[Floats, Floats] | None:
-    """Return each light's streak (N, 2), px, and by how far its center is off; None if the frame's streaks tell nothing.
+    """Return each light's streak (N, 2), px, and by how far its center is off; None without a rate from the streaks.
 
     The rate that fits all streaks gives those of all lights. The center is off from where the mean attitude of the
     exposure puts the light. A camera that rotates by the vector r in the exposure, at a constant rate, sees a ray q

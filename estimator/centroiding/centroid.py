@@ -277,7 +277,8 @@ def _fit_streaks(
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared.
 
     Without a streak from the gyro, the brightest blobs are first fitted with the median of their fitted streaks until
-    that agrees with the expected one: the ends of faint streaks are below the threshold, so their moments make them too short.
+    that agrees with the expected one: the ends of faint streaks are below the threshold, so their moments make them
+    too short.
     """
     expected_px = _frame_streaks(image, blobs, priors)
     some = np.arange(min(VOTING_BLOBS, len(blobs)))

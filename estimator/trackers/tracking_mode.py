@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
@@ -43,6 +44,7 @@ WINDOW_SIGMA = 4.0  # detection threshold: lower than in a frame, as fewer pixel
 # Longer streaks are detected with the streak filter in the whole frame
 LONGEST_STREAK_PX = 4.0
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
+ENDS_PX = 8.0  # length of a streak, of stars 0.7 px wide, whose middle is off by half as much as that of a long one
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 # Least share of the expected stars in a tracked solution: a few may be right where the prediction is wrong.
 LEAST_SHARE = 1 / 3
@@ -244,8 +246,10 @@ class TrackingMode:
         1. Mean rate since the last attitude, and its change: from the mean rate before that attitude, otherwise, less
            accurately, from the rate of this frame's streaks, whose sign the mean rate determines.
         2. A streak's middle between its ends is off from its center of light, where the mean attitude of the exposure
-           puts it, by a T^2 / 12, with the acceleration a along the streak in the exposure T. The covariance gets the
-           square of that (`rate.image_paths` corrects what a constant rate does).
+           puts it, by a T^2 / 12, with the acceleration a along the streak in the exposure T. The fit of a streak of
+           length L and width w is off by about L / (L + ENDS_PX) of that: the light fades from one end to the other by
+           s = a T^2 / L, which moves the middle back by sqrt(pi) / 2 w s, as its ends have the width w. The covariance
+           gets the square (`rate.image_paths` corrects what a constant rate does).
 
         A frame without an attitude leaves the memory unchanged.
         """
@@ -279,7 +283,9 @@ class TrackingMode:
             return replace(attitude, rate=rate)
         # 2. Acceleration
         axis = rate.rate_rad_s / np.linalg.norm(rate.rate_rad_s)
-        off_rad = acceleration_rad_s2 @ axis * exposure_s**2 / 12 * axis
+        length_px = np.hypot(*center_streak_px(self.tracker.camera, rate, exposure_s))
+        share = length_px / (length_px + ENDS_PX)
+        off_rad = share * exposure_s**2 / 12 * (acceleration_rad_s2 @ axis) * axis
         covariance_rad2 = attitude.covariance_rad2 + np.outer(off_rad, off_rad)
         return replace(attitude, rate=rate, covariance_rad2=covariance_rad2)
 
