@@ -138,7 +138,7 @@ def known_streaks(
     image: NDArray,
     blobs: Blobs,
     centroids: Centroids,
-    streak_px: Floats,
+    paths_px: tuple[Floats, Floats],
     gain_e_dn: float,
     priors: FramePriors,
 ) -> Centroids:
@@ -150,15 +150,18 @@ def known_streaks(
     1. Fit every streak of a known vector; begin again where the center has moved, with the pixels around it.
     2. Of two fits at one place, which are fragments of one streak, keep the first, of the brighter blob. Those that
        fail are no whole streaks. The errors of all these are NaN.
+    3. Move the centers to the centers of light where the rate changes in the exposure (`_without_acceleration`).
 
     Parameters
     ----------
     centroids
         Centroids of the blobs
-    streak_px
-        (N, 2) vector of each blob's streak
+    paths_px
+        (N, 2) vector of each blob's streak, and (N, 2) how far its middle is off from its center of light by the
+        constant rate alone
     """
     image = prepare(image, blobs, gain_e_dn, priors)
+    streak_px, ahead_px = paths_px
     # 1. Fits
     rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     xy_px = centroids.xy_px.copy()
@@ -173,11 +176,73 @@ def known_streaks(
     rows[np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)] = np.nan
     sigma_px = np.sqrt((rows[:, 5] + rows[:, 6]) / 2)
     covariance_px2 = rows[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
-    return replace(
+    found = replace(
         centroids,
         xy_px=rows[:, :2],
         sigma_px=sigma_px,
         flux=rows[:, 2],
+        covariance_px2=covariance_px2,
+    )
+    # 3. Acceleration
+    along = streak_px / np.linalg.norm(streak_px, axis=1)[:, None]
+    forward = np.where(np.sum(rows[:, 3:5] * along, axis=1) < 0, -1.0, 1.0)
+    measured_px = forward * rows[:, 8] - np.sum(ahead_px * along, axis=1)
+    length_px = float(np.median(np.linalg.norm(streak_px, axis=1)))
+    return _without_acceleration(found, along, measured_px, rows[:, 9], length_px)
+
+
+def _without_acceleration(
+    centroids: Centroids,
+    along: Floats,
+    ahead_px: Floats,
+    variance_px2: Floats,
+    length_px: float,
+) -> Centroids:
+    """Return the centroids of streaks moved to their centers of light, with the error of that.
+
+    An acceleration moves the middles of all streaks by the same d. Most exposures have none: d is 0 with the
+    probability 1 - ACCELERATED, otherwise anything to a twelfth of the streak's length L, with which its image stands
+    still at one end. With the weighted mean m of the measured values and its variance v, an acceleration has the odds
+
+        ACCELERATED / (1 - ACCELERATED) sqrt(2 pi v) / (L / 6) exp(m^2 / 2 v).
+
+    With this probability q, the mean of d is q m, and its variance q (v + (e m)^2) + q (1 - q) m^2, with the share e of
+    FADING_MODEL that the linear model of fading light leaves open. The error is common to all
+    stars: their variances along the streak are multiplied by a factor with which the variance of their weighted mean
+    grows by that of d.
+
+    Parameters
+    ----------
+    along
+        (N, 2) unit vectors of the streaks
+    ahead_px, variance_px2
+        (N,) distances of the middles from the centers of light, and their variances; NaN if unknown
+    """
+    usable = np.isfinite(ahead_px)
+    if usable.sum() < MIN_STREAKS:
+        return centroids
+    # Weighted mean, without outliers: neighbors brighten one end.
+    off_px = ahead_px - np.median(ahead_px[usable])
+    usable &= off_px**2 < OUTLIER_SIGMA**2 * variance_px2
+    weight = 1 / variance_px2[usable]
+    mean_px = float(np.sum(weight * ahead_px[usable]) / weight.sum())
+    variance = 1 / float(weight.sum())
+    # Probability of an acceleration
+    log_odds = np.log(
+        ACCELERATED / (1 - ACCELERATED) * np.sqrt(2 * np.pi * variance) * 6 / length_px
+    )
+    share = 1 / (1 + np.exp(-min(log_odds + mean_px**2 / (2 * variance), 50.0)))
+    error_px2 = share * (variance + (FADING_MODEL**2 + 1 - share) * mean_px**2)
+    # Centers and errors
+    assert centroids.covariance_px2 is not None
+    own_px2 = np.einsum("ni,nij,nj->n", along, centroids.covariance_px2, along)
+    factor = error_px2 * np.nansum(1 / own_px2)
+    common_px2 = (factor * own_px2)[:, None, None] * along[:, :, None] * along[:, None, :]
+    covariance_px2 = centroids.covariance_px2 + common_px2
+    return replace(
+        centroids,
+        xy_px=centroids.xy_px - share * mean_px * along,
+        sigma_px=np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2),
         covariance_px2=covariance_px2,
     )
 
@@ -238,6 +303,9 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
 STREAK_ROUNDS = 4  # largest number of fits of a streak
 # Factor of the priors of a streak that is known from all others.
 TIGHT = 0.02
+ACCELERATED = 0.3  # prior probability that the rate changes during an exposure
+FADING_MODEL = 0.1
+OUTLIER_SIGMA = 4.0
 MOVED_PX = 1.0  # a center farther from its start is fitted again
 ONE_PLACE_PX = 2.0  # two fits that are nearer than this are of one streak
 MIN_STREAKS = 3  # least number of fitted streaks whose median replaces the frame's streak

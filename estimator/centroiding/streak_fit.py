@@ -48,6 +48,9 @@ FAR_SIGMA = (
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13
+# Streaks of at least 6 widths show how their light fades, up to a share by faint neighbors and unequal pixels.
+MIN_INNER = 0.4
+FADING_SIGMA = 0.02
 MAX_OWN_ERROR = (
     0.3  # largest relative error of a length without priors that the linear theory holds for
 )
@@ -68,7 +71,8 @@ def fit_all(
     """Fit every blob around its expected streak; return (N, 13), NaN if it is not a streak.
 
     The columns are x, y, flux, dx, dy; xx, yy, xy of the center's covariance; dx, dy without the priors; and xx, yy, xy
-    of their covariance. The last five are NaN if the star alone does not determine its streak.
+    of their covariance. The last five are NaN if the star alone does not determine its streak. With tight priors two of
+    them are the distance of the center from the center of light, along the streak, and its variance.
 
     Parameters
     ----------
@@ -233,7 +237,7 @@ def _fit(
     3. Apply the step, shortened to about a pixel, and give up far from the start.
     4. At convergence, read the center's covariance from the inverse normal matrix. Where the model does not fit (two
        crossing streaks) the residuals inflate it. Add the error of the ends (`_write_streak`).
-    5. Compute the streak's vector without its priors (`_own_vector`), unless they are tight.
+    5. Compute the streak's vector without its priors (`_own_vector`); with tight ones, how its light fades (`_fading`).
 
     Parameters
     ----------
@@ -276,6 +280,8 @@ def _fit(
             # 5. The streak's own vector
             if tightness == 1:
                 _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
+            else:
+                out[8], out[9] = _fading(pixels, rows, weight, p)
             return True
     return False
 
@@ -398,6 +404,31 @@ def _own_vector(
     out[2] = ll * c * c + across * s * s - 2 * both * c * s
     out[3] = ll * s * s + across * c * c + 2 * both * c * s
     out[4] = (ll - across) * c * s + both * (c * c - s * s)
+
+
+@jit
+def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[float, float]:
+    """Return how far the fit's center is from the center of light along the streak, px, and the variance of that.
+
+    An image that accelerates by a in the exposure T leaves light that fades by the share s = a T^2 / L from one end to
+    the other, I (1 - s u / L), and the middle between its ends is s L / 12 ahead of its center of light. With g = I u /
+    L, the residuals r and their weights W, s is -sum(W g r) / sum(W g^2). Ends of the width w draw the fit's center
+    back by sqrt(pi) / 2 w s, a share 6 sqrt(pi) w / L, which takes half that share of the residuals. Both are exact to
+    first order in w / L; exponentials continue them to short streaks.
+    """
+    length = p[LENGTH]
+    inner = exp(-3 * sqrt(pi) * p[WIDTH] / length)
+    if inner < MIN_INNER:
+        return np.nan, np.nan
+    slope = information = 0.0
+    for k in range(pixels.shape[1]):
+        u = (pixels[0, k] - p[X]) * cos(p[ANGLE]) + (pixels[1, k] - p[Y]) * sin(p[ANGLE])
+        g = p[FLUX] * rows[FLUX, k] * u / length
+        slope -= weight[k] * g * rows[7, k]
+        information += weight[k] * g * g
+    ahead = length / 12 * inner * inner
+    variance = 1 / (information * inner) + FADING_SIGMA**2
+    return slope / (information * inner) * ahead, variance * ahead**2
 
 
 @jit
