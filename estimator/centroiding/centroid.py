@@ -349,6 +349,8 @@ def _fit_streaks(
     too short.
     """
     expected_px = _frame_streaks(image, blobs, priors)
+    if np.all(np.hypot(*expected_px.T) < streak_fit.MIN_STREAK_PX):
+        return np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
     some = np.arange(min(VOTING_BLOBS, len(blobs)))
     for _ in range(0 if priors.streak_px else STREAK_ROUNDS):
         rows = _fit_around(image, blobs, blobs.xy_px, expected_px, some, gain_e_dn, priors)

@@ -115,7 +115,7 @@ def fit_all(
         offsets = _offsets_of_others(xy, near, n, p)
         count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
         data = pixels[:, :count]
-        if p[FLUX] > 0 and _fit(data, sigma, gain_e_dn, tightness, rows, weight, p, out[n]):
+        if p[FLUX] > 0 and _fit(data, sigma, gain_e_dn, rows, weight, p, out[n], tightness):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
 
@@ -222,11 +222,11 @@ def _fit(
     pixels: Floats,
     noise: float,
     gain_e_dn: float,
-    tightness: float,
     rows: Floats,
     weight: Floats,
     p: Floats,
     out: Floats,
+    tightness: float = 1.0,
 ) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
@@ -245,14 +245,14 @@ def _fit(
         (3, K) x, y and value of the pixels used
     noise
         Standard deviation of a pixel of the sky
-    tightness
-        Factor of the priors' standard deviations
     rows, weight
         Work arrays for `_rows`
     p
         (7,) parameters, updated in place
     out
         (13,) row of `fit_all`
+    tightness
+        Factor of the priors' standard deviations
     """
     count = pixels.shape[1]
     start = p.copy()
