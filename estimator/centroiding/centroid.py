@@ -150,7 +150,9 @@ def known_streaks(
     1. Fit every streak of a known vector; begin again where the center has moved, with the pixels around it.
     2. Of two fits at one place, which are fragments of one streak, keep the first, of the brighter blob. Those that
        fail are no whole streaks. The errors of all these are NaN.
-    3. Move the centers to the centers of light where the rate changes in the exposure (`_without_acceleration`).
+    3. Move the centers to the centers of light where the rate changes in the exposure (`_acceleration`). The error of
+       that is common to all stars: their variances along the streak are multiplied by a factor with which the variance
+       of their weighted mean grows by it.
 
     Parameters
     ----------
@@ -174,77 +176,56 @@ def known_streaks(
     # 2. Fragments
     offset_px = np.abs(rows[:, None, :2] - rows[:, :2]).max(axis=2)
     rows[np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)] = np.nan
-    sigma_px = np.sqrt((rows[:, 5] + rows[:, 6]) / 2)
+    # 3. Acceleration
+    along = streak_px / np.linalg.norm(streak_px, axis=1)[:, None]
+    by_acceleration_px = rows[:, 8] - np.sum(ahead_px * along, axis=1)
+    length_px = float(np.median(np.linalg.norm(streak_px, axis=1)))
+    shift_px, error_px2 = _acceleration(by_acceleration_px, rows[:, 9], length_px)
     covariance_px2 = rows[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
-    found = replace(
+    own_px2 = np.einsum("ni,nij,nj->n", along, covariance_px2, along)
+    common_px2 = error_px2 * np.nansum(1 / own_px2) * own_px2
+    covariance_px2 += common_px2[:, None, None] * along[:, :, None] * along[:, None, :]
+    return replace(
         centroids,
-        xy_px=rows[:, :2],
-        sigma_px=sigma_px,
+        xy_px=rows[:, :2] - shift_px * along,
+        sigma_px=np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2),
         flux=rows[:, 2],
         covariance_px2=covariance_px2,
     )
-    # 3. Acceleration
-    along = streak_px / np.linalg.norm(streak_px, axis=1)[:, None]
-    forward = np.where(np.sum(rows[:, 3:5] * along, axis=1) < 0, -1.0, 1.0)
-    measured_px = forward * rows[:, 8] - np.sum(ahead_px * along, axis=1)
-    length_px = float(np.median(np.linalg.norm(streak_px, axis=1)))
-    return _without_acceleration(found, along, measured_px, rows[:, 9], length_px)
 
 
-def _without_acceleration(
-    centroids: Centroids,
-    along: Floats,
-    ahead_px: Floats,
-    variance_px2: Floats,
-    length_px: float,
-) -> Centroids:
-    """Return the centroids of streaks moved to their centers of light, with the error of that.
+def _acceleration(
+    ahead_px: Floats, variance_px2: Floats, length_px: float
+) -> tuple[float, float]:
+    """Return by how much an acceleration moves the middles of all streaks, px, and the variance of that.
 
-    An acceleration moves the middles of all streaks by the same d. Most exposures have none: d is 0 with the
-    probability 1 - ACCELERATED, otherwise anything to a twelfth of the streak's length L, with which its image stands
-    still at one end. With the weighted mean m of the measured values and its variance v, an acceleration has the odds
+    Most exposures have none: the shift d is 0 with the probability 1 - ACCELERATED, otherwise anything to a twelfth of
+    the streak's length L, with which its image stands still at one end. With the weighted mean m of the measured values
+    and its variance v, an acceleration has the odds
 
         ACCELERATED / (1 - ACCELERATED) sqrt(2 pi v) / (L / 6) exp(m^2 / 2 v).
 
     With this probability q, the mean of d is q m, and its variance q (v + (e m)^2) + q (1 - q) m^2, with the share e of
-    FADING_MODEL that the linear model of fading light leaves open. The error is common to all
-    stars: their variances along the streak are multiplied by a factor with which the variance of their weighted mean
-    grows by that of d.
+    FADING_MODEL that the linear model of fading light leaves open.
 
     Parameters
     ----------
-    along
-        (N, 2) unit vectors of the streaks
     ahead_px, variance_px2
-        (N,) distances of the middles from the centers of light, and their variances; NaN if unknown
+        (N,) measured shifts of the streaks, and their variances; NaN if unknown
     """
     usable = np.isfinite(ahead_px)
     if usable.sum() < MIN_STREAKS:
-        return centroids
+        return 0.0, 0.0
     # Weighted mean, without outliers: neighbors brighten one end.
     off_px = ahead_px - np.median(ahead_px[usable])
-    usable &= off_px**2 < OUTLIER_SIGMA**2 * variance_px2
-    weight = 1 / variance_px2[usable]
-    mean_px = float(np.sum(weight * ahead_px[usable]) / weight.sum())
-    variance = 1 / float(weight.sum())
+    usable &= off_px**2 < OUTLIER_CHI2 * variance_px2
+    variance = 1 / float(np.sum(1 / variance_px2[usable]))
+    mean_px = variance * float(np.sum(ahead_px[usable] / variance_px2[usable]))
     # Probability of an acceleration
-    log_odds = np.log(
-        ACCELERATED / (1 - ACCELERATED) * np.sqrt(2 * np.pi * variance) * 6 / length_px
-    )
-    share = 1 / (1 + np.exp(-min(log_odds + mean_px**2 / (2 * variance), 50.0)))
-    error_px2 = share * (variance + (FADING_MODEL**2 + 1 - share) * mean_px**2)
-    # Centers and errors
-    assert centroids.covariance_px2 is not None
-    own_px2 = np.einsum("ni,nij,nj->n", along, centroids.covariance_px2, along)
-    factor = error_px2 * np.nansum(1 / own_px2)
-    common_px2 = (factor * own_px2)[:, None, None] * along[:, :, None] * along[:, None, :]
-    covariance_px2 = centroids.covariance_px2 + common_px2
-    return replace(
-        centroids,
-        xy_px=centroids.xy_px - share * mean_px * along,
-        sigma_px=np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2),
-        covariance_px2=covariance_px2,
-    )
+    prior = ACCELERATED / (1 - ACCELERATED) * np.sqrt(2 * np.pi * variance) * 6 / length_px
+    odds = prior * np.exp(min(mean_px**2 / (2 * variance), 50.0))
+    share = odds / (1 + odds)
+    return share * mean_px, share * (variance + (FADING_MODEL**2 + 1 - share) * mean_px**2)
 
 
 def disk(
@@ -303,9 +284,9 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
 STREAK_ROUNDS = 4  # largest number of fits of a streak
 # Factor of the priors of a streak that is known from all others.
 TIGHT = 0.02
+OUTLIER_CHI2 = 16.0
 ACCELERATED = 0.3  # prior probability that the rate changes during an exposure
 FADING_MODEL = 0.1
-OUTLIER_SIGMA = 4.0
 MOVED_PX = 1.0  # a center farther from its start is fitted again
 ONE_PLACE_PX = 2.0  # two fits that are nearer than this are of one streak
 MIN_STREAKS = 3  # least number of fitted streaks whose median replaces the frame's streak

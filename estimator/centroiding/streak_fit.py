@@ -85,17 +85,13 @@ def fit_all(
     out = np.full((len(xy), OUTPUTS), np.nan)
     buffer = np.empty(len(xy), np.int64)
     p = np.empty(7)
-    capacity = _largest_window(streaks)
-    pixels = np.empty((3, capacity))
-    rows = np.empty((8, capacity))
-    weight = np.empty(capacity)
-    rows[SKY] = 1.0
     width_px = 0.9
     for n in range(len(xy)):
         length = hypot(streaks[n, 0], streaks[n, 1])
         angle = np.arctan2(streaks[n, 1], streaks[n, 0])
-        half_x, half_y = _half_window(streaks[n])
-        if length < MIN_STREAK_PX or half_x < 0:
+        half_x = int(abs(streaks[n, 0]) / 2) + MARGIN_PX
+        half_y = int(abs(streaks[n, 1]) / 2) + MARGIN_PX
+        if length < MIN_STREAK_PX or max(half_x, half_y) > MAX_HALF_WINDOW_PX:
             continue
         x0 = round(xy[n, 0]) - half_x
         y0 = round(xy[n, 1]) - half_y
@@ -111,23 +107,17 @@ def fit_all(
         p[ANGLE] = angle
         p[WIDTH] = width_px
         p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
+        capacity = (2 * half_x + 1) * (2 * half_y + 1)
+        pixels = np.empty((3, capacity))
         near = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
         offsets = _offsets_of_others(xy, near, n, p)
         count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
         data = pixels[:, :count]
+        rows = np.ones((8, count))  # those of the sky stay 1
+        weight = np.empty(count)
         if p[FLUX] > 0 and _fit(data, sigma, gain_e_dn, rows, weight, p, out[n], tightness):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
-
-
-@jit
-def _largest_window(streaks: Floats) -> int:
-    """Return the number of pixels in the largest streak's window."""
-    largest = 0
-    for n in range(len(streaks)):
-        half_x, half_y = _half_window(streaks[n])
-        largest = max(largest, (2 * half_x + 1) * (2 * half_y + 1))
-    return largest
 
 
 @jit
@@ -190,14 +180,6 @@ def _select_pixels(
                 pixels[2, count] = image[y, x]
                 count += 1
     return count
-
-
-@jit
-def _half_window(streak: Floats) -> tuple[int, int]:
-    """Return half the window's width and height about a streak; (-1, -1) if it is too long."""
-    half_x = int(abs(streak[0]) / 2) + MARGIN_PX
-    half_y = int(abs(streak[1]) / 2) + MARGIN_PX
-    return (half_x, half_y) if max(half_x, half_y) <= MAX_HALF_WINDOW_PX else (-1, -1)
 
 
 @jit

@@ -3,7 +3,7 @@
 1. Predict the attitude from the last one, with the gyros or with the last rate.
 2. Search for the brightest predicted stars in small windows around their positions.
 3. Match and fit the attitude, and accept it by the same Bayes factor as in the lost-in-space search, with the volumes
-   that the windows leave to attitudes and to lights (`window_dex`).
+   that the windows leave to attitudes and to lights (`_window_dex`).
 4. If that fails, or the last attitude is too old, solve the whole frame lost in space.
 5. Add the error by a change of the rate during the exposure to the covariance (`_remember`).
 """
@@ -318,7 +318,7 @@ class TrackingMode:
         hypothesis = star_evidence.evaluate(
             detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
         )
-        if hypothesis.dex + self.window_dex(len(window_centers_px), hypothesis) < ACCEPT_DEX:
+        if hypothesis.dex + self._window_dex(len(window_centers_px), hypothesis) < ACCEPT_DEX:
             return None
         # 3. Attitude
         solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
@@ -328,7 +328,7 @@ class TrackingMode:
         ):
             return None
         found = refitted.solution
-        dex = found.dex + self.window_dex(len(window_centers_px), found)
+        dex = found.dex + self._window_dex(len(window_centers_px), found)
         refitted = refitted._replace(solution=found._replace(dex=dex))
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
@@ -336,7 +336,7 @@ class TrackingMode:
             attitude, centroids, sigma_px, clock, streak_px, len(window_centers_px), saturated
         )
 
-    def window_dex(self, windows: int, found: Hypothesis | Solution) -> float:
+    def _window_dex(self, windows: int, found: Hypothesis | Solution) -> float:
         """Return log10 of the factor by which windows of a prediction change the evidence of an attitude.
 
         - The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
