@@ -224,7 +224,7 @@ def image_paths(
     # p'' is 4 (p(-1/2) - 2 p(0) + p(1/2))
     bend_px = 4 * (begin + end - 2 * middle)
     streak_px = end - begin
-    along = streak_px / np.linalg.norm(streak_px, axis=1)[:, None]
+    along = streak_px / np.maximum(np.linalg.norm(streak_px, axis=1), 1e-9)[:, None]
     along_px = np.sum(bend_px * along, axis=1)[:, None] * along
     factor = streak_factor(camera, tangent_motion(ray) @ rate)
     return factor[:, None] * streak_px, bend_px / 24, along_px * (1 / 8 - 1 / 24)

@@ -126,13 +126,9 @@ def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
     offsets = np.empty((len(near), 2))
     count = 0
     for m in near:
-        x = xy[m, 0] - xy[n, 0]
-        y = xy[m, 1] - xy[n, 1]
-        along = x * cos(p[ANGLE]) + y * sin(p[ANGLE])
-        across = y * cos(p[ANGLE]) - x * sin(p[ANGLE])
+        along, across = _along_across(p, xy[m, 0], xy[m, 1])
         if abs(across) > CORE_PX or abs(along) > p[LENGTH]:
-            offsets[count, 0] = x
-            offsets[count, 1] = y
+            offsets[count] = xy[m] - xy[n]
             count += 1
     return offsets[:count]
 
@@ -189,13 +185,18 @@ def length_sigma_px(length_px: float) -> float:
 
 
 @jit
-def _distance_to_line(p: Floats, x: float, y: float) -> float:
-    """Return the distance of a pixel from the line segment, px."""
+def _along_across(p: Floats, x: float, y: float) -> tuple[float, float]:
+    """Return the offset of a pixel from the line's center: u along and v across the line."""
     along_x = cos(p[ANGLE])
     along_y = sin(p[ANGLE])
-    # u along and v across the line
     u = (x - p[X]) * along_x + (y - p[Y]) * along_y
-    v = (y - p[Y]) * along_x - (x - p[X]) * along_y
+    return u, (y - p[Y]) * along_x - (x - p[X]) * along_y
+
+
+@jit
+def _distance_to_line(p: Floats, x: float, y: float) -> float:
+    """Return the distance of a pixel from the line segment, px."""
+    u, v = _along_across(p, x, y)
     return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
 
 
@@ -354,38 +355,32 @@ def _own_vector(
         least_squares.cholesky_solve(factor, column)
         cov[i, 0] = column[LENGTH]
         cov[i, 1] = column[ANGLE]
-    # 2. D = S^-1 - P, and then D^-1, with elements ll, aa, la of length and angle
-    prior_l = 1 / length_sigma_px(start[LENGTH]) ** 2
-    prior_a = 1 / ANGLE_RAD**2
-    det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-    ll = cov[1, 1] / det - prior_l
-    aa = cov[0, 0] / det - prior_a
-    la = -cov[0, 1] / det
-    det = ll * aa - la**2
-    if not (ll > 0 and aa > 0 and det > 0):
+    # 2. D = S^-1 - P, and then D^-1
+    prior = np.array([1 / length_sigma_px(start[LENGTH]) ** 2, 1 / ANGLE_RAD**2])
+    own = np.linalg.inv(cov)
+    for i in range(2):
+        own[i, i] -= prior[i]
+    if not (own[0, 0] > 0 and own[0, 0] * own[1, 1] > own[0, 1] ** 2):
         return
-    ll, aa, la = aa / det, ll / det, -la / det
+    own = np.linalg.inv(own)
     # 3. m + D^-1 P (m - start)
-    pull_l = prior_l * (p[LENGTH] - start[LENGTH])
-    pull_a = prior_a * (p[ANGLE] - start[ANGLE])
-    length = p[LENGTH] + ll * pull_l + la * pull_a
-    angle = p[ANGLE] + la * pull_l + aa * pull_a
+    length, angle = p[LENGTH:WIDTH] + own @ (prior * (p[LENGTH:WIDTH] - start[LENGTH:WIDTH]))
     # 4. Errors
-    ll = misfit * ll + ends_px2
-    aa = misfit * aa
-    la = misfit * la
-    if not (ll < (MAX_OWN_ERROR * length) ** 2 and aa < MAX_OWN_ERROR**2 and length > 0):
+    own *= misfit
+    own[0, 0] += ends_px2
+    largest = MAX_OWN_ERROR**2
+    if not (own[0, 0] < largest * length**2 and own[1, 1] < largest and length > 0):
         return
-    # 5. (dx, dy) = L (c, s): errors of the length are along the streak, L times those of the angle across it.
+    # 5. (dx, dy) = L (c, s), and its derivatives by L and the angle
     c = cos(angle)
     s = sin(angle)
-    across = length**2 * aa
-    both = length * la
+    slopes = np.array([[c, -length * s], [s, length * c]])
+    own = slopes @ own @ slopes.T.copy()
     out[0] = length * c
     out[1] = length * s
-    out[2] = ll * c * c + across * s * s - 2 * both * c * s
-    out[3] = ll * s * s + across * c * c + 2 * both * c * s
-    out[4] = (ll - across) * c * s + both * (c * c - s * s)
+    out[2] = own[0, 0]
+    out[3] = own[1, 1]
+    out[4] = own[0, 1]
 
 
 @jit
@@ -404,7 +399,7 @@ def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[fl
         return np.nan, np.nan
     slope = information = 0.0
     for k in range(pixels.shape[1]):
-        u = (pixels[0, k] - p[X]) * cos(p[ANGLE]) + (pixels[1, k] - p[Y]) * sin(p[ANGLE])
+        u, _ = _along_across(p, pixels[0, k], pixels[1, k])
         g = p[FLUX] * rows[FLUX, k] * u / length
         slope -= weight[k] * g * rows[7, k]
         information += weight[k] * g * g

@@ -280,10 +280,9 @@ def detect_and_centroid(
         paths = image_paths(camera, centroids, exposure_s or 1.0)
     if paths is not None:
         streaks_px, light_px, ahead_px = paths
-        if np.median(np.hypot(*streaks_px.T)) > LONG_STREAK_PX:
-            centroids = known_streaks(
-                image, blobs, centroids, (streaks_px, ahead_px), gain_e_dn, priors
-            )
+        centroids = known_streaks(
+            image, blobs, centroids, (streaks_px, ahead_px), gain_e_dn, priors
+        )
         centroids = replace(centroids, xy_px=centroids.xy_px - light_px - ahead_px)
     centroids = inflate_uncertainty(centroids, blobs, settings)
     if camera.row_time_s and streak_px is None and centroids.streak_px is None:

@@ -375,16 +375,10 @@ class TrackingMode:
         """Return the centroids of the detections in windows, and whether any of them is saturated."""
         settings = self.tracker.settings
         priors = FramePriors(streak_px, settings.saturation)
-        # Long streaks need the streak filter: the whole frame is processed, and only the windows are used.
+        # Long streaks need the streak filter: the whole frame is processed.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
-            centroids = detect_and_centroid(
-                image, self.tracker.camera, settings, clock, streak_px
-            )
-            near = (
-                np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2)
-                < self.reach_px
-            )
-            return centroids.take(near.any(axis=1)), False
+            camera = self.tracker.camera
+            return detect_and_centroid(image, camera, settings, clock, streak_px), False
         image = monochrome(image, settings)
         blobs = in_windows(image, window_centers_px, self.reach_px, WINDOW_SIGMA, priors)
         blobs = blobs.take(blobs.flag & settings.reject == 0)
