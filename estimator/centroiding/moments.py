@@ -71,55 +71,42 @@ def _weighted_mean(
     margin: int,
     power: int,
 ) -> Floats:
-    """Compute the mean position weighted by a power of the light, 1 or 2, in each box and a margin.
-
-    The first sweep over the pixels gives the mean c and the flux, the second one the sums about c.
-    """
+    """Compute the mean position weighted by a power of the light, 1 or 2, in each box and a margin."""
     height, width = image.shape
     out = np.zeros((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         x0, y0, x1, y1 = _window(boxes[n], margin, width, height)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-        window = np.full((y1 - y0 + 1, x1 - x0 + 1), np.nan)
-        flux = total = cx = cy = 0.0
+        light = np.zeros((y1 - y0 + 1, x1 - x0 + 1))
+        own = np.zeros_like(light)
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
-                if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                    continue
-                light = image[y, x] - interpolate(level, height, width, y, x)
-                window[y - y0, x - x0] = light
-                share = light if power == 1 else max(light, 0.0) ** 2
-                flux += light
-                total += share
-                cx += share * x
-                cy += share * y
+                if not belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
+                    light[y - y0, x - x0] = image[y, x] - interpolate(
+                        level, height, width, y, x
+                    )
+                    own[y - y0, x - x0] = 1.0
+        # Photon noise is that of the light itself, without the negative noise of the sky.
+        positive = np.maximum(light, 0.0)
+        share = light if power == 1 else positive**2
+        total = share.sum()
         if total == 0:  # the mean is undefined
             out[n, :3] = np.nan
             continue
-        # c, and n^2 of one pixel there
-        cx /= total
-        cy /= total
+        across = np.arange(x0, x1 + 1)
+        down = np.arange(y0, y1 + 1).reshape(-1, 1)
+        cx = (share * across).sum() / total
+        cy = (share * down).sum() / total
+        # n^2 of one pixel at c; the mean of both coordinates' squared distances
         sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
-        second_moment = moment_variance = 0.0
-        for y in range(y0, y1 + 1):
-            for x in range(x0, x1 + 1):
-                if np.isnan(window[y - y0, x - x0]):
-                    continue
-                # Photon noise is that of the light itself, without the negative noise of the sky.
-                light = max(window[y - y0, x - x0], 0.0)
-                # Mean of both coordinates' squared distances, and of the squared slopes dc/dI times the total
-                distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
-                slope2 = distance2 if power == 1 else 4 * light * light * distance2
-                second_moment += light * light * distance2
-                moment_variance += slope2 * (light / gain_e_dn + sigma2)
-        variance = moment_variance / total**2
+        distance2 = ((across - cx) ** 2 + (down - cy) ** 2) / 2
+        slope2 = own if power == 1 else 4 * share  # of c, without the distance and W
+        noise2 = slope2 * distance2 * (positive / gain_e_dn + sigma2)
+        variance = noise2.sum() / total**2
         if power == 2:
-            variance += sampling_variance(second_moment / total)
-        out[n, 0] = cx
-        out[n, 1] = cy
-        out[n, 2] = sqrt(variance)
-        out[n, 3] = flux
+            variance += sampling_variance((share * distance2).sum() / total)
+        out[n] = cx, cy, sqrt(variance), light.sum()
     return out
 
 

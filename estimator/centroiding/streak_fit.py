@@ -123,14 +123,10 @@ def fit_all(
 @jit
 def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
     """Return the (K, 2) offsets of nearby blobs from blob n, without those that may be fragments of its streak."""
-    offsets = np.empty((len(near), 2))
-    count = 0
-    for m in near:
-        along, across = _along_across(p, xy[m, 0], xy[m, 1])
-        if abs(across) > CORE_PX or abs(along) > p[LENGTH]:
-            offsets[count] = xy[m] - xy[n]
-            count += 1
-    return offsets[:count]
+    offsets = xy[near] - xy[n]
+    along = offsets[:, 0] * cos(p[ANGLE]) + offsets[:, 1] * sin(p[ANGLE])
+    across = offsets[:, 1] * cos(p[ANGLE]) - offsets[:, 0] * sin(p[ANGLE])
+    return offsets[(np.abs(across) > CORE_PX) | (np.abs(along) > p[LENGTH])]
 
 
 @jit
@@ -185,18 +181,13 @@ def length_sigma_px(length_px: float) -> float:
 
 
 @jit
-def _along_across(p: Floats, x: float, y: float) -> tuple[float, float]:
-    """Return the offset of a pixel from the line's center: u along and v across the line."""
-    along_x = cos(p[ANGLE])
-    along_y = sin(p[ANGLE])
-    u = (x - p[X]) * along_x + (y - p[Y]) * along_y
-    return u, (y - p[Y]) * along_x - (x - p[X]) * along_y
-
-
-@jit
 def _distance_to_line(p: Floats, x: float, y: float) -> float:
     """Return the distance of a pixel from the line segment, px."""
-    u, v = _along_across(p, x, y)
+    along_x = cos(p[ANGLE])
+    along_y = sin(p[ANGLE])
+    # u along and v across the line
+    u = (x - p[X]) * along_x + (y - p[Y]) * along_y
+    v = (y - p[Y]) * along_x - (x - p[X]) * along_y
     return hypot(max(abs(u) - p[LENGTH] / 2, 0.0), v)
 
 
@@ -397,15 +388,12 @@ def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[fl
     inner = exp(-3 * sqrt(pi) * p[WIDTH] / length)
     if inner < MIN_INNER:
         return np.nan, np.nan
-    slope = information = 0.0
-    for k in range(pixels.shape[1]):
-        u, _ = _along_across(p, pixels[0, k], pixels[1, k])
-        g = p[FLUX] * rows[FLUX, k] * u / length
-        slope -= weight[k] * g * rows[7, k]
-        information += weight[k] * g * g
+    u = (pixels[0] - p[X]) * cos(p[ANGLE]) + (pixels[1] - p[Y]) * sin(p[ANGLE])
+    g = p[FLUX] * rows[FLUX] * u / length
+    information = np.sum(weight * g * g) * inner
+    fading = -np.sum(weight * g * rows[7]) / information
     ahead = length / 12 * inner * inner
-    variance = 1 / (information * inner) + FADING_SIGMA**2
-    return slope / (information * inner) * ahead, variance * ahead**2
+    return fading * ahead, (1 / information + FADING_SIGMA**2) * ahead**2
 
 
 @jit
