@@ -41,6 +41,9 @@ AREAS = {
     "lenses": Area("cameras whose model is wrong, beside tetra3rs", {"count": 5}),
     "rate": Area("angular rate from the streaks of one frame", {"count": 20}),
     "rolling": Area("rolling shutter against a global one"),
+    "motion": Area(
+        "honest covariances at long streaks, accelerations and in tracking mode", {"count": 6}
+    ),
     "smear": Area("frames solved by rate: SHEFEX-2's chain and ours", {"count": 10}),
     "heads": Area("two star cameras: the roll, and drifting mounts", {"count": 50}),
     "photographs": Area("pictures as people take them", {"count": 1}),

@@ -199,6 +199,37 @@ def from_streaks(
     return [rate for rate in rates if rate is not None]
 
 
+def image_paths(
+    camera: Camera, centroids: Centroids, exposure_s: float
+) -> tuple[Floats, Floats, Floats] | None:
+    """Return each light's streak (N, 2), px, and by how far its center is off; None without a rate from the streaks.
+
+    The rate that fits all streaks gives those of all lights. The center is off from where the mean attitude of the
+    exposure puts the light, by one vector (N, 2) for all images, and by another one along streaks. A camera that
+    rotates by the vector r in the exposure, at a constant rate, sees a ray q along exp(-[r] t) q, t from -1/2 to 1/2.
+    Its image p(t) is bent, and not equally fast everywhere: with the acceleration a = p'' and t in units of the
+    exposure, the image's center of light is at p(0) + a / 24, and the middle between its ends at p(0) + a / 8. The fit
+    of a straight streak of equal brightness finds the middle of the ends along the streak, and the center of light
+    across it. A rate and its negative have the same a.
+    """
+    rates = from_streaks(camera, centroids, exposure_s)
+    if not rates:
+        return None
+    rate = rates[0].rate_rad_s
+    ray = camera.rays(centroids.xy_px)
+    half = Rotation.from_rotvec(0.5 * exposure_s * rate)
+    middle, begin, end = (
+        camera.pixels(turn.apply(ray)) for turn in (half * half.inv(), half, half.inv())
+    )
+    # p'' is 4 (p(-1/2) - 2 p(0) + p(1/2))
+    bend_px = 4 * (begin + end - 2 * middle)
+    streak_px = end - begin
+    along = streak_px / np.maximum(np.linalg.norm(streak_px, axis=1), 1e-9)[:, None]
+    along_px = np.sum(bend_px * along, axis=1)[:, None] * along
+    factor = streak_factor(camera, tangent_motion(ray) @ rate)
+    return factor[:, None] * streak_px, bend_px / 24, along_px * (1 / 8 - 1 / 24)
+
+
 def chords(camera: Camera, centroids: Centroids) -> tuple[Floats, Floats]:
     """Return the (N, 2) chords of streaks in tangents, sign arbitrary, and their (N, 2, 2) inverse covariances."""
     assert centroids.streak_px is not None

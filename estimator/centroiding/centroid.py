@@ -4,33 +4,37 @@ Each centroider takes the frame and its `Blobs` and returns `Centroids`. The fir
 `estimator.centroiding.moments`); the others fit a model by weighted least squares: a Gaussian, a streak, a disk. A
 blob that the model does not fit keeps its center of gravity.
 
-All centroiders have the parameters of `cog`, and raise ImageError for unusable ones (`prepare`).
+All centroiders have the parameters of `_moments` but the first, and raise ImageError for unusable ones (`prepare`).
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.attitude.rate import OUTLIER_CHI2, covariance_of
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
-from estimator.detection.classify import streaks_px
+from estimator.detection.classify import VOTING_BLOBS, streaks_px
 from estimator.detection.detect import check_pixel_type, to_native
 
 Centroider = Callable[..., Centroids]  # (image, blobs, gain_e_dn, priors)
 
 
-def cog(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+def _moments(
+    kernel: Callable[..., Floats],
+    image: NDArray,
+    blobs: Blobs,
+    gain_e_dn: float = 1.0,
+    priors: FramePriors = NO_PRIORS,
 ) -> Centroids:
-    """Measure the center of gravity of the light above the sky, in the blob's box and a margin around it.
-
-    With xbar = sum(I x) / sum(I), its variance is var(xbar) = sum((I / g + noise^2) (x - xbar)^2) / sum(I)^2
-    (`moments.center_of_gravity`). Pixels closer to another blob's box are excluded.
+    """Run one of the kernels of `moments` that use the blobs' boxes.
 
     Parameters
     ----------
@@ -44,22 +48,24 @@ def cog(
         Prior information about the frame: streak, saturation
     """
     image = prepare(image, blobs, gain_e_dn, priors)
-    return _to_centroids(_gravity_rows(image, blobs, gain_e_dn))
-
-
-def weighted(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
-) -> Centroids:
-    """Measure the center of gravity weighted by the light itself: xbar = sum(I^2 x) / sum(I^2).
-
-    The wings, which are mostly noise, get less weight. The variance is
-    sum(4 I^2 (x - xbar)^2 (I / g + noise^2)) / sum(I^2)^2 plus the mean square of the S-curve (the pixel-phase error)
-    of the squared profile, which is narrower by the square root of 2 (`moments.squared_light`).
-    """
-    image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
-    rows = moments.squared_light(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn))
-    return _to_centroids(rows)
+    return _to_centroids(kernel(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)))
+
+
+cog = partial(_moments, moments.center_of_gravity)
+"""Measure the center of gravity of the light above the sky, in the blob's box and a margin around it.
+
+With xbar = sum(I x) / sum(I), its variance is var(xbar) = sum((I / g + noise^2) (x - xbar)^2) / sum(I)^2
+(`moments.center_of_gravity`). Pixels closer to another blob's box are excluded.
+"""
+
+weighted = partial(_moments, moments.squared_light)
+"""Measure the center of gravity weighted by the light itself: xbar = sum(I^2 x) / sum(I^2).
+
+The wings, which are mostly noise, get less weight. The variance is
+sum(4 I^2 (x - xbar)^2 (I / g + noise^2)) / sum(I^2)^2 plus the mean square of the S-curve (the pixel-phase error)
+of the squared profile, which is narrower by the square root of 2 (`moments.squared_light`).
+"""
 
 
 def gaussian_window(
@@ -108,7 +114,6 @@ def streak(
     1. Fit the streaks. If none converges (a frame that is not smeared), all blobs are fitted by `gaussian_fit`.
     2. Fit the blobs that are not streaks by a Gaussian, if the streaks are no longer than half its window; those that
        fail, and longer ones, keep their center of gravity.
-    3. Correct the centers of streaks that a roll has bent.
     """
     image = prepare(image, blobs, gain_e_dn, priors)
     # 1. Streaks
@@ -131,12 +136,102 @@ def streak(
         covariance[failed] = rows[failed, 2, None, None] ** 2 * np.eye(2)
     # Covariance of the streaks without their priors
     own = streaks[:, [10, 12, 12, 11]].reshape(-1, 2, 2)
-    if blobs.turn_rad:
-        # 3. A streak v that a roll w bends is an arc. Its mean is off its middle by a 24th of the acceleration w J v,
-        # with J a rotation by 90 degrees.
-        x, y = _frame_streaks(image, blobs, priors).T
-        rows[:, :2] -= blobs.turn_rad / 24 * np.column_stack([-y, x])
     return Centroids(rows[:, :2], rows[:, 2], rows[:, 3], covariance, streaks[:, 8:10], own)
+
+
+def known_streaks(
+    image: NDArray,
+    blobs: Blobs,
+    centroids: Centroids,
+    paths_px: tuple[Floats, Floats],
+    gain_e_dn: float,
+    priors: FramePriors,
+) -> Centroids:
+    """Fit the centers of streaks again, with the streak vectors that all streaks of the frame together determine.
+
+    Noise breaks a faint streak into fragments, and a fit of one star alone may take a fragment for the whole. With its
+    length known, both ends determine the center: their likelihood falls twice as steeply (`_end_variance_px2`).
+
+    1. Fit every streak of a known vector; begin again where the center has moved, with the pixels around it.
+    2. Of two fits at one place, which are fragments of one streak, keep the first, of the brighter blob. Those that
+       fail are no whole streaks. The errors of all these are NaN. Short streaks stay as they are.
+    3. Move the centers to the centers of light where the rate changes in the exposure (`_acceleration`). The error of
+       that is common to all stars: their variances along the streak are multiplied by a factor with which the variance
+       of their weighted mean grows by it.
+
+    Parameters
+    ----------
+    centroids
+        Centroids of the blobs
+    paths_px
+        (N, 2) vector of each blob's streak, and (N, 2) how far its middle is off from its center of light by the
+        constant rate alone
+    """
+    image = prepare(image, blobs, gain_e_dn, priors)
+    streak_px, ahead_px = paths_px
+    length_px = np.hypot(*streak_px.T)
+    long = length_px > gaussian.HALF_WINDOW_PX
+    if not long.any():
+        return centroids
+    # 1. Fits
+    rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
+    xy_px = centroids.xy_px.copy()
+    moved = np.flatnonzero(long)
+    for _ in range(STREAK_ROUNDS):
+        again = _fit_around(image, blobs, xy_px, streak_px, moved, gain_e_dn, priors, TIGHT)
+        rows[moved] = again[moved]
+        moved = np.flatnonzero(np.hypot(*(rows[:, :2] - xy_px).T) > MOVED_PX)
+        xy_px[moved] = rows[moved, :2]
+    # 2. Fragments
+    offset_px = np.abs(rows[:, None, :2] - rows[:, :2]).max(axis=2)
+    rows[np.tril(offset_px < ONE_PLACE_PX, -1).any(axis=1)] = np.nan
+    # 3. Acceleration
+    along = streak_px / np.maximum(length_px, gaussian.HALF_WINDOW_PX)[:, None]
+    measured_px = rows[:, 8] - np.sum(ahead_px * along, axis=1)
+    shift, variance = _acceleration(measured_px / length_px, rows[:, 9] / length_px**2)
+    covariance_px2 = rows[:, [5, 7, 7, 6]].reshape(-1, 2, 2)
+    own_px2 = np.einsum("ni,nij,nj->n", along, covariance_px2, along)
+    common_px2 = variance * np.nansum(length_px**2 / own_px2) * own_px2
+    covariance_px2 += common_px2[:, None, None] * along[:, :, None] * along[:, None, :]
+    covariance_px2[~long] = covariance_of(centroids)[~long]
+    return replace(
+        centroids,
+        xy_px=np.where(long[:, None], rows[:, :2] - shift * streak_px, xy_px),
+        sigma_px=np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2),
+        flux=np.where(long, rows[:, 2], centroids.flux),
+        covariance_px2=covariance_px2,
+    )
+
+
+def _acceleration(ahead: Floats, variances: Floats) -> tuple[float, float]:
+    """Return by how much of its length an acceleration moves the middle of a streak, and the variance of that.
+
+    The share is the same for all streaks if the acceleration is along the rate. Most exposures have none: the share is
+    0 with the probability 1 - ACCELERATED, otherwise anything to a twelfth, with which an image stands still at one
+    end. With the weighted mean m of the measured values and its variance v, an acceleration has the odds
+
+        ACCELERATED / (1 - ACCELERATED) 6 sqrt(2 pi v) exp(m^2 / 2 v).
+
+    With this probability q, the mean of the share is q m, and its variance q (v + (e m)^2) + q (1 - q) m^2, with the
+    share e of FADING_MODEL that the linear model of fading light leaves open.
+
+    Parameters
+    ----------
+    ahead, variances
+        (N,) measured shifts of the streaks over their lengths, and their variances; NaN if unknown
+    """
+    usable = np.isfinite(ahead)
+    if usable.sum() < MIN_STREAKS:
+        return 0.0, 0.0
+    # Weighted mean, without outliers: neighbors brighten one end.
+    usable &= (ahead - np.median(ahead[usable])) ** 2 < OUTLIER_CHI2 * variances
+    v = 1 / float(np.sum(1 / variances[usable]))
+    m = v * float(np.sum(ahead[usable] / variances[usable]))
+    # Probability of an acceleration
+    prior = ACCELERATED / (1 - ACCELERATED) * 6 * np.sqrt(2 * np.pi * v)
+    odds = prior * np.exp(min(m**2 / (2 * v), 50.0))
+    q = odds / (1 + odds)
+    return q * m, q * (v + (FADING_MODEL**2 + 1 - q) * m**2)
 
 
 def disk(
@@ -192,7 +287,13 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
     return to_native(image)
 
 
-STREAK_ROUNDS = 4  # largest number of fits of a frame's streaks
+STREAK_ROUNDS = 4  # largest number of fits of a streak
+# Factor of the priors of a streak that is known from all others.
+TIGHT = 0.02
+ACCELERATED = 0.3  # prior probability that the rate changes during an exposure
+FADING_MODEL = 0.1
+MOVED_PX = 1.0  # a center farther from its start is fitted again
+ONE_PLACE_PX = 2.0  # two fits that are nearer than this are of one streak
 MIN_STREAKS = 3  # least number of fitted streaks whose median replaces the frame's streak
 
 CENTROIDERS: dict[str, Centroider] = {
@@ -229,24 +330,51 @@ def _fit_streaks(
 ) -> Floats:
     """Return the rows of `streak_fit.fit_all`; all NaN for a frame that is not smeared.
 
-    Without a streak from the gyro, the fit is repeated with the median of the fitted streaks until that agrees with
-    the expected one: the ends of faint streaks are below the threshold, so their moments make them too short.
+    Without a streak from the gyro, the brightest blobs are first fitted with the median of their fitted streaks until
+    that agrees with the expected one: the ends of faint streaks are below the threshold, so their moments make them
+    too short.
     """
     expected_px = _frame_streaks(image, blobs, priors)
-    sky = blobs.background
-    rows = np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
-    for _ in range(1 if priors.streak_px else STREAK_ROUNDS):
-        length_px = np.hypot(*expected_px.T)
-        if np.all(length_px < streak_fit.MIN_STREAK_PX):
-            break
-        scene = image, blobs.xy_px, blobs.box_px, sky.level, sky.noise
-        rows = streak_fit.fit_all(*scene, expected_px, float(gain_e_dn), priors.saturation)
+    if np.all(np.hypot(*expected_px.T) < streak_fit.MIN_STREAK_PX):
+        return np.full((len(blobs), streak_fit.OUTPUTS), np.nan)
+    some = np.arange(min(VOTING_BLOBS, len(blobs)))
+    for _ in range(0 if priors.streak_px else STREAK_ROUNDS):
+        rows = _fit_around(image, blobs, blobs.xy_px, expected_px, some, gain_e_dn, priors)
         # The streaks without their priors, as those depend on the expected streak.
-        shift_px = _median_shift(rows[:, 8:10], expected_px)
-        if np.hypot(*shift_px) < streak_fit.length_sigma_px(float(np.median(length_px))) / 4:
+        shift_px = _median_shift(rows[some, 8:10], expected_px[some])
+        length_px = float(np.median(np.hypot(*expected_px.T)))
+        if np.hypot(*shift_px) < streak_fit.length_sigma_px(length_px) / 4:
             break
         expected_px = expected_px + shift_px
-    return rows
+    every = np.arange(len(blobs))
+    return _fit_around(image, blobs, blobs.xy_px, expected_px, every, gain_e_dn, priors)
+
+
+def _fit_around(
+    image: NDArray,
+    blobs: Blobs,
+    xy_px: Floats,
+    expected_px: Floats,
+    which: Ints,
+    gain_e_dn: float,
+    priors: FramePriors,
+    tightness: float = 1.0,
+) -> Floats:
+    """Return the rows of `streak_fit.fit_all` around centers and streaks (N, 2), NaN but for the blobs `which`."""
+    sky = blobs.background
+    chosen_px = np.zeros_like(expected_px)
+    chosen_px[which] = expected_px[which]
+    return streak_fit.fit_all(
+        image,
+        xy_px,
+        blobs.box_px,
+        sky.level,
+        sky.noise,
+        chosen_px,
+        float(gain_e_dn),
+        priors.saturation,
+        tightness,
+    )
 
 
 def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
@@ -266,19 +394,14 @@ def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:
     return streaks_px(blobs, image.shape, priors.streak_px or blobs.streak_px or (0.0, 0.0))
 
 
-def _gravity_rows(image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
-    """Return the rows of `moments.center_of_gravity`."""
-    sky = blobs.background
-    return moments.center_of_gravity(
-        image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
-    )
-
-
 def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Replace the rows that are NaN by those of the center of gravity, in place."""
     failed = np.isnan(rows[:, 0])
     if failed.any():
-        rows[failed] = _gravity_rows(image, blobs, gain_e_dn)[failed]
+        sky = blobs.background
+        rows[failed] = moments.center_of_gravity(
+            image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
+        )[failed]
     return rows
 
 

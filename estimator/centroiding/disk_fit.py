@@ -42,11 +42,6 @@ def fit_all(
     out = np.full((len(xy), 5), np.nan)
     buffer = np.empty(len(xy), np.int64)
     p = np.empty(6)
-    capacity = _largest_window(boxes)
-    pixels = np.empty((3, capacity))
-    rows = np.empty((7, capacity))
-    weight = np.empty(capacity)
-    rows[SKY] = 1.0
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
         p[RADIUS] = sqrt(area[n] / pi)
@@ -67,6 +62,8 @@ def fit_all(
         p[BRIGHTNESS] = flux[n] / area[n]
         p[SKY] = sky
         # Pixels that are neither saturated nor of another blob
+        capacity = (x1 - x0 + 1) * (y1 - y0 + 1)
+        pixels = np.empty((3, capacity))
         count = 0
         for y in range(y0, y1 + 1):
             for x in range(x0, x1 + 1):
@@ -78,17 +75,10 @@ def fit_all(
                     pixels[2, count] = image[y, x]
                     count += 1
         if count >= 12:  # twice the number of parameters
+            rows = np.ones((7, count))  # those of the sky stay 1
+            weight = np.empty(count)
             _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n])
     return out
-
-
-@jit
-def _largest_window(boxes: Ints) -> int:
-    """Return the number of pixels in the largest blob's window."""
-    largest = 0
-    for x0, y0, x1, y1 in boxes:
-        largest = max(largest, (x1 - x0 + 1 + 2 * MARGIN_PX) * (y1 - y0 + 1 + 2 * MARGIN_PX))
-    return largest
 
 
 @jit

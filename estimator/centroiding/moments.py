@@ -28,7 +28,6 @@ WINDOW_VARIANCE_RATIO = 2.0
 # Number of iterations that adapt the window's width, and largest number of all iterations.
 SIZING_ITERATIONS = 4
 MAX_ITERATIONS = 60
-Moments = tuple[float, float, float, float]
 
 
 @jit
@@ -41,108 +40,10 @@ def center_of_gravity(
 
         xbar = sum(I_i x_i) / F,    var(xbar) = sum(s_i^2 (x_i - xbar)^2) / F^2,    s_i^2 = max(I_i, 0) / g + n^2,
 
-    as dxbar/dI_i = (x_i - xbar) / F. The same holds for y, and sigma^2 = (var(xbar) + var(ybar)) / 2. In one pass over
-    the pixels, with u = x - x_origin and v = y - y_origin from the window's center:
-
-    1. Sum the light and its first moments, which give xbar and ybar.
-    2. Sum the second moments of the positive light and of the pixels about the origin.
-    3. Move the second moments to xbar and ybar: sum(w (u - c)^2) = sum(w u^2) - 2 c sum(w u) + c^2 sum(w).
-    4. The variance is the light's second moment over g plus the pixels' second moment times n^2.
-
-    Pixels nearer to another blob's box are excluded.
+    as dxbar/dI_i = (x_i - xbar) / F. The same holds for y, and sigma^2 = (var(xbar) + var(ybar)) / 2. Pixels nearer to
+    another blob's box are excluded.
     """
-    height, width = image.shape
-    out = np.empty((len(boxes), 4))
-    buffer = np.empty(len(boxes), np.int64)
-    for n in range(len(boxes)):
-        x0, y0, x1, y1 = _window(boxes[n], MARGIN_PX, width, height)
-        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-        origin_x = (x0 + x1) / 2
-        origin_y = (y0 + y1) / 2
-        # 1. and 2. Moments about the origin
-        flux, sx, sy, by_light, by_pixel = _box_moments(
-            image, boxes, neighbor_rows, n, level, (x0, y0, x1, y1)
-        )
-        if flux == 0:  # the center of gravity is undefined
-            out[n, :3] = np.nan
-            out[n, 3] = 0.0
-            continue
-        # xbar and ybar, from the origin
-        cx = sx / flux
-        cy = sy / flux
-        # 3. and 4. n^2 of one pixel, and the mean of both coordinates' variances times F^2
-        sigma2 = (
-            interpolate(noise, height, width, cy + origin_y, cx + origin_x) / FILTERED_NOISE
-        ) ** 2
-        moment_variance = (
-            _moved(by_light, cx, cy) / gain_e_dn + sigma2 * _moved(by_pixel, cx, cy)
-        ) / 2
-        out[n, 0] = cx + origin_x
-        out[n, 1] = cy + origin_y
-        out[n, 3] = flux
-        out[n, 2] = sqrt(max(moment_variance, 0.0)) / abs(flux)
-    return out
-
-
-@jit
-def _box_moments(
-    image: NDArray,
-    boxes: Ints,
-    neighbor_rows: Ints,
-    n: int,
-    level: Floats,
-    window: tuple[int, int, int, int],
-) -> tuple[float, float, float, Moments, Moments]:
-    """Sum blob n's light about the center of a window: steps 1 and 2 of `center_of_gravity`.
-
-    Returns
-    -------
-    tuple
-        F, sum(I u) and sum(I v); the sums of w, w u, w v and w (u^2 + v^2), with w the positive light, and with w = 1
-    """
-    height, width = image.shape
-    x0, y0, x1, y1 = window
-    origin_x = (x0 + x1) / 2
-    origin_y = (y0 + y1) / 2
-    flux = sx = sy = s_light = light_xx = light_x = light_y = 0.0
-    count = px = py = pxx = 0.0
-    for y in range(y0, y1 + 1):
-        for x in range(x0, x1 + 1):
-            if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                continue
-            light = image[y, x] - interpolate(level, height, width, y, x)
-            u = x - origin_x
-            v = y - origin_y
-            # 1. F, sum(I u), sum(I v)
-            flux += light
-            sx += light * u
-            sy += light * v
-            # 2. Photon noise is that of the light itself, without the negative noise of the sky.
-            positive = max(light, 0.0)
-            s_light += positive
-            light_x += positive * u
-            light_y += positive * v
-            light_xx += positive * (u * u + v * v)
-            count += 1
-            px += u
-            py += v
-            pxx += u * u + v * v
-    return flux, sx, sy, (s_light, light_x, light_y, light_xx), (count, px, py, pxx)
-
-
-@jit
-def _moved(moments: Moments, cx: float, cy: float) -> float:
-    """Return sum(w ((u - cx)^2 + (v - cy)^2)) from the sums of w, w u, w v and w (u^2 + v^2)."""
-    total, x, y, square = moments
-    return square - 2 * (cx * x + cy * y) + (cx * cx + cy * cy) * total
-
-
-@jit
-def _window(box: Ints, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
-    """Return a box (x0, y0, x1, y1) with a margin, cut at the image's edge."""
-    x0 = max(box[0] - margin, 0)
-    y0 = max(box[1] - margin, 0)
-    return x0, y0, min(box[2] + margin, width - 1), min(box[3] + margin, height - 1)
+    return _weighted_mean(image, boxes, level, noise, gain_e_dn, MARGIN_PX, 1)
 
 
 @jit
@@ -155,55 +56,66 @@ def squared_light(
 
         c = sum(I_i^2 x_i) / W,    var(c) = sum(4 I_i^2 (x_i - c)^2 (I_i / g + n^2)) / W^2 + sampling_variance.
 
-    The sampling variance is that of the squared profile, whose variance is sum(I_i^2 (x_i - c)^2) / W. The first sweep
-    over the pixels gives c, the second one the sums about it.
+    The sampling variance is that of the squared profile, whose variance is sum(I_i^2 (x_i - c)^2) / W.
     """
+    return _weighted_mean(image, boxes, level, noise, gain_e_dn, 1, 2)
+
+
+@jit
+def _weighted_mean(
+    image: NDArray,
+    boxes: Ints,
+    level: Floats,
+    noise: Floats,
+    gain_e_dn: float,
+    margin: int,
+    power: int,
+) -> Floats:
+    """Compute the mean position weighted by a power of the light, 1 or 2, in each box and a margin."""
     height, width = image.shape
-    out = np.empty((len(boxes), 4))
+    out = np.zeros((len(boxes), 4))
     buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
-        x0, y0, x1, y1 = _window(boxes[n], 1, width, height)
+        x0, y0, x1, y1 = _window(boxes[n], margin, width, height)
         neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
-        cx = cy = flux = weight = moment_variance = second_moment = 0.0
-        sigma2 = 0.0
-        for sweep in range(2):  # first c and the flux, then the sums about c
-            for y in range(y0, y1 + 1):
-                for x in range(x0, x1 + 1):
-                    if belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
-                        continue
-                    light = image[y, x] - interpolate(level, height, width, y, x)
-                    if sweep == 0:
-                        flux += light
-                        light = max(light, 0.0)
-                        weight += light * light
-                        cx += light * light * x
-                        cy += light * light * y
-                        continue
-                    # Mean of both coordinates' squared distances
-                    light = max(light, 0.0)
-                    distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / 2
-                    second_moment += light * light * distance2
-                    moment_variance += (
-                        4 * light * light * distance2 * (light / gain_e_dn + sigma2)
+        light = np.zeros((y1 - y0 + 1, x1 - x0 + 1))
+        own = np.zeros_like(light)
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if not belongs_to_neighbor(boxes, neighbor_rows, n, x, y):
+                    light[y - y0, x - x0] = image[y, x] - interpolate(
+                        level, height, width, y, x
                     )
-            if sweep == 0:
-                if weight == 0:
-                    break
-                # c, and n^2 of one pixel there
-                cx = cx / weight
-                cy = cy / weight
-                sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
-        if weight == 0:
+                    own[y - y0, x - x0] = 1.0
+        # Photon noise is that of the light itself, without the negative noise of the sky.
+        positive = np.maximum(light, 0.0)
+        share = light if power == 1 else positive**2
+        total = share.sum()
+        if total == 0:  # the mean is undefined
             out[n, :3] = np.nan
-            out[n, 3] = 0.0
             continue
-        out[n, 0] = cx
-        out[n, 1] = cy
-        out[n, 3] = flux
-        out[n, 2] = sqrt(
-            moment_variance / weight**2 + sampling_variance(second_moment / weight)
-        )
+        across = np.arange(x0, x1 + 1)
+        down = np.arange(y0, y1 + 1).reshape(-1, 1)
+        cx = (share * across).sum() / total
+        cy = (share * down).sum() / total
+        # n^2 of one pixel at c; the mean of both coordinates' squared distances
+        sigma2 = (interpolate(noise, height, width, cy, cx) / FILTERED_NOISE) ** 2
+        distance2 = ((across - cx) ** 2 + (down - cy) ** 2) / 2
+        slope2 = own if power == 1 else 4 * share  # of c, without the distance and W
+        noise2 = slope2 * distance2 * (positive / gain_e_dn + sigma2)
+        variance = noise2.sum() / total**2
+        if power == 2:
+            variance += sampling_variance((share * distance2).sum() / total)
+        out[n] = cx, cy, sqrt(variance), light.sum()
     return out
+
+
+@jit
+def _window(box: Ints, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
+    """Return a box (x0, y0, x1, y1) with a margin, cut at the image's edge."""
+    x0 = max(box[0] - margin, 0)
+    y0 = max(box[1] - margin, 0)
+    return x0, y0, min(box[2] + margin, width - 1), min(box[3] + margin, height - 1)
 
 
 @jit

@@ -19,7 +19,7 @@ from math import cos, erf, exp, hypot, pi, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.centroiding.moments import belongs_to_neighbor, neighbors
+from estimator.centroiding.moments import neighbors
 from estimator.core import least_squares
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
@@ -30,6 +30,9 @@ MARGIN_PX = 4
 MAX_HALF_WINDOW_PX = 96
 REACH_PX = (
     4.5  # largest distance of a pixel from the initial line; farther ones contain only sky
+)
+CORE_PX = (
+    2.0  # pixels nearer than this belong to a streak even if they are nearer to another one
 )
 MIN_STREAK_PX = 1.5  # shortest streak whose length and direction can be measured
 MAX_ITERATIONS = 40
@@ -45,6 +48,9 @@ FAR_SIGMA = (
 # Parameters: center, flux, length, direction, width, sky.
 X, Y, FLUX, LENGTH, ANGLE, WIDTH, SKY = range(7)
 OUTPUTS = 13
+# Streaks of at least 6 widths show how their light fades, up to a share by faint neighbors and unequal pixels.
+MIN_INNER = 0.4
+FADING_SIGMA = 0.02
 MAX_OWN_ERROR = (
     0.3  # largest relative error of a length without priors that the linear theory holds for
 )
@@ -60,32 +66,32 @@ def fit_all(
     streaks: Floats,
     gain_e_dn: float,
     saturation: float,
+    tightness: float = 1.0,
 ) -> Floats:
     """Fit every blob around its expected streak; return (N, 13), NaN if it is not a streak.
 
     The columns are x, y, flux, dx, dy; xx, yy, xy of the center's covariance; dx, dy without the priors; and xx, yy, xy
-    of their covariance. The last five are NaN if the star alone does not determine its streak.
+    of their covariance. The last five are NaN if the star alone does not determine its streak. With tight priors two of
+    them are the distance of the center from the center of light, along the streak, and its variance.
 
     Parameters
     ----------
     streaks
         (N, 2) expected streak (dx, dy) of each blob, px
+    tightness
+        Factor of the priors' standard deviations: below 1 where the streaks are known better than by a frame's median
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
     buffer = np.empty(len(xy), np.int64)
     p = np.empty(7)
-    capacity = _largest_window(streaks)
-    pixels = np.empty((3, capacity))
-    rows = np.empty((8, capacity))
-    weight = np.empty(capacity)
-    rows[SKY] = 1.0
     width_px = 0.9
     for n in range(len(xy)):
         length = hypot(streaks[n, 0], streaks[n, 1])
         angle = np.arctan2(streaks[n, 1], streaks[n, 0])
-        half_x, half_y = _half_window(streaks[n])
-        if length < MIN_STREAK_PX or half_x < 0:
+        half_x = int(abs(streaks[n, 0]) / 2) + MARGIN_PX
+        half_y = int(abs(streaks[n, 1]) / 2) + MARGIN_PX
+        if length < MIN_STREAK_PX or max(half_x, half_y) > MAX_HALF_WINDOW_PX:
             continue
         x0 = round(xy[n, 0]) - half_x
         y0 = round(xy[n, 1]) - half_y
@@ -101,27 +107,32 @@ def fit_all(
         p[ANGLE] = angle
         p[WIDTH] = width_px
         p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
-        own = (boxes, buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)], n)
-        count = _select_pixels(image, own, (x0, y0, x1, y1), saturation, p, pixels)
-        if p[FLUX] > 0 and _fit(pixels[:, :count], sigma, gain_e_dn, rows, weight, p, out[n]):
+        capacity = (2 * half_x + 1) * (2 * half_y + 1)
+        pixels = np.empty((3, capacity))
+        near = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        offsets = _offsets_of_others(xy, near, n, p)
+        count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
+        data = pixels[:, :count]
+        rows = np.ones((8, count))  # those of the sky stay 1
+        weight = np.empty(count)
+        if p[FLUX] > 0 and _fit(data, sigma, gain_e_dn, rows, weight, p, out[n], tightness):
             width_px = p[WIDTH]  # the optics are the same for the next star
     return out
 
 
 @jit
-def _largest_window(streaks: Floats) -> int:
-    """Return the number of pixels in the largest streak's window."""
-    largest = 0
-    for n in range(len(streaks)):
-        half_x, half_y = _half_window(streaks[n])
-        largest = max(largest, (2 * half_x + 1) * (2 * half_y + 1))
-    return largest
+def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
+    """Return the (K, 2) offsets of nearby blobs from blob n, without those that may be fragments of its streak."""
+    offsets = xy[near] - xy[n]
+    along = offsets[:, 0] * cos(p[ANGLE]) + offsets[:, 1] * sin(p[ANGLE])
+    across = offsets[:, 1] * cos(p[ANGLE]) - offsets[:, 0] * sin(p[ANGLE])
+    return offsets[(np.abs(across) > CORE_PX) | (np.abs(along) > p[LENGTH])]
 
 
 @jit
 def _select_pixels(
     image: NDArray,
-    blob: tuple[Ints, Ints, int],
+    offsets: Floats,
     window: tuple[int, int, int, int],
     saturation: float,
     p: Floats,
@@ -131,8 +142,8 @@ def _select_pixels(
 
     Parameters
     ----------
-    blob
-        Boxes of all blobs, the rows of its neighbors, and its own row
+    offsets
+        (K, 2) offsets of other streaks, whose pixels are left out
     window
         x0, y0, x1, y1
     p
@@ -140,15 +151,19 @@ def _select_pixels(
     pixels
         (3, K) x, y and value of the pixels, written in place
     """
-    boxes, neighbor_rows, n = blob
     x0, y0, x1, y1 = window
     p[FLUX] = 0.0
     count = 0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
-            if _distance_to_line(p, x, y) > REACH_PX or belongs_to_neighbor(
-                boxes, neighbor_rows, n, x, y
-            ):
+            distance = _distance_to_line(p, x, y)
+            if distance > REACH_PX:
+                continue
+            own = True
+            for k in range(len(offsets)):
+                other = _distance_to_line(p, x - offsets[k, 0], y - offsets[k, 1])
+                own = own and (distance < CORE_PX or distance <= other)
+            if not own:
                 continue
             p[FLUX] += image[y, x] - p[SKY]
             if image[y, x] < saturation:
@@ -157,14 +172,6 @@ def _select_pixels(
                 pixels[2, count] = image[y, x]
                 count += 1
     return count
-
-
-@jit
-def _half_window(streak: Floats) -> tuple[int, int]:
-    """Return half the window's width and height about a streak; (-1, -1) if it is too long."""
-    half_x = int(abs(streak[0]) / 2) + MARGIN_PX
-    half_y = int(abs(streak[1]) / 2) + MARGIN_PX
-    return (half_x, half_y) if max(half_x, half_y) <= MAX_HALF_WINDOW_PX else (-1, -1)
 
 
 @jit
@@ -193,6 +200,7 @@ def _fit(
     weight: Floats,
     p: Floats,
     out: Floats,
+    tightness: float = 1.0,
 ) -> bool:
     """Fit one streak by Gauss-Newton, starting from `p`; return False if it does not converge near its start.
 
@@ -203,7 +211,7 @@ def _fit(
     3. Apply the step, shortened to about a pixel, and give up far from the start.
     4. At convergence, read the center's covariance from the inverse normal matrix. Where the model does not fit (two
        crossing streaks) the residuals inflate it. Add the error of the ends (`_write_streak`).
-    5. Compute the streak's vector without its priors (`_own_vector`).
+    5. Compute the streak's vector without its priors (`_own_vector`); with tight ones, how its light fades (`_fading`).
 
     Parameters
     ----------
@@ -217,6 +225,8 @@ def _fit(
         (7,) parameters, updated in place
     out
         (13,) row of `fit_all`
+    tightness
+        Factor of the priors' standard deviations
     """
     count = pixels.shape[1]
     start = p.copy()
@@ -227,7 +237,7 @@ def _fit(
         _rows(pixels, noise, gain_e_dn, p, rows, weight)
         # 2. Step
         least_squares.normal_equations(rows, weight, count, normal)
-        _add_priors(normal, p, start)
+        _add_priors(normal, p, start, tightness)
         fall = least_squares.step(normal, step)
         if not fall >= 0:
             return False
@@ -242,17 +252,21 @@ def _fit(
             end_variance_px2 = _end_variance_px2(p, noise, gain_e_dn)
             _write_streak(normal, p, misfit, end_variance_px2, step, out)
             # 5. The streak's own vector
-            _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
+            if tightness == 1:
+                _own_vector(normal, p, start, misfit, 8 * end_variance_px2, out[8:])
+            else:
+                out[8], out[9] = _fading(pixels, rows, weight, p)
             return True
     return False
 
 
 @jit
-def _add_priors(normal: Floats, p: Floats, start: Floats) -> None:
+def _add_priors(normal: Floats, p: Floats, start: Floats, tightness: float) -> None:
     """Add the priors on length, direction and width to the normal matrix."""
-    length_sigma = length_sigma_px(start[LENGTH])
+    length_sigma = tightness * length_sigma_px(start[LENGTH])
     least_squares.add_prior(normal, LENGTH, start[LENGTH] - p[LENGTH], length_sigma)
-    least_squares.add_prior(normal, ANGLE, start[ANGLE] - p[ANGLE], ANGLE_RAD)
+    angle_sigma = tightness * ANGLE_RAD
+    least_squares.add_prior(normal, ANGLE, start[ANGLE] - p[ANGLE], angle_sigma)
     width_sigma = WIDTH_FRACTION * start[WIDTH]
     least_squares.add_prior(normal, WIDTH, start[WIDTH] - p[WIDTH], width_sigma)
 
@@ -332,38 +346,54 @@ def _own_vector(
         least_squares.cholesky_solve(factor, column)
         cov[i, 0] = column[LENGTH]
         cov[i, 1] = column[ANGLE]
-    # 2. D = S^-1 - P, and then D^-1, with elements ll, aa, la of length and angle
-    prior_l = 1 / length_sigma_px(start[LENGTH]) ** 2
-    prior_a = 1 / ANGLE_RAD**2
-    det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-    ll = cov[1, 1] / det - prior_l
-    aa = cov[0, 0] / det - prior_a
-    la = -cov[0, 1] / det
-    det = ll * aa - la**2
-    if not (ll > 0 and aa > 0 and det > 0):
+    # 2. D = S^-1 - P, and then D^-1
+    prior = np.array([1 / length_sigma_px(start[LENGTH]) ** 2, 1 / ANGLE_RAD**2])
+    own = np.linalg.inv(cov)
+    for i in range(2):
+        own[i, i] -= prior[i]
+    if not (own[0, 0] > 0 and own[0, 0] * own[1, 1] > own[0, 1] ** 2):
         return
-    ll, aa, la = aa / det, ll / det, -la / det
+    own = np.linalg.inv(own)
     # 3. m + D^-1 P (m - start)
-    pull_l = prior_l * (p[LENGTH] - start[LENGTH])
-    pull_a = prior_a * (p[ANGLE] - start[ANGLE])
-    length = p[LENGTH] + ll * pull_l + la * pull_a
-    angle = p[ANGLE] + la * pull_l + aa * pull_a
+    length, angle = p[LENGTH:WIDTH] + own @ (prior * (p[LENGTH:WIDTH] - start[LENGTH:WIDTH]))
     # 4. Errors
-    ll = misfit * ll + ends_px2
-    aa = misfit * aa
-    la = misfit * la
-    if not (ll < (MAX_OWN_ERROR * length) ** 2 and aa < MAX_OWN_ERROR**2 and length > 0):
+    own *= misfit
+    own[0, 0] += ends_px2
+    largest = MAX_OWN_ERROR**2
+    if not (own[0, 0] < largest * length**2 and own[1, 1] < largest and length > 0):
         return
-    # 5. (dx, dy) = L (c, s): errors of the length are along the streak, L times those of the angle across it.
+    # 5. (dx, dy) = L (c, s), and its derivatives by L and the angle
     c = cos(angle)
     s = sin(angle)
-    across = length**2 * aa
-    both = length * la
+    slopes = np.array([[c, -length * s], [s, length * c]])
+    own = slopes @ own @ slopes.T.copy()
     out[0] = length * c
     out[1] = length * s
-    out[2] = ll * c * c + across * s * s - 2 * both * c * s
-    out[3] = ll * s * s + across * c * c + 2 * both * c * s
-    out[4] = (ll - across) * c * s + both * (c * c - s * s)
+    out[2] = own[0, 0]
+    out[3] = own[1, 1]
+    out[4] = own[0, 1]
+
+
+@jit
+def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[float, float]:
+    """Return how far the fit's center is from the center of light along the streak, px, and the variance of that.
+
+    An image that accelerates by a in the exposure T leaves light that fades by the share s = a T^2 / L from one end to
+    the other, I (1 - s u / L), and the middle between its ends is s L / 12 ahead of its center of light. With g = I u /
+    L, the residuals r and their weights W, s is -sum(W g r) / sum(W g^2). Ends of the width w draw the fit's center
+    back by sqrt(pi) / 2 w s, a share 6 sqrt(pi) w / L, which takes half that share of the residuals. Both are exact to
+    first order in w / L; exponentials continue them to short streaks.
+    """
+    length = p[LENGTH]
+    inner = exp(-3 * sqrt(pi) * p[WIDTH] / length)
+    if inner < MIN_INNER:
+        return np.nan, np.nan
+    u = (pixels[0] - p[X]) * cos(p[ANGLE]) + (pixels[1] - p[Y]) * sin(p[ANGLE])
+    g = p[FLUX] * rows[FLUX] * u / length
+    information = np.sum(weight * g * g) * inner
+    fading = -np.sum(weight * g * rows[7]) / information
+    ahead = length / 12 * inner * inner
+    return fading * ahead, (1 / information + FADING_SIGMA**2) * ahead**2
 
 
 @jit

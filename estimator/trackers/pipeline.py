@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.attitude.rate import center_streak_px
-from estimator.centroiding.centroid import CENTROIDERS
+from estimator.attitude.rate import center_streak_px, image_paths
+from estimator.centroiding.centroid import CENTROIDERS, known_streaks
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
 from estimator.core.checks import Allowed, Floats, Ints, Step
@@ -47,6 +47,9 @@ SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
 # with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
+LONG_STREAK_PX = (
+    3.0  # median length above which streaks are fitted with the rate of the frame
+)
 MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
 # Extra error of a centroid on an interpolated bad pixel, from Monte Carlo.
 BAD_PIXEL_SIGMA_PX = 0.06
@@ -236,6 +239,7 @@ def detect_and_centroid(
     clock: Clock,
     streak_px: Step | None = None,
     turn_rad: float = 0.0,
+    exposure_s: float | None = None,
 ) -> Centroids:
     """Detect blobs and compute their centroids: the numbered steps of the module.
 
@@ -243,6 +247,8 @@ def detect_and_centroid(
     ----------
     streak_px, turn_rad
         Streak and turn of FramePriors, from the gyro; None if unknown
+    exposure_s
+        Exposure time; None if unknown
 
     Raises
     ------
@@ -283,7 +289,18 @@ def detect_and_centroid(
         blobs = blobs.take(stars)
     clock.lap("detect")
     # 3. Centroids
-    centroids = CENTROIDERS[settings.centroider](image, blobs, settings.gain_e_dn, priors)
+    gain_e_dn = settings.gain_e_dn
+    centroids = CENTROIDERS[settings.centroider](image, blobs, gain_e_dn, priors)
+    paths = None
+    # Without the time between rows an exposure of 1 s gives the rotation during it.
+    if exposure_s or not camera.row_time_s:
+        paths = image_paths(camera, centroids, exposure_s or 1.0)
+    if paths is not None:
+        streaks_px, light_px, ahead_px = paths
+        centroids = known_streaks(
+            image, blobs, centroids, (streaks_px, ahead_px), gain_e_dn, priors
+        )
+        centroids = replace(centroids, xy_px=centroids.xy_px - light_px - ahead_px)
     centroids = inflate_uncertainty(centroids, blobs, settings)
     if camera.row_time_s and streak_px is None and centroids.streak_px is None:
         # The rows of a frame are far apart in time, so that even a rough rate is needed to identify its lights.
@@ -342,7 +359,9 @@ def process_frame(
     if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
         streak_px = center_streak_px(camera, rate, exposure_s)
         turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
-    centroids = detect_and_centroid(image, camera, settings, clock, streak_px, turn_rad)
+    centroids = detect_and_centroid(
+        image, camera, settings, clock, streak_px, turn_rad, exposure_s
+    )
     return Report(solve(centroids, clock), centroids, clock.seconds)
 
 

@@ -172,7 +172,10 @@ def candidates(
     no streak is measured.
     """
     if rate is not None:
-        yield from ((signed, signed) for signed in _signs(rate))
+        yield rate, rate
+        if not rate.sign_known:
+            reverse = replace(rate, rate_rad_s=-rate.rate_rad_s)
+            yield reverse, reverse
         return
     anything = RateEstimate(np.zeros(3), MAX_RATE_RAD_S**2 * np.eye(3))
     streaks = []
@@ -197,11 +200,6 @@ def candidates(
         covariance = slow.covariance_rad2_s2 * (SMALL_SHEAR_PX / shear_px) ** 2
         yield replace(slow, covariance_rad2_s2=covariance), prior
     yield slow, prior
-
-
-def _signs(rate: RateEstimate) -> list[RateEstimate]:
-    """Return a rate, and its negative if the sign is unknown."""
-    return [rate] if rate.sign_known else [rate, replace(rate, rate_rad_s=-rate.rate_rad_s)]
 
 
 def _fit(
@@ -238,7 +236,9 @@ def _fit(
     if not streaks:
         return by_rows.rate
     resolved = [streak.resolved(by_rows.rate) for streak in streaks]
-    signed = min(resolved, key=lambda one: _apart(one, by_rows.rate))
+    signed = min(
+        resolved, key=lambda one: np.linalg.norm(one.rate_rad_s - by_rows.rate.rate_rad_s)
+    )
     if not signed.sign_known:
         return by_rows.rate
     first = by_rows.cam_from_ref, signed.rate_rad_s
@@ -252,15 +252,6 @@ def _lens(attitude: Attitude, camera: Camera) -> Camera:
     """
     fitted = attitude.camera or camera
     return fitted if abs(fitted.focal_px / camera.focal_px - 1) > SAME_FOCAL else camera
-
-
-def _apart(one: RateEstimate, other: RateEstimate) -> float:
-    """Return the squared Mahalanobis distance of two rates."""
-    difference = one.rate_rad_s - other.rate_rad_s
-    return float(
-        difference
-        @ np.linalg.solve(one.covariance_rad2_s2 + other.covariance_rad2_s2, difference)
-    )
 
 
 def _radii(lights: Lights, places: Floats) -> Sight:
@@ -310,9 +301,7 @@ def with_streak_rate(
     camera = attitude.camera
     if match is None or camera is None or exposure_s is None:
         return attitude
-    sight = STARS
-    if lights is not None and lights.lever_cam_m.any():
-        sight = _radii(lights, lights.place_ref[match.star])
+    sight = STARS if lights is None else _radii(lights, lights.place_ref[match.star])
     streaks = from_streaks(camera, centroids.take(match.observed), exposure_s, sight)
     if not streaks:
         return attitude

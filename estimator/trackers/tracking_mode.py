@@ -2,12 +2,13 @@
 
 1. Predict the attitude from the last one, with the gyros or with the last rate.
 2. Search for the brightest predicted stars in small windows around their positions.
-3. Match and fit the attitude, and accept it by the same Bayes factor as in the lost-in-space search, increased because
-   the prediction restricts the volume of possible attitudes.
+3. Match and fit the attitude, and accept it by the same Bayes factor as in the lost-in-space search, with the volumes
+   that the windows leave to attitudes and to lights (`_window_dex`).
 4. If that fails, or the last attitude is too old, solve the whole frame lost in space.
+5. Add the error by a change of the rate during the exposure to the covariance (`_remember`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from math import log10, pi
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
@@ -27,6 +29,7 @@ from estimator.detection.detect import in_row_order
 from estimator.detection.windows import in_windows
 from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
+from estimator.identification.star_evidence import Hypothesis, Solution
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
@@ -42,9 +45,9 @@ WINDOW_SIGMA = 4.0  # detection threshold: lower than in a frame, as fewer pixel
 # Longer streaks are detected with the streak filter in the whole frame
 LONGEST_STREAK_PX = 4.0
 RATE_CHANGE = 0.3  # relative difference of a rate from its mean since the last attitude
+ENDS_PX = 8.0  # length of a streak, of stars 0.7 px wide, whose middle is off by half as much as that of a long one
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
-# Least share of the expected stars in a tracked solution. Where the prediction is wrong, three stars in the windows may
-# fit by chance: in 2 of 2,400 frames at the limits of rate and acceleration, with 3 of 15 and 16 stars.
+# Least share of the expected stars in a tracked solution: a few may be right where the prediction is wrong.
 LEAST_SHARE = 1 / 3
 
 
@@ -94,12 +97,18 @@ class LastSolution:
     cam_from_ref
         Attitude
     rate_rad_s
-        (3,) rate of the stars in camera axes: the negative of the camera's rate
+        (3,) mean rate of the stars, in camera axes, since the attitude before: the negative of the camera's rate
+    acceleration_rad_s2
+        (3,) change of that rate per time; zeros if it is unknown
+    step_s
+        Time since the attitude before; 0 if there is none
     """
 
     t_s: float
     cam_from_ref: Rotation
     rate_rad_s: Floats
+    acceleration_rad_s2: Floats = field(default_factory=lambda: np.zeros(3))
+    step_s: float = 0.0
 
 
 class TrackingMode:
@@ -192,8 +201,8 @@ class TrackingMode:
             attitude = tracker.solve_centroids(centroids, clock, exposure_s=exposure_s)
             sigma_px = tracker.sigma_px(centroids)
             report = self._report(attitude, centroids, sigma_px, clock, streak_px)
-        report.attitude = self._with_rate(t_s, report.attitude, report.centroids, exposure_s)
-        self._store(t_s, report.attitude)
+        # 5. Memory
+        report.attitude = self._remember(t_s, report.attitude, report.centroids, exposure_s)
         return report
 
     def warm_up(self, dtype: DTypeLike = np.uint16) -> None:
@@ -224,43 +233,62 @@ class TrackingMode:
         ):
             return None
         if now_from_then is None:
-            now_from_then = Rotation.from_rotvec(last.rate_rad_s * (t_s - last.t_s))
+            step_s = t_s - last.t_s
+            change_s = (last.step_s + step_s) / 2  # between the middles of both steps
+            rate_rad_s = last.rate_rad_s + last.acceleration_rad_s2 * change_s
+            now_from_then = Rotation.from_rotvec(rate_rad_s * step_s)
         return now_from_then * last.cam_from_ref
 
-    def _with_rate(
+    def _remember(
         self, t_s: float, attitude: Attitude, centroids: Centroids, exposure_s: float | None
     ) -> Attitude:
-        """Return the attitude with the rate of its streaks, whose sign the last attitude determines."""
+        """Store an attitude; return it with the rate of its streaks, and with the error by a change of the rate.
+
+        1. Mean rate since the last attitude, and its change: from the mean rate before that attitude, otherwise, less
+           accurately, from the rate of this frame's streaks, whose sign the mean rate determines.
+        2. A streak's middle between its ends is off from its center of light, where the mean attitude of the exposure
+           puts it, by a T^2 / 12, with the acceleration a along the streak in the exposure T. The fit of a streak of
+           length L and width w is off by about L / (L + ENDS_PX) of that: the light fades from one end to the other by
+           s = a T^2 / L, which moves the middle back by sqrt(pi) / 2 w s, as its ends have the width w. The covariance
+           gets the square (`rate.image_paths` corrects what a constant rate does).
+
+        A frame without an attitude leaves the memory unchanged.
+        """
         if attitude.rate is None:
             attitude = with_streak_rate(attitude, centroids, exposure_s)
-        last = self.last
         cam_from_ref = attitude.cam_from_ref
-        if attitude.rate is None or cam_from_ref is None or last is None:
+        if cam_from_ref is None or attitude.covariance_rad2 is None:
             return attitude
-        if not 0 < t_s - last.t_s <= self.max_age_s:
+        last = self.last
+        rate = attitude.rate
+        self.last = LastSolution(t_s, cam_from_ref, np.zeros(3))
+        if last is None or not 0 < t_s - last.t_s <= self.max_age_s:
             return attitude
-        # Mean rate of the camera since the last attitude
-        between_rad_s = -(cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (
-            t_s - last.t_s
+        # 1. Rate
+        step_s = t_s - last.t_s
+        between_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / step_s
+        change_rad_s = np.zeros(3)
+        if last.step_s:
+            change_rad_s = between_rad_s - last.rate_rad_s
+        if rate is not None:
+            sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
+            mean = RateEstimate(-between_rad_s, sigma_rad_s**2 * np.eye(3))
+            rate = rate.resolved(mean)
+            if rate.sign_known and not last.step_s:
+                change_rad_s = -rate.rate_rad_s - between_rad_s
+        acceleration_rad_s2 = 2 * change_rad_s / (step_s + last.step_s)
+        self.last = LastSolution(
+            t_s, cam_from_ref, between_rad_s, acceleration_rad_s2, step_s
         )
-        sigma_rad_s = RATE_CHANGE * float(np.linalg.norm(between_rad_s))
-        between = RateEstimate(between_rad_s, sigma_rad_s**2 * np.eye(3))
-        return replace(attitude, rate=attitude.rate.resolved(between))
-
-    def _store(self, t_s: float, attitude: Attitude) -> None:
-        """Store the attitude and its rate. A frame without an attitude leaves the memory unchanged."""
-        cam_from_ref = attitude.cam_from_ref
-        if cam_from_ref is None:
-            return
-        last = self.last
-        rate_rad_s = np.zeros(3)
-        if attitude.rate is not None and attitude.rate.sign_known:
-            rate_rad_s = -attitude.rate.rate_rad_s
-        if last is not None and 0 < t_s - last.t_s <= self.max_age_s:
-            rate_rad_s = (cam_from_ref * last.cam_from_ref.inv()).as_rotvec() / (
-                t_s - last.t_s
-            )
-        self.last = LastSolution(t_s, cam_from_ref, rate_rad_s)
+        if rate is None or exposure_s is None:
+            return replace(attitude, rate=rate)
+        # 2. Acceleration
+        axis = rate.rate_rad_s / np.linalg.norm(rate.rate_rad_s)
+        length_px = np.hypot(*center_streak_px(self.tracker.camera, rate, exposure_s))
+        share = length_px / (length_px + ENDS_PX)
+        off_rad = share * exposure_s**2 / 12 * (acceleration_rad_s2 @ axis) * axis
+        covariance_rad2 = attitude.covariance_rad2 + np.outer(off_rad, off_rad)
+        return replace(attitude, rate=rate, covariance_rad2=covariance_rad2)
 
     def _track(
         self,
@@ -291,13 +319,7 @@ class TrackingMode:
         hypothesis = star_evidence.evaluate(
             detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
         )
-        # The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
-        # 2 reach_rad, the roll in an interval of 2 reach_rad over the half field.
-        field = tracker.sensor.field
-        half = float(np.min(field[1::2] - field[::2])) / 2
-        prior_volume = (2 * reach_rad) ** 2 * min(2 * reach_rad / half, 2 * pi)
-        prior_gain_dex = log10(8 * pi**2 / prior_volume)
-        if hypothesis.dex + prior_gain_dex < ACCEPT_DEX:
+        if hypothesis.dex + self._window_dex(len(window_centers_px), hypothesis) < ACCEPT_DEX:
             return None
         # 3. Attitude
         solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
@@ -307,12 +329,29 @@ class TrackingMode:
         ):
             return None
         found = refitted.solution
-        refitted = refitted._replace(solution=found._replace(dex=found.dex + prior_gain_dex))
+        dex = found.dex + self._window_dex(len(window_centers_px), found)
+        refitted = refitted._replace(solution=found._replace(dex=dex))
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(
             attitude, centroids, sigma_px, clock, streak_px, len(window_centers_px), saturated
         )
+
+    def _window_dex(self, windows: int, found: Hypothesis | Solution) -> float:
+        """Return log10 of the factor by which windows of a prediction change the evidence of an attitude.
+
+        - The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
+          2 reach, the roll in an interval of 2 reach over the half field.
+        - Chance does not put lights anywhere on the sensor: they are those in the windows. The density of false
+          lights is larger by the ratio of the sensor's area to that of the windows, for each match. Where the
+          prediction is wrong, each window has a light anywhere, and three of them soon agree.
+        """
+        side_rad = 2 * self.reach_px / self.tracker.camera.focal_px
+        left, right, top, bottom = self.tracker.sensor.field
+        half = min(right - left, bottom - top) / 2
+        prior_volume = side_rad**2 * min(side_rad / half, 2 * pi)
+        share = min(windows * side_rad**2 / ((right - left) * (bottom - top)), 1.0)
+        return log10(8 * pi**2 / prior_volume) + len(found.star) * log10(share)
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
         """Return the (N, 2) predicted pixels of the brightest stars whose windows are on the sensor.
@@ -337,16 +376,10 @@ class TrackingMode:
         """Return the centroids of the detections in windows, and whether any of them is saturated."""
         settings = self.tracker.settings
         priors = FramePriors(streak_px, settings.saturation, reject=settings.reject)
-        # Long streaks need the streak filter: the whole frame is processed, and only the windows are used.
+        # Long streaks need the streak filter: the whole frame is processed.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
-            centroids = detect_and_centroid(
-                image, self.tracker.camera, settings, clock, streak_px
-            )
-            near = (
-                np.abs(centroids.xy_px[:, None] - window_centers_px).max(axis=2)
-                < self.reach_px
-            )
-            return centroids.take(near.any(axis=1)), False
+            camera = self.tracker.camera
+            return detect_and_centroid(image, camera, settings, clock, streak_px), False
         image = monochrome(image, settings)
         image, blobs = cleaned(
             in_windows, image, priors, window_centers_px, self.reach_px, WINDOW_SIGMA

@@ -177,6 +177,43 @@ def test_exact_streaks_give_the_rate_in_one_of_two_signs(rng: np.random.Generato
         )
 
 
+@law(rate.image_paths, slow=True)
+@given(rng=SEEDS)
+def test_the_paths_of_images_are_those_of_a_constant_rate(rng: np.random.Generator) -> None:
+    """Against the path itself: its ends, their middle, and its mean over the exposure."""
+    camera = replace(GLOBAL, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
+    exposure_s = 0.1
+    omega = np.radians(any_rate(rng, 12.0))
+    corners = camera.corners_px - camera.center_px
+    middle_px = camera.center_px + rng.uniform(-0.8, 0.8, (20, 2)) * corners.max(axis=0)
+    t_s = np.linspace(-0.5, 0.5, 101) * exposure_s
+    rays = camera.rays(middle_px)
+    path = np.array(
+        [camera.pixels(Rotation.from_rotvec(-omega * t).apply(rays)) for t in t_s]
+    )
+    streak_px = path[-1] - path[0]
+    length_px = np.linalg.norm(streak_px, axis=1)[:, None]
+    found = Centroids(
+        middle_px,
+        np.full(20, 0.1),
+        np.ones(20),
+        streak_px=streak_px,
+        streak_covariance_px2=np.tile(1e-4 * np.eye(2), (20, 1, 1)),
+    )
+    paths = rate.image_paths(camera, found, exposure_s)
+    assert paths is not None
+    streaks, light_px, ahead_px = paths
+    sign = np.sign(np.sum(streaks * streak_px, axis=1))[:, None]
+    assert_allclose(streaks * sign, streak_px, rtol=0, atol=2e-3 * length_px.max())
+    tolerance = 0.02 * np.abs(path.mean(axis=0) - middle_px).max() + 1e-4
+    assert_allclose(light_px, path.mean(axis=0) - middle_px, rtol=0, atol=tolerance)
+    along = streak_px / length_px
+    ends_px = np.sum(((path[0] + path[-1]) / 2 - path.mean(axis=0)) * along, axis=1)
+    expected = ends_px[:, None] * along
+    assert_allclose(ahead_px, expected, rtol=0, atol=0.03 * np.abs(expected).max() + 1e-4)
+    assert rate.image_paths(camera, found.take(np.arange(2)), exposure_s) is None
+
+
 @pytest.mark.slow
 def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
     nees = []

@@ -1,5 +1,6 @@
 """Tracking mode: following stars, health flags, and recovery after loss."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.special import erf
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
-from estimator.core.types import Attitude, Centroids, StarMatch
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.detection.windows import in_windows
 from estimator.trackers.pipeline import Clock, Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -103,21 +104,77 @@ def test_the_last_rate_predicts_the_next_frame(tracker: StarTracker) -> None:
     assert off_rad(reports[2], turns[2] * START) < 2e-4
 
 
-def test_a_prediction_adds_the_evidence_of_its_smaller_volume(tracker: StarTracker) -> None:
-    """The same detections lost in space and followed: the odds differ by the ratio of the volumes of attitudes.
+def test_a_prediction_changes_the_volumes_of_attitudes_and_of_lights(
+    tracker: StarTracker,
+) -> None:
+    """The same detections lost in space and followed: the odds differ by two ratios.
 
-    8 pi^2, against a boresight within a square of 16 px and a roll of as much over the half field of 246.5 px.
+    Volumes of attitudes: 8 pi^2, against a boresight within a square of 16 px and a roll of as much over the half field
+    of 246.5 px. Places of a light: the sensor, against the windows.
     """
     follower = TrackingMode(tracker)
     follower.solve(photograph(tracker, START), 0.0)
     followed = follower.solve(photograph(tracker, START, 1), STEP_S)
     assert not followed.health & Health.SEARCHED
     lost = tracker.solve_centroids(followed.centroids).match
+    match = followed.attitude.match
     assert lost is not None
+    assert match is not None
     volume = (16 / CAMERA.focal_px) ** 2 * 16 / 246.5
+    places = followed.expected * 16**2 / (CAMERA.width_px * CAMERA.height_px)
+    expected = np.log10(8 * np.pi**2 / volume) + len(match.star) * np.log10(places)
     gain = followed.log10_odds + lost.log10_chance
-    # The two fits differ by rounding.
-    assert gain == pytest.approx(np.log10(8 * np.pi**2 / volume), abs=1e-3)
+    # The sensor's area by its corners: half a pixel more or less on each side
+    assert gain == pytest.approx(expected, abs=0.02 * len(match.star))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_lights_anywhere_in_the_windows_are_no_lock(tracker: StarTracker, seed: int) -> None:
+    """Where the prediction is wrong, each window has a light at some place: no attitude follows from that."""
+    rng = np.random.default_rng(seed)
+    follower = TrackingMode(tracker)
+    centers_px = follower.window_centers_px(START)
+    y, x = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
+    image = rng.normal(300, 12, x.shape)
+    for at in centers_px + rng.uniform(-7, 7, centers_px.shape):
+        image += 900 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / 2 / 0.8**2)
+    follower.last = LastSolution(0.0, START, np.zeros(3))
+    report = follower.solve(image.astype(np.uint16), STEP_S)
+    assert not report.attitude.solved
+
+
+def test_a_change_of_the_rate_predicts_the_next_frame_and_is_claimed(
+    tracker: StarTracker,
+) -> None:
+    """At 30 deg/s^2 the fourth frame is 13 px from where the last rate puts it: out of a window of 8 px."""
+    follower = TrackingMode(tracker)
+    change_rad_s2 = np.radians(30) * np.array([0.6, 0.8, 0.0])
+    times_s = STEP_S * np.arange(4)
+    turns = [Rotation.from_rotvec(change_rad_s2 * t**2 / 2) for t in times_s]
+    reports = [
+        follower.solve(photograph(tracker, turn * START, n), t)
+        for n, (turn, t) in enumerate(zip(turns, times_s, strict=True))
+    ]
+    assert not reports[3].health & Health.SEARCHED
+    assert off_rad(reports[3], turns[3] * START) < 2e-4
+    assert follower.last is not None
+    np.testing.assert_allclose(
+        follower.last.acceleration_rad_s2, change_rad_s2, rtol=0, atol=0.05
+    )
+    # The claim: a twelfth of a T^2 along the rate, less for a short streak.
+    attitude = reports[3].attitude
+    rate = RateEstimate(-change_rad_s2 * 0.25, 1e-6 * np.eye(3))
+    follower.last = LastSolution(
+        times_s[2], turns[2] * START, change_rad_s2 * 0.15, np.zeros(3), STEP_S
+    )
+    told = follower._remember(
+        times_s[3], replace(attitude, rate=rate), reports[3].centroids, 0.04
+    )
+    length_px = 0.25 * np.linalg.norm(change_rad_s2) * 0.04 * CAMERA.focal_px
+    axis = np.array([0.6, 0.8, 0.0])
+    added = axis @ (told.covariance_rad2 - attitude.covariance_rad2) @ axis
+    expected = np.radians(30) * 0.04**2 / 12 * length_px / (length_px + 8)
+    assert np.sqrt(added) == pytest.approx(expected, rel=0.05)
 
 
 def test_residuals_of_one_sigma_are_counted_over_2n_less_3(tracker: StarTracker) -> None:
