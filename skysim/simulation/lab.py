@@ -287,24 +287,6 @@ class Lab:
             lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras)
         )
 
-    def with_camera(self, **changes: Any) -> Lab:
-        """The lab with changed fields of its main camera."""
-        return replace(self, cameras=(replace(self.camera, **changes), *self.cameras[1:]))
-
-    def with_light(self, light: Light) -> Lab:
-        """The lab with one light of the main camera replaced: that of the same class. Raises InputError."""
-        if self.camera.channels:
-            raise InputError("camera.detector.bayer", "no light can be replaced", "none")
-        return self.with_camera(
-            lights=tuple(
-                light if type(one) is type(light) else one for one in self.camera.lights
-            )
-        )
-
-    def with_sources(self, sources: Sources) -> Lab:
-        """The lab with other stars or LEDs for its main camera."""
-        return self.with_light(replace(self.camera.known, sources=sources))
-
     def of_camera(self, number: int) -> Lab:
         """The lab with only one of its cameras, which becomes the main one."""
         camera = self.cameras[number]
