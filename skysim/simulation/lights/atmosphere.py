@@ -12,7 +12,6 @@ from skysim.camera.glow.background import node_directions, viewing_geometry
 from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.simulation.lights.light import (
     AddedLight,
@@ -94,10 +93,10 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
 
 def build(plan: LightPlan) -> Iterator[Light]:
     """The effects of `light.air`; none without it."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.air and plan.catalog is not None:
-        air = Air.from_config(light.air, plan.scene.site, plan.catalog, plan.band)
+    sky = plan.scene.stars
+    if sky and sky.air and plan.catalog is not None:
+        air = Air.from_config(sky.air, plan.scene.site, plan.catalog, plan.band)
         yield AirEffects(air)
         yield Skyline(air)
-        if light.air.glow:
-            yield AirGlow(air, light.air.glow)
+        if sky.air.glow:
+            yield AirGlow(air, sky.air.glow)

@@ -10,7 +10,6 @@ from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, wall_glow
 from skysim.core.types import Bools, Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
-from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.light import (
     AddedLight,
@@ -87,8 +86,8 @@ class Mirror(AddedLight):
 
 def build_wall(plan: LightPlan) -> Iterator[Light]:
     """The light that the wall or the floor of a dome reflects."""
-    light = plan.scene.light
-    if isinstance(light, DomeConfig) and light.reflection:
+    light = plan.scene.dome
+    if light and light.reflection:
         dome = reflecting_dome(light, light.reflection, known_light(plan).sources)
         if dome.diffuse is not None:
             yield WallGlow(dome, light.led.warm_up)
@@ -148,8 +147,8 @@ def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> Bools:
 
 def build_obstacles(plan: LightPlan) -> Iterator[Light]:
     """The obstacles, if `light.occlusion` is on; a collimated display has none in its beam."""
-    light = plan.scene.light
-    if getattr(light, "occlusion", False):
+    scene = plan.scene
+    if getattr(scene.light, "occlusion", False):
         yield Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount))
-        if isinstance(light, DomeConfig):
-            yield DomeWall(build_surface(light.surface))
+        if scene.dome:
+            yield DomeWall(build_surface(scene.dome.surface))

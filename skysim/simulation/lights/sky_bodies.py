@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
 from skysim.core.types import Bools, Floats
-from skysim.scene.sections.light import BodiesConfig, StarsConfig
+from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
     AddedLight,
@@ -120,13 +120,13 @@ class Satellites(AddedLight):
 
 def build_satellites(plan: LightPlan) -> Iterator[Light]:
     """The satellites of `light.satellites`; none without it. Raises InputError for an unreadable file."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.satellites:
+    sky = plan.scene.stars
+    if sky and sky.satellites:
         elements = None
-        if file := light.satellites.file:
+        if file := sky.satellites.file:
             elements = read_elements(file)
             check_epochs(file, elements, plan.scene.start_time)
-        yield Satellites(light.satellites, elements)
+        yield Satellites(sky.satellites, elements)
 
 
 # Sun, Moon and planets.
@@ -145,6 +145,6 @@ class SolarSystem(Light):
 
 def build_solar_system(plan: LightPlan) -> Iterator[Light]:
     """The bodies of `light.bodies`; none without it."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.bodies:
-        yield SolarSystem(light.bodies)
+    sky = plan.scene.stars
+    if sky and sky.bodies:
+        yield SolarSystem(sky.bodies)

@@ -28,7 +28,6 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
@@ -112,17 +111,17 @@ class Workbench:
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
         scene = self.scene
-        camera = scene.camera
+        lens = scene.camera.calibration()
         settings = factory.assumed_settings(scene)
         return SceneInfo(
             scene,
             scoring.angle_names(scene),
             id_prefix(self.lab),
-            2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
-            1 / camera.focal_px / ARCSEC_RAD,
+            lens.field_deg[0],
+            lens.arcsec_px,
             {name: getattr(settings, name) for name in STAGES},
             self.lab.duration_s,
-            camera.detector.noise,
+            scene.camera.detector.noise,
             self.geometry,
             self.lens,
         )
