@@ -452,20 +452,14 @@ def check(sheet: Sheet, answers: Answers) -> None:
             fault = fault_of(one, CameraConfig)
             section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
             faults.append(fault.under(section) if section else fault)
-        raise blame(faults, answers) from None
-
-
-def blame(faults: list[InputError], answers: Answers) -> InputError:
-    """The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault."""
-    for name, text in answers.items():
-        for fault in faults:
-            if fault.key not in QUESTIONS[name].keys:
-                continue
-            if not fault.allowed:
-                return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
-            allowed = fault.allowed + SI.get(fault.key, "")
-            return InputError(f"answers.{name}", quoted(text), allowed)
-    return faults[0].under("camera")
+        # The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault.
+        for name, text in answers.items():
+            for fault in faults:
+                if fault.key in QUESTIONS[name].keys:
+                    allowed = fault.allowed and fault.allowed + SI.get(fault.key, "")
+                    problem = quoted(text) if allowed else f"{quoted(text)}: {fault.problem}"
+                    raise InputError(f"answers.{name}", problem, allowed) from None
+        raise faults[0].under("camera") from None
 
 
 def text(sheet: Sheet, name: str) -> str:

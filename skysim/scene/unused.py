@@ -45,13 +45,8 @@ def check(
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
             raise no_effect(*broken).at(where_of(key.split("."), files, {}))
-    if not overrides:
-        check_heads(scene, own, files)
-
-
-def check_heads(scene: Scene, own: Keys, files: Files) -> None:
-    """Raise InputError for the first key of a head in the scene's own file that has no effect in the head's scene."""
-    for n, head in enumerate(own.get("heads") or ()):
+    # Keys of heads that have no effect in the head's scene.
+    for n, head in enumerate(own.get("heads") or () if not overrides else ()):
         sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
         for key in set_keys(sections):
             if broken := find(RULES, [key], scene.of_head(n)):

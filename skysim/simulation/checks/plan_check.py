@@ -176,25 +176,6 @@ def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
     return math.nan, math.nan
 
 
-def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Expected cross and roll error of all cameras together about the boresight of the main one.
-
-    The information of solutions with independent errors adds up: P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation
-    from the axes of camera n to those of the main one. A camera without a solution has none.
-    """
-    total = np.zeros((3, 3))
-    main = lab.camera.mount.cam_from_body
-    for camera, (cross, roll) in zip(lab.cameras, errors, strict=True):
-        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
-        # The variance of cross is the sum of those about x and y, half of it each.
-        information = 1 / np.array([cross**2 / 2, cross**2 / 2, roll**2])
-        total += R_main_from_cam @ np.diag(np.nan_to_num(information)) @ R_main_from_cam.T
-    if not total.any():
-        return math.nan, math.nan
-    variance = np.diag(np.linalg.inv(total))
-    return float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
-
-
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together, from the facts of each camera."""
     errors = [errors_arcsec(own) for own in facts]
@@ -203,7 +184,20 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
         f"{name}: {errors_text(*error)}"
         for name, error in zip(names, errors[1:], strict=True)
     ]
-    combined = together_arcsec(lab, errors)
+    # Of all cameras about the boresight of the main one. The information of solutions with independent errors adds up:
+    # P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation from the axes of camera n to those of the main one. A camera
+    # without a solution has none.
+    total = np.zeros((3, 3))
+    main = lab.camera.mount.cam_from_body
+    for camera, (cross, roll) in zip(lab.cameras, errors, strict=True):
+        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
+        # The variance of cross is the sum of those about x and y, half of it each.
+        information = 1 / np.array([cross**2 / 2, cross**2 / 2, roll**2])
+        total += R_main_from_cam @ np.diag(np.nan_to_num(information)) @ R_main_from_cam.T
+    combined = (math.nan, math.nan)
+    if total.any():
+        x, y, z = np.diag(np.linalg.inv(total)).tolist()
+        combined = (math.sqrt(x + y), math.sqrt(z))
     lines.append(
         f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts"
     )

@@ -267,13 +267,18 @@ def exclusion(plan: Plan) -> Iterator[str]:
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
-    boresight = attitudes.boresights(at.lab_from_body, lab)
-    angles_deg = np.array(
-        [
-            beside_deg(plan, t, axis)
-            for t, axis in zip(at.t_s.tolist(), boresight, strict=True)
-        ]
-    )
+    # Angles from the Sun's center, the Earth's limb and the Moon's center.
+    rows = []
+    boresights = attitudes.boresights(at.lab_from_body, lab)
+    for t_s, boresight in zip(at.t_s.tolist(), boresights, strict=True):
+        here = lab.camera.viewpoint.observer_at(t_s)
+        sun, moon = (
+            float(angular_separation_deg(boresight, place(name, here).direction))
+            for name in ("sun", "moon")
+        )
+        limb_rad = limb_elevation_rad(here.from_earth.position_m, boresight)
+        rows.append([sun, math.degrees(float(limb_rad)), moon])
+    angles_deg = np.array(rows)
     limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
     for column, (name, limit_deg) in enumerate(limits_deg.items()):
         n = int(angles_deg[:, column].argmin())
@@ -283,17 +288,6 @@ def exclusion(plan: Plan) -> Iterator[str]:
                 f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
                 f" {attitudes.describe(at, n, lab)}, within {limit_deg:g}°; point farther away"
             )
-
-
-def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
-    """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time, in deg."""
-    here = context.lab.camera.viewpoint.observer_at(t_s)
-    sun, moon = (
-        float(angular_separation_deg(boresight, place(name, here).direction))
-        for name in ("sun", "moon")
-    )
-    limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
-    return np.array([sun, limb_deg, moon])
 
 
 # Limiting magnitudes of the camera, the simulated sky and the tracker's catalog.

@@ -37,7 +37,13 @@ class Baffle(AddedLight):
 
     def stray_e_s(self, beam: Beam, exposure: Exposure) -> dict[str, float]:
         """Stray light in electrons s^-1 px^-1, by the name of the body that emits it."""
-        bodies = [disc for lit in beam.lits for disc in visible_discs(lit)]
+        bodies: list[BodyLight] = []
+        for lit in beam.lits:
+            occludes = lit.occlusion
+            hidden = np.zeros(len(lit.discs), bool)
+            if occludes:
+                hidden = occludes(centers_of(lit.discs).place)
+            bodies += itertools.compress(lit.discs, ~hidden)
         found = stray_of_bodies_e_s_m2(self.config, bodies, exposure.boresight)
         for lit in beam.lits:
             if lit.around is not None:
@@ -46,15 +52,6 @@ class Baffle(AddedLight):
                 )
         pixel_m2 = exposure.optics.camera.pixel_m**2
         return {name: light * pixel_m2 for name, light in found.items()}
-
-
-def visible_discs(lit: Lit) -> Iterator[BodyLight]:
-    """The discs of a light whose centers are not hidden."""
-    occludes = lit.occlusion
-    hidden = (
-        occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
-    )
-    return itertools.compress(lit.discs, ~hidden)
 
 
 def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:

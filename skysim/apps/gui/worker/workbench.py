@@ -40,6 +40,7 @@ from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory, onboard_model
 
 STAGES = ("detector", "centroider", "identifier", "solver")
+MAX_WINDOWS = 200
 
 
 @dataclass
@@ -216,6 +217,12 @@ def tracker_result(
 ) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
     row = scoring.row(lab.camera, frame, truth, report)
+    # Lights in the field: tracking mode would search at their places in the next frame.
+    windows_px: list[tuple[float, float]] = []
+    if report.attitude.solved and not isinstance(estimator, factory.UserTracker):
+        _, xy_px = predicted_lights(estimator, report.attitude)
+        inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
+        windows_px = [(x, y) for x, y in xy_px[inside][:MAX_WINDOWS].tolist()]
     return TrackerResult(
         row.status,
         detections_of(estimator, report),
@@ -225,7 +232,7 @@ def tracker_result(
         row.roll_arcsec,
         (row.cross_sigma_arcsec, row.roll_sigma_arcsec),
         row.wrong,
-        search_windows_px(estimator, report.attitude),
+        tuple(windows_px),
     )
 
 
@@ -267,17 +274,6 @@ def predicted_lights(
     return estimator.stars.id, camera.pixels(
         attitude.cam_from_ref.apply(estimator.stars.vectors)
     )
-
-
-def search_windows_px(
-    estimator: factory.Estimator, attitude: Attitude
-) -> tuple[tuple[float, float], ...]:
-    """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
-    if attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
-        return ()
-    _, xy_px = predicted_lights(estimator, attitude)
-    inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
-    return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
 
 
 def ambiguity(lab: Lab) -> AmbiguityMap:
