@@ -38,7 +38,6 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.motion import (
     PRESCRIBED,
     ControlConfig,
-    MotionConfig,
     PointingConfig,
     ProfileConfig,
 )
@@ -105,15 +104,26 @@ def with_parts(
         config = (motion.control or ControlConfig()).model_copy(update={"law": law})
         motion = motion.model_copy(update={"control": config})
         programs = programs if law is controller else {**programs, law: controller}
+    is_named = isinstance(profile, str | Path)
     if profile is not None:
-        motion = with_profile(motion, profile)
+        # Along the profile alone, from its start; prescribed if there is no controller.
+        if is_named and not is_file(Path(profile)):
+            raise InputError("profile", f"{profile} is not a file", "a file, or a table")
+        file = str(profile) if is_named else GIVEN_TABLE
+        along = {
+            "start": "profile",
+            "rate_deg_s": (0.0, 0.0, 0.0),
+            "maneuver": (ProfileConfig.model_construct(kind="profile", file=file),),
+            "control": motion.control or ControlConfig(law=PRESCRIBED),
+        }
+        motion = motion.model_copy(update=along)
     scene = scene.model_copy(update={"motion": motion})
     if tracker is not None:
         name = tracker if isinstance(tracker, str) else name_of(tracker)
         estimator = None if name is tracker else factory.tracker_of(name, tracker)
         named = scene.tracker.model_copy(update={"name": name})
         scene = scene.model_copy(update={"tracker": named})
-    table = None if isinstance(profile, str | Path) else profile
+    table = None if is_named else profile
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {
         name: repr(str(part)) if isinstance(part, str | Path) else name_of(part)
@@ -139,22 +149,6 @@ def check_tracker(tracker: Any) -> None:
     """Raise InputError for what is no tracker."""
     if not isinstance(tracker, str):
         factory.tracker_of(name_of(tracker), tracker)
-
-
-def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
-    """The motion along a profile alone, from the start of the profile; prescribed if there is no controller."""
-    if isinstance(profile, str | Path) and not is_file(Path(profile)):
-        raise InputError("profile", f"{profile} is not a file", "a file, or a table")
-    file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
-    element = ProfileConfig.model_construct(kind="profile", file=file)
-    return motion.model_copy(
-        update={
-            "start": "profile",
-            "rate_deg_s": (0.0, 0.0, 0.0),
-            "maneuver": (element,),
-            "control": motion.control or ControlConfig(law=PRESCRIBED),
-        }
-    )
 
 
 def name_of(part: Any) -> str:

@@ -17,7 +17,6 @@ from skysim.results.report_blocks import Column, Table, text_column
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames
-    from skysim.experiments.datasheet.model_fit import Agreement
 
 
 Quick = Annotated[
@@ -155,14 +154,8 @@ def write_model(folder: Path | None, sheet: MeasuredFrames, fmu: bool, json: boo
     )
     if fmu:
         written.append(model_fit.write_fmu(folder))
-    if not json:
-        print_agreements(agreements)
-        for path in written:
-            print(path)
-
-
-def print_agreements(agreements: list[Agreement]) -> None:
-    """Print how well the model, fitted to each half of the fields, agrees with the other half."""
+    if json:
+        return
     rows = [[*one[:3], *one.p_values, *one[4:]] for one in agreements]
     heads = {
         "rate °/s": "g",
@@ -191,3 +184,5 @@ def print_agreements(agreements: list[Agreement]) -> None:
         " that the model of this half accepts."
     )
     print()
+    for path in written:
+        print(path)

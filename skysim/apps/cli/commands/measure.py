@@ -199,7 +199,7 @@ def calibrate(
     from skysim.experiments import home_calibration
 
     loaded = load(scene, None, seed, set_)
-    with progress_callback(loaded.title, quiet=json) as watch:
+    with progress_callback(loaded.title) as watch:
         known, frames = (
             home_calibration.measure_folder(images, loaded)
             if images

@@ -52,7 +52,7 @@ def reproduce(
 
     reproductions = []
     for id in reproduction.check_ids(ids):
-        with progress_callback(id, quiet=json) as watch:
+        with progress_callback(id) as watch:
             options = reproduction.Options(quick, seed, watch)
             reproductions.append(reproduction.reproduce(id, options))
         if not json:

@@ -184,7 +184,7 @@ def compare(
     recorder = None
     with (
         Flight(lab, UserParts(programs, tracker=entrants[tracker[0]])) as flight,
-        terminal.progress_callback(loaded.title, quiet=json) as update,
+        terminal.progress_callback(loaded.title) as update,
     ):
         for frame, truth, row_by_tracker in tracker_comparison.compare_frames(
             flight, entrants, update
