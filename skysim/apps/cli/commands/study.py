@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -314,20 +313,22 @@ def run_and_report(
 
     total = plan.study.trial_count(len(plan.points))
     resume_command = place.command("resume")
-    with (
-        store.writing(place.store) as stored,
-        interruptible(resume_command, stored),
-        closing(engine),
-    ):
-        runner.prepare_store(plan, stored, resumed, overrides)
-        if repeat_failed:
-            stored.delete_failed()
-        with trial_progress(plan.study.title, total) as update:
-            if plan.study.optimize is not None:
-                finished = search.search(plan, stored, engine, update).finished
-            else:
-                progress = runner.run(plan, stored, engine, update)
-                finished = progress.done == progress.trials
+    with store.writing(place.store) as stored, closing(engine):
+        try:
+            runner.prepare_store(plan, stored, resumed, overrides)
+            if repeat_failed:
+                stored.delete_failed()
+            with trial_progress(plan.study.title, total) as update:
+                if plan.study.optimize is not None:
+                    finished = search.search(plan, stored, engine, update).finished
+                else:
+                    progress = runner.run(plan, stored, engine, update)
+                    finished = progress.done == progress.trials
+        except KeyboardInterrupt:  # Ctrl-C or SIGTERM
+            print_error(
+                f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
+            )
+            raise
         counts = stored.counts()
     if not finished:
         print_error(
@@ -336,18 +337,6 @@ def run_and_report(
     if counts["failed"]:
         print_error(f"{counts['failed']} trials failed; list them: {place.command('status')}")
     write_report(plan, place, json, open_)
-
-
-@contextmanager
-def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
-    """Within this context Ctrl-C and SIGTERM print the command that continues the run, and end it."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print_error(
-            f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
-        )
-        raise
 
 
 def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
