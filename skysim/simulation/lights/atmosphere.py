@@ -4,7 +4,6 @@ Everything is computed for mid-exposure. The site rotates by 15" in a second, wh
 0.02" at an altitude of 15 deg.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skysim.camera.glow.air_glow import air_glow
@@ -18,7 +17,6 @@ from skysim.simulation.lights.light import (
     Beam,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     Obstacle,
     Occluder,
@@ -89,14 +87,3 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
     return sky.twinkling(
         seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng
     )
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The effects of `light.air`; none without it."""
-    sky = plan.scene.stars
-    if sky and sky.air and plan.catalog is not None:
-        air = Air.from_config(sky.air, plan.scene.site, plan.catalog, plan.band)
-        yield AirEffects(air)
-        yield Skyline(air)
-        if sky.air.glow:
-            yield AirGlow(air, sky.air.glow)

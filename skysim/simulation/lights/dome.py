@@ -154,8 +154,3 @@ KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
     "stars": stars_of,
     "collimated_display": of_display,
 }
-
-
-def known_light(plan: LightPlan) -> KnownLight:
-    """The light of the scene's section `light`; that of the plan if it has one."""
-    return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)

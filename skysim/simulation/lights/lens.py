@@ -1,7 +1,7 @@
 """Effects of the lens and its baffle: stray light from outside the field, ghosts, and veiling glare."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,6 @@ from skysim.simulation.lights.light import (
     Beam,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     beam_of,
 )
@@ -81,19 +80,3 @@ class Glare(AddedLight):
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
         return beam._replace(glares=(*beam.glares, self.config))
-
-
-def build_baffle(plan: LightPlan) -> Iterator[Light]:
-    """The stray light of `camera.baffle`; none without it."""
-    baffle = plan.scene.camera.baffle
-    if baffle:
-        yield Baffle(baffle)
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The effects of `camera.ghosts` and `camera.glare`; none without them."""
-    camera = plan.scene.camera
-    if camera.ghosts:
-        yield Ghosts(camera.ghosts)
-    if camera.glare:
-        yield Glare(camera.glare)

@@ -1,6 +1,5 @@
 """The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
@@ -11,7 +10,6 @@ from skysim.simulation.lights.light import (
     AddedLight,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     Obstacle,
     Occluder,
@@ -19,7 +17,7 @@ from skysim.simulation.lights.light import (
 from skysim.sources.bodies import bodies_from
 from skysim.sources.camera_orbit import hidden_by_earth, sun_m
 from skysim.sources.ephemeris import GcrsState
-from skysim.sources.orbit_elements import MeanElements, check_epochs, read_elements
+from skysim.sources.orbit_elements import MeanElements
 from skysim.sources.satellites import (
     MovingLight,
     as_sources,
@@ -67,13 +65,6 @@ class LitEarth(DarkEarth):
         )
 
 
-def build_earth(plan: LightPlan) -> Iterator[Light]:
-    """The Earth under a camera in orbit; none on the ground."""
-    orbit = plan.scene.orbit
-    if orbit:
-        yield LitEarth(orbit.earth) if orbit.earth else DarkEarth()
-
-
 # Artificial satellites: those of a file, and random ones.
 
 
@@ -118,17 +109,6 @@ class Satellites(AddedLight):
         )
 
 
-def build_satellites(plan: LightPlan) -> Iterator[Light]:
-    """The satellites of `light.satellites`; none without it. Raises InputError for an unreadable file."""
-    sky = plan.scene.stars
-    if sky and sky.satellites:
-        elements = None
-        if file := sky.satellites.file:
-            elements = read_elements(file)
-            check_epochs(file, elements, plan.scene.start_time)
-        yield Satellites(sky.satellites, elements)
-
-
 # Sun, Moon and planets.
 
 
@@ -141,10 +121,3 @@ class SolarSystem(Light):
     def during(self, exposure: Exposure) -> Lit:
         bodies = bodies_from(self.config, exposure.observer, exposure.band)
         return Lit("Sun, Moon and planets", discs=tuple(bodies))
-
-
-def build_solar_system(plan: LightPlan) -> Iterator[Light]:
-    """The bodies of `light.bodies`; none without it."""
-    sky = plan.scene.stars
-    if sky and sky.bodies:
-        yield SolarSystem(sky.bodies)

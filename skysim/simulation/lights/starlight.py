@@ -1,6 +1,5 @@
 """Stars of a catalog, as seen from the ground or from an orbit, and extended light of the scene's `background`."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +14,6 @@ from skysim.simulation.lights.light import (
     AddedLight,
     Exposure,
     KnownLight,
-    Light,
     LightPlan,
     Lit,
 )
@@ -108,8 +106,3 @@ class BackgroundLight(AddedLight):
                 self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
             ),
         )
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The light of the scene's section `background`."""
-    yield BackgroundLight(plan.scene.background)
