@@ -13,7 +13,7 @@ from typing import Any
 from skysim.dynamics import multibody
 from skysim.scene.sections.light import LightConfig, add_kind
 from skysim.simulation.lights.atmosphere import AirEffects, AirGlow, Skyline
-from skysim.simulation.lights.dome import KNOWN
+from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.lab_room import DomeWall, Mirror, Vehicle, WallGlow
 from skysim.simulation.lights.lens import Baffle, Ghosts, Glare
 from skysim.simulation.lights.light import Light, LightPlan
@@ -47,7 +47,7 @@ def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     dome = scene.dome
     sky = scene.stars
     # Light leaks and the glow of the sky; stars, LEDs or a display.
-    known = plan.known or KNOWN[scene.light.kind](scene.light, plan)
+    known = known_light(plan)
     found: list[Light] = [BackgroundLight(scene.background), known]
     if sky and sky.bodies:
         found.append(SolarSystem(sky.bodies))

@@ -22,14 +22,6 @@ from skysim.sources.dome.led import Emitter
 
 
 @dataclass(frozen=True)
-class FixedStars(KnownLight):
-    """Stars whose apparent places are constant during the scene."""
-
-    def during(self, exposure: Exposure) -> Lit:
-        return Lit("stars", True, self.sources, self.emitter)
-
-
-@dataclass(frozen=True)
 class StarsInOrbit(KnownLight):
     """Stars displaced by the aberration of an orbit, whose velocity turns by a degree in 15 s in a low orbit.
 
@@ -84,7 +76,7 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
         velocity_m_s,
     )
     if viewpoint.orbit is None:
-        return FixedStars(shown, Emitter())
+        return KnownLight(shown, Emitter())
     return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)
 
 
