@@ -48,10 +48,9 @@ def check(
     # Keys of heads that have no effect in the head's scene.
     for n, head in enumerate(own.get("heads") or () if not overrides else ()):
         sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
-        for key in set_keys(sections):
-            if broken := find(RULES, [key], scene.of_head(n)):
-                error = no_effect(*broken).under(f"heads.{n}")
-                raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
+        if broken := find(RULES, set_keys(sections), scene.of_head(n)):
+            error = no_effect(*broken).under(f"heads.{n}")
+            raise error.at(where_of(error.key.split("."), files, {}))
 
 
 def check_overrides(scenes: Sequence[Scene], overrides: OverrideTexts) -> None:

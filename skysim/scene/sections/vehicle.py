@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
@@ -30,7 +30,6 @@ from skysim.core.units import (
     Stiffness,
     Time,
     Torque,
-    Triple,
 )
 
 # Keys of `vehicle`, and the ideal torques.
@@ -315,19 +314,15 @@ class VehicleConfig(ConfigModel):
     imu: ImuConfig | None = None
     gimbals: GimbalsConfig | None = None
 
-    @field_validator("inertia_kg_m2")
-    @classmethod
-    def check_inertia(cls, value: Triple | None) -> Triple | None:
-        if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
+    @model_validator(mode="after")
+    def check_body(self) -> VehicleConfig:
+        inertia = self.inertia_kg_m2
+        if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(
-                "",
-                f"{value} is not possible for a rigid body",
+                "inertia",
+                f"{inertia} is not possible for a rigid body",
                 "positive, none above the sum of the others",
             )
-        return value
-
-    @model_validator(mode="after")
-    def check_free_mount(self) -> VehicleConfig:
         if self.mount == "free" and self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skysim.apps.cli.commands.study import Workers
 from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
@@ -27,9 +28,6 @@ FieldCount = Annotated[
     typer.Option(
         help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.",
     ),
-]
-Processes = Annotated[
-    int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
 ]
 Folder = Annotated[
     Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
@@ -63,7 +61,7 @@ def datasheet(
     rates: Rates = None,
     seed: Seed = None,
     set_: Overrides = None,
-    workers: Processes = None,
+    workers: Workers = None,
     out: Folder = None,
     markdown: Annotated[Path | None, typer.Option(help="Also write a Markdown page.")] = None,
     model: ModelFolder = None,
