@@ -361,6 +361,15 @@ def camera_of(
     """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
     camera = plan.scene.camera
     dtype = np.float32 if camera.detector.noise else np.float64
+    # The red, green and blue pixels of a color camera.
+    channels = []
+    colors = camera.detector.quantum_efficiency
+    for color, curve in colors if isinstance(colors, ColorEfficiencyConfig) else ():
+        band = Band.from_camera(camera, curve)
+        lights = build_lights(replace(plan, band=band, known=None))
+        letters = enumerate(camera.detector.bayer or "")
+        first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
+        channels.append(ColorChannel(first_px, band, lights))
     return StarCamera(
         name,
         plan.scene,
@@ -370,27 +379,11 @@ def camera_of(
         plan.band,
         np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
-        color_channels(plan),
+        tuple(channels),
         orbit,
         run_seed,
         mount_error,
     )
-
-
-def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
-    """The red, green and blue pixels of a color camera, from the plan of its lights; none if it is monochrome."""
-    camera = plan.scene.camera
-    colors = camera.detector.quantum_efficiency
-    if not isinstance(colors, ColorEfficiencyConfig):
-        return ()
-    channels = []
-    for color, curve in colors:
-        band = Band.from_camera(camera, curve)
-        lights = build_lights(replace(plan, band=band, known=None))
-        letters = enumerate(camera.detector.bayer or "")
-        first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
-        channels.append(ColorChannel(first_px, band, lights))
-    return tuple(channels)
 
 
 def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:

@@ -17,7 +17,7 @@ from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.lab_room import DomeWall, Mirror, Vehicle, WallGlow
 from skysim.simulation.lights.lens import Baffle, Ghosts, Glare
 from skysim.simulation.lights.light import Light, LightPlan
-from skysim.simulation.lights.sky_bodies import DarkEarth, LitEarth, Satellites, SolarSystem
+from skysim.simulation.lights.sky_bodies import Earth, Satellites, SolarSystem
 from skysim.simulation.lights.starlight import BackgroundLight
 from skysim.sources.air import Air
 from skysim.sources.dome.interreflection import reflecting_dome
@@ -52,7 +52,7 @@ def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     if sky and sky.bodies:
         found.append(SolarSystem(sky.bodies))
     if scene.orbit:
-        found.append(LitEarth(scene.orbit.earth) if scene.orbit.earth else DarkEarth())
+        found.append(Earth(scene.orbit.earth))
     if sky and sky.satellites:
         elements = None
         if file := sky.satellites.file:

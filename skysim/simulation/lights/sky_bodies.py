@@ -31,34 +31,25 @@ NAME = "the Earth"
 
 
 @dataclass(frozen=True)
-class DarkEarth(Obstacle):
-    """An Earth that only hides: stars one by one, and bodies as a whole.
+class Earth(Obstacle):
+    """The Earth, which hides stars one by one and bodies as a whole, and shines if it has a section `earth`."""
 
-    Satellites may be in front of it, so they follow it in the list of lights.
-    """
+    config: EarthConfig | None
 
     def during(self, exposure: Exposure) -> Lit:
-        position_m = exposure.observer.from_earth.position_m
+        here = exposure.observer
+        position_m = here.from_earth.position_m
 
         def hides(place: Floats) -> Bools:
             return hidden_by_earth(position_m, place[:, :3]) & (place[:, 3] == 0)
 
-        return Lit(NAME, hides=Occluder(NAME, hides, whole=True))
-
-
-@dataclass(frozen=True)
-class LitEarth(DarkEarth):
-    """An Earth that also shines."""
-
-    config: EarthConfig
-
-    def during(self, exposure: Exposure) -> Lit:
-        here = exposure.observer
-        seen_from = (self.config, here.from_earth.position_m, sun_m(here.tt_jd))
+        dark = Lit(NAME, hides=Occluder(NAME, hides, whole=True))
+        if self.config is None:
+            return dark
+        seen_from = (self.config, position_m, sun_m(here.tt_jd))
         optics = exposure.optics
         cam_from_lab = exposure.cam_from_lab
         band = exposure.band
-        dark = super().during(exposure)
         return dark._replace(
             edged=lambda: earth_light(*seen_from, optics, cam_from_lab, band),
             around=lambda: earth_around(*seen_from, band),
