@@ -38,13 +38,6 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
     return parse
 
 
-def finite(value: float) -> float:
-    """The value. Raises InputError if it is not finite."""
-    if not math.isfinite(value):
-        raise InputError("", "not finite")
-    return value
-
-
 def plain(value: float) -> float:
     """The number, without a decimal point if it is whole."""
     return int(value) if value.is_integer() and abs(value) < 1e15 else value
@@ -58,9 +51,11 @@ def number(units: str, example: str) -> Callable[[str], float]:
             rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE
         )
         try:
-            value = finite(float(match[1] if match else ""))
+            value = float(match[1] if match else "")
         except ValueError:
-            raise InputError("", "", f"a number such as {example}") from None
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError("", "", f"a number such as {example}")
         return plain(value)
 
     return parse

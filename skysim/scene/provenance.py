@@ -155,9 +155,11 @@ def entries(
             for word, section in value.items():
                 yield from entries(section, value_at(raw, (word,)), sources, (*path, word))
         else:
-            written = raw not in (ABSENT, None) and not (
-                isinstance(raw, dict) or sections(value)
+            # A list of sections has defaults that are not written.
+            listed = isinstance(value, tuple) and any(
+                isinstance(item, ConfigModel) for item in value
             )
+            written = not (raw in (ABSENT, None) or isinstance(raw, dict) or listed)
             yield Entry(path, raw if written else plain(value, name), origin)
 
 
@@ -175,11 +177,6 @@ def origin_of(keys: tuple[str, ...], value: Any, sources: list[Source]) -> Origi
         ):
             return Origin(what, file, lines.get(keys, 0))
     return DEFAULT
-
-
-def sections(value: Any) -> bool:
-    """Whether a value of the schema is a list of sections."""
-    return isinstance(value, tuple) and bool(value) and isinstance(value[0], ConfigModel)
 
 
 def plain(value: Any, name: str) -> Any:

@@ -412,23 +412,6 @@ class Place(NamedTuple):
         return shell_command(*self, {}, verb)
 
 
-def located(study: str, out: Path | None) -> Place:
-    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
-    folder = Path(study)
-    inside = Place(study, folder)
-    if out is not None or not inside.store.is_file():
-        return Place(study, out)
-    with inside.open() as stored:
-        file = stored.meta("file")
-    if not Path(file).is_file():
-        raise InputError(
-            study,
-            f"no such file as its study, {file or 'not stored'}",
-            f"STUDY --out {study}",
-        )
-    return Place(file, folder)
-
-
 def load_stored_plan(
     study: str,
     out: Path | None,
@@ -457,7 +440,19 @@ def load_stored_plan(
     from skysim.experiments.study.execution import runner
     from skysim.tracking import tracker_interface
 
-    place = located(study, out)
+    # The study's file, or the folder of its store.
+    place = Place(study, out)
+    inside = Place(study, Path(study))
+    if out is None and inside.store.is_file():
+        with inside.open() as stored:
+            file = stored.meta("file")
+        if not Path(file).is_file():
+            raise InputError(
+                study,
+                f"no such file as its study, {file or 'not stored'}",
+                f"STUDY --out {study}",
+            )
+        place = Place(file, Path(study))
     with place.open() as stored:
         overrides = stored.overrides() | parse_overrides(set_)
         plan = study_file.load(

@@ -139,13 +139,6 @@ class Workbench:
         self.rendered_count += 1
         return self.lab.in_run(self.scene.seed + self.rendered_count)
 
-    @property
-    def result(self) -> TrackerResult | None:
-        """The tracker's solution of the newest frame; None if it was not solved."""
-        if self.frame is None or self.truth is None or self.report is None:
-            return None
-        return tracker_result(self.lab, self.estimator, self.frame, self.truth, self.report)
-
     def render(self, camera: StarCamera, trajectory: Trajectory, solve: bool) -> FrameView:
         """Render frame 0 of a camera in motion, solve it if `solve`, and return the view for the page."""
         clock = Clock()
