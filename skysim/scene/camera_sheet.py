@@ -368,7 +368,12 @@ class Sheet(NamedTuple):
 def fill(answers: Answers) -> Sheet:
     """The camera of some answers, with assumptions for the rest. Raises InputError with a key `answers.NAME`."""
     # Questions are in an order in which each assumption only needs earlier values.
-    values = {name: parsed(name, text) for name, text in answers.items()}
+    values = {}
+    for name, text in answers.items():
+        try:
+            values[name] = QUESTIONS[name].parse(text)
+        except InputError as error:
+            raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
     missing = []
     comments = dict.fromkeys(values, "[S1]")
     for name, question in QUESTIONS.items():
@@ -395,14 +400,6 @@ def outstanding(answers: Answers) -> dict[str, Missing]:
     missing.
     """
     return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
-
-
-def parsed(name: str, text: str) -> Any:
-    """The value of an answer. Raises InputError."""
-    try:
-        return QUESTIONS[name].parse(text)
-    except InputError as error:
-        raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
 
 
 def quoted(text: str) -> str:

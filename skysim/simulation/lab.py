@@ -46,7 +46,6 @@ from skysim.simulation.lights.light import KnownLight, Light, LightPlan, Seeds
 from skysim.simulation.lights.registry import build_lights
 from skysim.sources import catalog, stars
 from skysim.sources.camera_orbit import CameraOrbit, Viewpoint, build_orbit
-from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.photometry import Band
 from skysim.tracking import factory
 from skysim.tracking.tracker_interface import TRACKERS
@@ -298,13 +297,6 @@ class Lab:
     def export_mjcf(self) -> str:
         """The lab as MJCF text, for MuJoCo's viewer and for pictures."""
         return mjcf_export.mjcf(self.vehicle, self.scene, self.camera.sources, self.start)
-
-    def export_leds(self) -> tuple[str, int]:
-        """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
-        scene = self.scene
-        if not scene.dome:
-            raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
-        return led_list(scene.dome, self.camera.band, scene.name)
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:

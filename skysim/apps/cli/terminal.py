@@ -188,19 +188,18 @@ def print_remarks(solution: dict[str, Any]) -> None:
     if not solution["hint"]:
         return
     print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
-    if solution["roll_deg"] is None:
+    refused = solution["roll_deg"] is None
+    if refused:
         print(
             f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
             f" the background {solution['background_dn']:g} DN"
         )
-    if solution["roll_deg"] is None and "leds" not in solution:
+    if refused and "leds" not in solution:
         fields = " and ".join(
             f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"]
         )
         print(f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}")
-    print(
-        f"  {'likely' if solution['roll_deg'] is None else 'note'}: {printable(solution['hint'])}"
-    )
+    print(f"  {'likely' if refused else 'note'}: {printable(solution['hint'])}")
 
 
 def print_json(data: Any) -> None:

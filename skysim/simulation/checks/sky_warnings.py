@@ -30,7 +30,7 @@ from skysim.simulation.checks.findings import few_lights
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.views import peak_share
 from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.lens import STRAY_LIGHT, stray_e_s
 from skysim.simulation.lights.light import find_light
 from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad
@@ -246,7 +246,7 @@ def stray_light(plan: Plan) -> Iterator[str]:
     by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in plan.frames.exposures]
     stray_e = plan.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n = int(stray_e.argmax())
-    own_e2 = plan.camera.noise_e**2 - plan.camera.stray_e
+    own_e2 = plan.camera.noise_e**2 - plan.camera.glow_e.get(STRAY_LIGHT, 0.0)
     loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
     if loss_mag <= MAX_LOSS_MAG:
         return

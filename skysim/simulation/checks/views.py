@@ -26,7 +26,6 @@ from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigm
 from skysim.core.types import Floats, Ints, Sources
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
-from skysim.simulation.lights.lens import STRAY_LIGHT
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
@@ -131,11 +130,6 @@ class CameraModel(NamedTuple):
     glow_e: dict[str, float]
     noise_e: float
     exposure_s: float
-
-    @property
-    def stray_e(self) -> float:
-        """Mean electrons in a pixel from stray light past the baffle."""
-        return self.glow_e.get(STRAY_LIGHT, 0.0)
 
     @classmethod
     def of(cls, lab: Lab) -> CameraModel:

@@ -1,7 +1,5 @@
 """Plan panel: the scene's check, ambiguous fields on the dome, and attitudes of a survey, which can be flown."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
