@@ -382,8 +382,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "motion.control.actuators",
                 f"requires the section vehicle.{control.actuators}",
             )
-        stores_momentum = commanded is not None and commanded.stores_momentum
-        if control.desaturation and not (self.vehicle.fans and stores_momentum):
+        stored = control.actuators in ("wheels", "cmgs")  # these store momentum
+        if control.desaturation and not (self.vehicle.fans and stored):
             raise InputError(
                 "motion.control.desaturation",
                 "requires vehicle.fans, and actuators wheels or cmgs",

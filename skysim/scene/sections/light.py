@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -503,13 +503,6 @@ class LightConfig(ConfigModel):
         if kind not in CONFIGS and kind in PLUGINS.entry_points():
             PLUGINS.entry_points()[kind].load()  # the module registers the kind
         return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
-
-
-def add_kind(config: type[LightConfig]) -> str:
-    """Add a kind of light to the schema, and return its name, the literal of its `kind`."""
-    (kind,) = get_args(config.model_fields["kind"].annotation)
-    CONFIGS[kind] = config
-    return str(kind)
 
 
 FurtherLight = SerializeAsAny[LightConfig]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -38,13 +38,7 @@ TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 
 
-class ActuatorsConfig(ConfigModel):
-    """A set of actuators that a controller can command."""
-
-    stores_momentum: ClassVar[bool] = False
-
-
-class WheelsConfig(ActuatorsConfig):
+class WheelsConfig(ConfigModel):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
     Attributes
@@ -61,7 +55,6 @@ class WheelsConfig(ActuatorsConfig):
         Speed of each wheel at the start; at rest if left out
     """
 
-    stores_momentum: ClassVar[bool] = True
     torque_limit_nm: TorqueLimit = 0.5
     speed_limit_rpm: Positive = 3000.0
     coulomb_nm: TorqueLevel = 0.0
@@ -77,7 +70,7 @@ class WheelsConfig(ActuatorsConfig):
         return self
 
 
-class FansConfig(ActuatorsConfig):
+class FansConfig(ConfigModel):
     """Fans: every site `fan_*` of the model exerts a thrust along its own z, in both directions.
 
     Attributes
@@ -92,7 +85,7 @@ class FansConfig(ActuatorsConfig):
     time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
 
 
-class CmgsConfig(ActuatorsConfig):
+class CmgsConfig(ConfigModel):
     """Control moment gyroscopes: hinge joints `gimbal_*`, each with the joint `rotor_*` of the same suffix.
 
     Attributes
@@ -109,7 +102,6 @@ class CmgsConfig(ActuatorsConfig):
         Greatest motor torque on the rotors of variable-speed CMGs; the rotor speeds are constant if left out
     """
 
-    stores_momentum: ClassVar[bool] = True
     rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
     gimbal_rate_limit_deg_s: Positive = 60.0
     gimbal_time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.01

@@ -114,7 +114,17 @@ def bodies_near(plan: Plan) -> Iterator[str]:
         if in_field(
             cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera
         ):
-            yield f"{what} is in the field, {far}: {short(peak_fill(plan, body), 2)} times saturation"
+            # Electrons in its brightest pixel at rest. A partly lit body counts as a full disk of the lit area.
+            camera = plan.camera
+            lit = (1 + math.cos(body.place.phase_rad)) / 2
+            radius = math.tan(body.radius_rad) * math.sqrt(lit)
+            radius_px = np.array([camera.optics.camera.focal_px * radius])
+            lens2_px2 = np.array([camera.lens_px**2])
+            none = np.zeros(1)
+            share = float(peak_share(lens2_px2, radius_px, none, none)[0])
+            light_e = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
+            fill = light_e * share / plan.full_e
+            yield f"{what} is in the field, {far}: {short(fill, 2)} times saturation"
         elif lab.scene.camera.baffle is None and off_rad < math.radians(
             NEAR_DEG.get(name, 0.0)
         ):
@@ -128,23 +138,6 @@ def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> 
     xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
     size_px = np.array([camera.width_px, camera.height_px])
     return bool((xy_px < size_px / 2 + camera.focal_px * math.tan(radius_rad)).all())
-
-
-def peak_fill(context: Context, body: BodyLight) -> float:
-    """Electrons in the brightest pixel of a body at rest over saturation.
-
-    A partly lit body counts as a full disk of the lit area.
-    """
-    camera = context.camera
-    scene = context.scene
-    lit = (1 + math.cos(body.place.phase_rad)) / 2
-    radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
-    lens2_px2 = np.array([camera.lens_px**2])
-    radius = np.array([radius_px])
-    none = np.zeros(1)
-    electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
-    share = float(peak_share(lens2_px2, radius, none, none)[0])
-    return electrons * share / context.full_e
 
 
 # Claimed errors: the expected normalized estimation error squared (NEES) under the stars.

@@ -8,10 +8,10 @@ package that an entry point of the group `skysim.lights` names (see scene/sectio
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 from skysim.dynamics import multibody
-from skysim.scene.sections.light import LightConfig, add_kind
+from skysim.scene.sections.light import CONFIGS, LightConfig
 from skysim.simulation.lights.atmosphere import AirEffects, AirGlow, Skyline
 from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.lab_room import DomeWall, Mirror, Vehicle, WallGlow
@@ -37,7 +37,9 @@ def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]
     build
         Function from a section and a plan to the light
     """
-    KINDS[add_kind(config)] = build
+    (kind,) = get_args(config.model_fields["kind"].annotation)
+    CONFIGS[kind] = config
+    KINDS[kind] = build
 
 
 def build_lights(plan: LightPlan) -> tuple[Light, ...]:
