@@ -63,10 +63,12 @@ def run(
     from skysim.simulation.flight import open_flight
 
     stages = selected_stages(
-        detector=detector, centroider=centroider, identifier=identifier, solver=solver
+        detector=detector,
+        centroider=centroider,
+        identifier=identifier,
+        solver=solver,
+        name=tracker,
     )
-    if tracker is not None:
-        stages["name"] = tracker
     loaded = load(
         scene,
         frames,
