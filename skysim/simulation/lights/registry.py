@@ -8,6 +8,7 @@ package that an entry point of the group `skysim.lights` names (see scene/sectio
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, get_args
 
 from skysim.dynamics import multibody
@@ -50,6 +51,7 @@ def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     sky = scene.stars
     # Light leaks and the glow of the sky; stars, LEDs or a display.
     known = known_light(plan)
+    plan = replace(plan, known=known)
     found: list[Light] = [BackgroundLight(scene.background), known]
     if sky and sky.bodies:
         found.append(SolarSystem(sky.bodies))

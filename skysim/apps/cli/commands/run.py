@@ -142,7 +142,6 @@ def render(
 
     loaded = load(scene, frames, seed, set_)
     folder = output_folder(out, loaded.name)
-    paths = list[str]()
     with open_flight(loaded) as flight:
         if warning := dome_warnings.camera_outside_warning(
             loaded, flight.lab.camera.mount, flight.lab.start
@@ -150,10 +149,10 @@ def render(
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
-            for shot in flight.shots(solves=False, progress=update):
-                paths.append(
-                    str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
-                )
+            paths = [
+                str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
+                for shot in flight.shots(solves=False, progress=update)
+            ]
     if json:
         terminal.print_json(paths)
     else:
