@@ -256,12 +256,11 @@ def characterize(
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        if conflict := next(
-            (name for name, value in given.items() if value is not None), None
-        ):
-            raise InputError(
-                f"--{conflict}", "has no effect with --frames-to", "one of the two"
-            )
+        for option, value in given.items():
+            if value is not None:
+                raise InputError(
+                    f"--{option}", "has no effect with --frames-to", "one of the two"
+                )
         write_simulated(config, frames_to, seed, json)
         return
     folders = characterize_camera.check_folders(darks, flats)
