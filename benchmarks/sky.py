@@ -25,6 +25,7 @@ from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.sources import star_archives
+from tests.helpers.changed_light import with_sources
 
 DEEP = Path("out/catalogs/gaia_v10.0.ecsv")
 FIELDS_DEG = 2, 3, 5
@@ -174,7 +175,7 @@ def frame_time() -> dict[str, Any]:
     boresight = whole.camera.mount.cam_from_body.inv().apply([0, 0, 1.0])
     direction = whole.start.apply(boresight)
     near = whole.camera.sources.place[:, :3] @ direction > math.cos(math.radians(10))
-    part = whole.with_sources(whole.camera.sources.take(near))
+    part = with_sources(whole, whole.camera.sources.take(near))
     seconds: list[list[float]] = [[], []]
     for _ in range(40):
         for side, lab in enumerate((whole, part)):

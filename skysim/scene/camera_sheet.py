@@ -38,13 +38,6 @@ def quantity_text(si_unit: str, what: str, example: str) -> Callable[[str], str]
     return parse
 
 
-def finite(value: float) -> float:
-    """The value. Raises InputError if it is not finite."""
-    if not math.isfinite(value):
-        raise InputError("", "not finite")
-    return value
-
-
 def plain(value: float) -> float:
     """The number, without a decimal point if it is whole."""
     return int(value) if value.is_integer() and abs(value) < 1e15 else value
@@ -58,9 +51,11 @@ def number(units: str, example: str) -> Callable[[str], float]:
             rf"([-+.\de]*?\d\.?)\s*(?:{units})?", text.strip(), re.IGNORECASE
         )
         try:
-            value = finite(float(match[1] if match else ""))
+            value = float(match[1] if match else "")
         except ValueError:
-            raise InputError("", "", f"a number such as {example}") from None
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError("", "", f"a number such as {example}")
         return plain(value)
 
     return parse
@@ -373,7 +368,12 @@ class Sheet(NamedTuple):
 def fill(answers: Answers) -> Sheet:
     """The camera of some answers, with assumptions for the rest. Raises InputError with a key `answers.NAME`."""
     # Questions are in an order in which each assumption only needs earlier values.
-    values = {name: parsed(name, text) for name, text in answers.items()}
+    values = {}
+    for name, text in answers.items():
+        try:
+            values[name] = QUESTIONS[name].parse(text)
+        except InputError as error:
+            raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
     missing = []
     comments = dict.fromkeys(values, "[S1]")
     for name, question in QUESTIONS.items():
@@ -400,14 +400,6 @@ def outstanding(answers: Answers) -> dict[str, Missing]:
     missing.
     """
     return {one.name: one for one in fill(PLACEHOLDERS | dict(answers)).missing}
-
-
-def parsed(name: str, text: str) -> Any:
-    """The value of an answer. Raises InputError."""
-    try:
-        return QUESTIONS[name].parse(text)
-    except InputError as error:
-        raise InputError(f"answers.{name}", quoted(text), error.allowed) from None
 
 
 def quoted(text: str) -> str:
@@ -452,20 +444,14 @@ def check(sheet: Sheet, answers: Answers) -> None:
             fault = fault_of(one, CameraConfig)
             section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
             faults.append(fault.under(section) if section else fault)
-        raise blame(faults, answers) from None
-
-
-def blame(faults: list[InputError], answers: Answers) -> InputError:
-    """The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault."""
-    for name, text in answers.items():
-        for fault in faults:
-            if fault.key not in QUESTIONS[name].keys:
-                continue
-            if not fault.allowed:
-                return InputError(f"answers.{name}", f"{quoted(text)}: {fault.problem}")
-            allowed = fault.allowed + SI.get(fault.key, "")
-            return InputError(f"answers.{name}", quoted(text), allowed)
-    return faults[0].under("camera")
+        # The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault.
+        for name, text in answers.items():
+            for fault in faults:
+                if fault.key in QUESTIONS[name].keys:
+                    allowed = fault.allowed and fault.allowed + SI.get(fault.key, "")
+                    problem = quoted(text) if allowed else f"{quoted(text)}: {fault.problem}"
+                    raise InputError(f"answers.{name}", problem, allowed) from None
+        raise faults[0].under("camera") from None
 
 
 def text(sheet: Sheet, name: str) -> str:

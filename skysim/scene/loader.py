@@ -18,7 +18,7 @@ import contextlib
 import copy
 import functools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -177,31 +177,19 @@ def merge(base: Tree, override: Tree) -> Tree:
     return merged
 
 
-def over_base(
-    base: Tree,
-    own: Tree,
-    camera_of: Callable[[Any], Tree] = lambda name: preset(str(name)),
-) -> Tree:
+def over_base(base: Tree, own: Tree) -> Tree:
     """The keys of a scene merged over the keys of its base.
 
     A camera preset in `own` also removes the keys of the base that it defines, another `vehicle.model` the mass
     properties of the base's model. `motion.start: profile` removes the rate of the base, which the profile defines,
     `tracker.map` the sizes of the survey's errors and the assumed camera, which the map contains.
-
-    Parameters
-    ----------
-    base, own
-        Raw trees
-    camera_of
-        Function from the name of a preset to its camera section. An unknown preset removes nothing; `with_preset`
-        reports it
     """
-    camera = own.get("camera")
+    named = plain_at(own, "camera", "preset")
     below = base.get("camera")
-    named = camera.get("preset") if isinstance(camera, dict) else None
     if named is not None and isinstance(below, dict):
+        # An unknown preset removes nothing; `with_preset` reports it.
         with contextlib.suppress(InputError):
-            base = base | {"camera": undefined_keys(below, camera_of(named))}
+            base = base | {"camera": undefined_keys(below, preset(str(named)))}
     if plain_at(own, "motion", "start") == "profile":
         base = without_keys(base, "motion", ("rate_deg_s",))
     if has_other_model(own, base):
@@ -232,9 +220,8 @@ BODY_KEYS = (
 
 
 def plain_at(tree: Tree, section: str, key: str) -> Any:
-    """The value of a section's key, None without one. In `provenance` a value is an object with its origin."""
-    found = tree[section].get(key) if isinstance(tree.get(section), dict) else None
-    return getattr(found, "value", found)
+    """The value of a section's key, None without one."""
+    return tree[section].get(key) if isinstance(tree.get(section), dict) else None
 
 
 def without_keys(tree: Tree, section: str, keys: Sequence[str]) -> Tree:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from skysim.core.constants import ARCSEC_RAD
@@ -202,23 +203,14 @@ def matrix(
 
 def text(calibration: OpencvCalibration) -> str:
     """The calibration as YAML for `read` and for OpenCV's FileStorage (versions 4 and 5)."""
-    fx = calibration.focal_px
+    import cv2  # slow to import
+
+    f = calibration.focal_px
     cx, cy = calibration.center_px
-    return (
-        "%YAML:1.0\n---\n"
-        f"image_width: {calibration.width_px}\nimage_height: {calibration.height_px}\n"
-        + matrix_text("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fx, cy, 0.0, 0.0, 1.0])
-        + matrix_text("distortion_coefficients", 1, 5, list(calibration.distortion))
-    )
-
-
-def matrix_text(key: str, rows: int, cols: int, data: list[float]) -> str:
-    """The YAML of a matrix of 64-bit floats, with all digits."""
-    numbers = ", ".join(number_text(value) for value in data)
-    return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {numbers} ]\n"
-
-
-def number_text(value: float) -> str:
-    """The number with a decimal point, without which YAML reads 1e-07 as a string."""
-    mantissa, e, exponent = repr(float(value)).partition("e")
-    return f"{mantissa if '.' in mantissa else mantissa + '.0'}{e}{exponent}"
+    flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY
+    storage = cv2.FileStorage(".yml", flags)
+    storage.write("image_width", calibration.width_px)
+    storage.write("image_height", calibration.height_px)
+    storage.write("camera_matrix", np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]], float))
+    storage.write("distortion_coefficients", np.array([calibration.distortion]))
+    return str(storage.releaseAndGetString())

@@ -1,32 +1,29 @@
 """The effective scene: every key with its value and the origin of the value.
 
-1. Merge the raw trees of all files as `loader` does, with values that know their origin (`located_tree`).
-2. Look up each field of the validated scene in that tree; a field that is not there has its default (`entries`).
+1. Merge the raw trees of all files as `loader` does.
+2. Look up each field of the validated scene in that tree (a field that is not there has its default), and then in the
+   files, from the first to the last, for the origin of its value (`entries`).
 3. Mark the keys that have no effect (unused.py).
 """
 
 import datetime
-import functools
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core.units import ConfigModel, si_unit
 from skysim.core.yaml_reader import (
-    Keys,
     OverrideTexts,
     Tree,
     key_lines,
     one_line,
     opened_sections,
-    parse_yaml,
     read_yaml,
 )
 from skysim.scene import loader, unused
 from skysim.scene.camera_sheet import rounded
-from skysim.scene.loader import CALIBRATED_KEYS, Layer, merge
+from skysim.scene.loader import Layer
 from skysim.scene.scene import NAME_ALIAS
 
 COMMENT_COLUMN = 44  # column of the origins; a longer line has its origin at its end
@@ -44,7 +41,7 @@ class Origin(NamedTuple):
 
 
 DEFAULT = Origin("default")
-OVERRIDE = Origin("--set")
+ABSENT = object()  # stands for the value of a key that is not in a tree
 
 
 class Entry(NamedTuple):
@@ -68,24 +65,37 @@ class Entry(NamedTuple):
     no_effect: str = ""
 
 
-@dataclass(frozen=True)
-class Located:
-    """A raw value with its origin. Two are equal if their values are, because `merge` compares kinds."""
+class Source(NamedTuple):
+    """The raw keys of a file or of the overrides, and the line of each key in the file."""
 
-    value: Any
-    origin: Origin = field(compare=False)
+    what: str
+    tree: Tree
+    file: str = ""
+    lines: Mapping[tuple[str, ...], int] = {}
 
 
 def effective(name: str | Path, overrides: OverrideTexts | None = None) -> list[Entry]:
     """All keys of a scene in the order of the schema. Raises InputError as `loader.load`."""
-    # 1. Tree with origins.
+    # 1. The merged tree, and what it is made of.
     path = loader.find(str(name))
     overrides = loader.resolve_overrides(path, overrides or {})
     scene = loader.load(name, overrides)
-    tree = located_tree(loader.read_layers(path), overrides)
+    layers = loader.read_layers(path)
+    sources = sources_of(layers, overrides)
+    tree = loader.with_overrides(loader.merged(layers), overrides)
+    camera = tree["camera"]
+    if preset := camera.get("preset"):
+        camera = tree["camera"] = loader.merge(loader.preset(str(preset)), camera)
+    if calibration := camera.get("calibration"):
+        # Their values are not in the files: those of the scene are shown.
+        keys: Tree = {"camera": dict.fromkeys(loader.CALIBRATED_KEYS)}
+        camera |= keys["camera"]
+        sources.insert(
+            0, Source(f"calibration {Path(calibration).name}", keys, str(calibration))
+        )
     # 2. Fields of the scene. 3. Reasons.
     found = []
-    for entry in entries(scene, tree):
+    for entry in entries(scene, tree, sources):
         if entry.path != (NAME_ALIAS,):
             unset = entry.value is None
             reason = "" if unset else unused.reason(".".join(entry.path), scene)
@@ -93,113 +103,80 @@ def effective(name: str | Path, overrides: OverrideTexts | None = None) -> list[
     return found
 
 
-def located_tree(layers: list[Layer], overrides: OverrideTexts) -> Tree:
-    """The raw scene with preset, calibration and overrides applied, and the origin of each value."""
-    whats = ["this file", *(f"base {layer.path.name}" for layer in layers[1:])]
-    trees = [with_origins(*layer, what) for layer, what in zip(layers, whats, strict=True)]
-    tree: Tree = functools.reduce(over_base, reversed(trees))
-    for key in loader.REPLACING:
-        if key in overrides:
-            tree = over_base(tree, put({}, key.split("."), parse_yaml(overrides[key])[1]))
-    for key, text in overrides.items():
-        tree = put(tree, key.split("."), parse_yaml(text)[1])
-    camera = tree.get("camera")
-    return tree | {"camera": with_preset(camera)} if isinstance(camera, dict) else tree
+def sources_of(layers: list[Layer], overrides: OverrideTexts) -> list[Source]:
+    """The overrides, the files of a scene, and its camera's preset, before the bases of the file that names it."""
+    found = [Source("--set", loader.with_overrides({}, overrides))]
+    for n, layer in enumerate(layers):
+        what = f"base {layer.path.name}" if n else "this file"
+        found.append(Source(what, layer.tree, str(layer.path), key_lines(layer.text)))
+    for n, source in enumerate(found):
+        preset = value_at(source.tree, ("camera", "preset"))
+        if preset is ABSENT:
+            continue
+        if preset is not None:
+            path = loader.preset_path(str(preset))
+            keys = {"camera": loader.preset(str(preset))}
+            lines = key_lines(read_yaml(path)[1])
+            found.insert(n + 1, Source(f"preset {path.name}", keys, str(path), lines))
+        break
+    return found
 
 
-def preset_camera(preset: Located) -> Tree:
-    """The camera section of a preset with the origin of each value; empty if there is no preset."""
-    if preset.value is None:
-        return {}
-    path = loader.preset_path(str(preset.value))
-    tree, text = read_yaml(path)
-    camera: Tree = with_origins(path, text, tree, f"preset {path.name}")["camera"]
-    return camera
+def value_at(tree: Any, keys: tuple[str, ...]) -> Any:
+    """The value at nested keys of a tree; ABSENT if there is none."""
+    for key in keys:
+        tree = tree.get(key, ABSENT) if isinstance(tree, dict) else ABSENT
+    return tree
 
 
-# `loader.over_base` for located values.
-over_base = functools.partial(loader.over_base, camera_of=preset_camera)
-
-
-def with_preset(camera: Tree) -> Tree:
-    """The keys of a camera merged over the keys of its preset, and the keys of a calibration merged over both."""
-    own = {
-        key: value for key, value in camera.items() if key not in ("preset", "calibration")
-    }
-    if preset := camera.get("preset"):
-        own = merge(preset_camera(preset), own)
-    if (calibration := camera.get("calibration")) and calibration.value is not None:
-        path = Path(str(calibration.value))
-        origin = Origin(f"calibration {path.name}", str(path))
-        own |= dict.fromkeys(CALIBRATED_KEYS, Located(None, origin))
-    return own
-
-
-def with_origins(path: Path, text: str, tree: Keys, what: str) -> Tree:
-    """The tree of a file with the origin of each value; a list is one value."""
-    lines = key_lines(text)
-
-    def locate(value: Any, keys: tuple[str, ...]) -> Any:
-        """The value at nested keys with its origin, or the mapping with those of its values."""
-        if isinstance(value, dict):
-            return {key: locate(inner, (*keys, str(key))) for key, inner in value.items()}
-        return Located(value, Origin(what, str(path), lines.get(keys, 0)))
-
-    located: Tree = locate(tree, ())
-    return located
-
-
-def put(tree: Any, keys: list[str], value: Any) -> Any:
-    """The tree with the value of an override at nested keys; an override of an element is the origin of its list."""
-    if keys and (isinstance(tree, dict) or tree is None):
-        tree = tree or {}
-        return tree | {keys[0]: put(tree.get(keys[0]), keys[1:], value)}
-    # Keys that are left lead into a list.
-    if keys:
-        return Located(None, OVERRIDE)
-    if isinstance(value, dict):
-        return {key: put(None, [], inner) for key, inner in value.items()}
-    return Located(value, OVERRIDE)
-
-
-def entries(model: ConfigModel, tree: Any, parent: tuple[str, ...] = ()) -> Iterator[Entry]:
+def entries(
+    model: ConfigModel, tree: Any, sources: list[Source], parent: tuple[str, ...] = ()
+) -> Iterator[Entry]:
     """Yield the keys of a section and of the sections in it.
 
-    `tree` has the located values of the section, or is one located value for the section as a whole.
+    `tree` has the raw values of the section, or is one value for the section as a whole.
     """
     for name, info in type(model).model_fields.items():
         key = info.alias or name
+        path = (*parent, key)
         value = getattr(model, name)
-        raw = tree.get(key) if isinstance(tree, dict) else None
+        raw = value_at(tree, (key,))
+        origin = origin_of(path, raw, sources)
         # A section may be written as one value, such as control: pid.
-        if isinstance(tree, Located) and tree.value == value:
+        if isinstance(tree, str) and tree == value:
             raw = tree
+            origin = origin_of(parent, raw, sources)
         if isinstance(value, ConfigModel):
-            yield from entries(value, raw, (*parent, key))
+            yield from entries(value, raw, sources, path)
         elif isinstance(value, dict) and any(
             isinstance(v, ConfigModel) for v in value.values()
         ):
             # Sections by names of the user's, such as types of LEDs.
             for word, section in value.items():
-                named = raw.get(word) if isinstance(raw, dict) else None
-                yield from entries(section, named, (*parent, key, word))
+                yield from entries(section, value_at(raw, (word,)), sources, (*path, word))
         else:
-            written = raw.value if isinstance(raw, Located) and not sections(value) else None
-            shown = plain(value, name) if written is None else written
-            yield Entry((*parent, key), shown, next(origins_in(raw), DEFAULT))
+            # A list of sections has defaults that are not written.
+            listed = isinstance(value, tuple) and any(
+                isinstance(item, ConfigModel) for item in value
+            )
+            written = not (raw in (ABSENT, None) or isinstance(raw, dict) or listed)
+            yield Entry(path, raw if written else plain(value, name), origin)
 
 
-def origins_in(tree: Any) -> Iterator[Origin]:
-    """Yield the origins of the values within a tree, since the value of a key may be any mapping."""
-    if isinstance(tree, Located):
-        yield tree.origin
-    for inner in tree.values() if isinstance(tree, dict) else ():
-        yield from origins_in(inner)
-
-
-def sections(value: Any) -> bool:
-    """Whether a value of the schema is a list of sections."""
-    return isinstance(value, tuple) and bool(value) and isinstance(value[0], ConfigModel)
+def origin_of(keys: tuple[str, ...], value: Any, sources: list[Source]) -> Origin:
+    """The origin of a value at nested keys of the merged tree; that of a mapping is the origin of its first value."""
+    while isinstance(value, dict) and value:
+        key = next(iter(value))
+        keys = (*keys, key)
+        value = value[key]
+    for what, tree, file, lines in sources:
+        found = value_at(tree, keys)
+        # An override of an item is the origin of its list.
+        if found == value is not ABSENT or (
+            isinstance(found, dict) and isinstance(value, list)
+        ):
+            return Origin(what, file, lines.get(keys, 0))
+    return DEFAULT
 
 
 def plain(value: Any, name: str) -> Any:

@@ -264,6 +264,16 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "camera.shutter",
                 f"readout takes {read_s:g} s, longer than the frame period {1 / self.exposure.rate_hz:g} s",
             )
+        # The decoder has a code, and all rows of the shutter show the same bits.
+        code = self.dome.led.code if self.dome else None
+        if self.tracker.decoder and code is None:
+            raise InputError("tracker.decoder", "requires light.led.code")
+        if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
+            raise InputError(
+                "light.led.code.bit_time",
+                "the rows of a rolling shutter show different bits",
+                "frame, or another camera.shutter",
+            )
         return self
 
     @model_validator(mode="after")
@@ -284,20 +294,6 @@ class Scene(ConfigModel, metaclass=SceneKind):
         )
         layout = dome.layout.model_copy(update={"points": points}) if nested else points
         return self.model_copy(update={"light": dome.model_copy(update={"layout": layout})})
-
-    @model_validator(mode="after")
-    def check_code(self) -> Scene:
-        """Check that the decoder has a code, and that all rows of the shutter show the same bits."""
-        code = self.dome.led.code if self.dome else None
-        if self.tracker.decoder and code is None:
-            raise InputError("tracker.decoder", "requires light.led.code")
-        if code and code.bit_time_s != "frame" and self.camera.shutter.kind == "rolling":
-            raise InputError(
-                "light.led.code.bit_time",
-                "the rows of a rolling shutter show different bits",
-                "frame, or another camera.shutter",
-            )
-        return self
 
     @model_validator(mode="after")
     def check_sky(self) -> Scene:
@@ -386,8 +382,8 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "motion.control.actuators",
                 f"requires the section vehicle.{control.actuators}",
             )
-        stores_momentum = commanded is not None and commanded.stores_momentum
-        if control.desaturation and not (self.vehicle.fans and stores_momentum):
+        stored = control.actuators in ("wheels", "cmgs")  # these store momentum
+        if control.desaturation and not (self.vehicle.fans and stored):
             raise InputError(
                 "motion.control.desaturation",
                 "requires vehicle.fans, and actuators wheels or cmgs",
@@ -401,8 +397,13 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_gimbals(self) -> Scene:
-        """Check that a two-axis mount has gimbals, and follows profiles alone, in a laboratory."""
+    def check_motion(self) -> Scene:
+        """Check the gimbals of a two-axis mount, and the control period.
+
+        The mount follows profiles alone, in a laboratory. The period is a whole number of milliseconds and of IMU
+        samples, and resolves every sine.
+        """
+        # 1. Gimbals.
         motion = self.motion
         two_axis = self.vehicle.mount == "two_axis"
         follows = (
@@ -417,11 +418,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "mount two_axis has them and follows profiles in a laboratory, without dynamics",
                 "motion.control: prescribed, start: profile, maneuvers profile, hold, jitter, and no light: stars",
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_rates(self) -> Scene:
-        """Check that a control period is a whole number of milliseconds and of IMU samples, and resolves every sine."""
+        # 2. Period.
         rate_hz = self.control_rate_hz
         if abs(1000 / rate_hz - round(1000 / rate_hz)) > 1e-9:
             raise InputError(

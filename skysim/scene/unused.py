@@ -45,18 +45,12 @@ def check(
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
             raise no_effect(*broken).at(where_of(key.split("."), files, {}))
-    if not overrides:
-        check_heads(scene, own, files)
-
-
-def check_heads(scene: Scene, own: Keys, files: Files) -> None:
-    """Raise InputError for the first key of a head in the scene's own file that has no effect in the head's scene."""
-    for n, head in enumerate(own.get("heads") or ()):
+    # Keys of heads that have no effect in the head's scene.
+    for n, head in enumerate(own.get("heads") or () if not overrides else ()):
         sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
-        for key in set_keys(sections):
-            if broken := find(RULES, [key], scene.of_head(n)):
-                error = no_effect(*broken).under(f"heads.{n}")
-                raise error.at(where_of(["heads", str(n), *key.split(".")], files, {}))
+        if broken := find(RULES, set_keys(sections), scene.of_head(n)):
+            error = no_effect(*broken).under(f"heads.{n}")
+            raise error.at(where_of(error.key.split("."), files, {}))
 
 
 def check_overrides(scenes: Sequence[Scene], overrides: OverrideTexts) -> None:

@@ -74,20 +74,6 @@ def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]
             listener.process.wait()
 
 
-def compile_tracker(scene: str, overrides: Sequence[str] = ()) -> None:
-    """Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
-
-    Parameters
-    ----------
-    scene
-        Name or path of the scene
-    overrides
-        Texts `KEY=VALUE` as on the command line
-    """
-    lab = build_lab(loader.load(scene, parse_overrides(list(overrides))))
-    warm_up(lab.camera, lab.start, build_tracker(lab.camera))
-
-
 def warm_up(camera: StarCamera, lab_from_body: Rotation, tracker: factory.Estimator) -> None:
     """Solve a synthetic frame so that numba compiles before timing.
 
@@ -122,7 +108,10 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
 
 
 if __name__ == "__main__":
+    # Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
+    name, *texts = sys.argv[1:]
     try:
-        compile_tracker(sys.argv[1], sys.argv[2:])
+        lab = build_lab(loader.load(name, parse_overrides(texts)))
+        warm_up(lab.camera, lab.start, build_tracker(lab.camera))
     except InputError as error:
         sys.exit(str(error))

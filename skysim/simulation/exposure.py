@@ -258,6 +258,12 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
     t_s = sample_times(exposure.t_s - half_s, exposure.t_s + half_s, trajectory)
     mean_lab_from_body, mean_rate_rad_s = trajectory.means(t_s)
     cam_from_body = exposure.mount.cam_from_body
+    # Points that something hides and that would otherwise be on the detector at mid-exposure.
+    hidden = [np.zeros(0, np.int64)]
+    for lit in beam.lits:
+        if lit.points is not None and lit.occlusion is not None:
+            seen = lit.points.take(on_detector(lit.points, exposure)[0])
+            hidden.append(seen.id[lit.occlusion(seen.place)])
     return Truth(
         exposure.t_s,
         exposure.lab_from_body,
@@ -266,22 +272,12 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
         cam_from_body.apply(trajectory.rate_at(exposure.t_s)),
         cam_from_body.apply(mean_rate_rad_s),
         sources,
-        hidden_ids(beam, exposure),
+        np.concatenate(hidden),
         tuple(disc.truth() for disc in beam.discs if disc.id in sources.id),
         tuple(
             truth for lit in beam.lits for truth in lit.satellites if truth.id in sources.id
         ),
     )
-
-
-def hidden_ids(beam: Beam, exposure: Exposure) -> Ints:
-    """(M,) ids of the points that something hides and that would otherwise be on the detector at mid-exposure."""
-    found = [np.zeros(0, np.int64)]
-    for lit in beam.lits:
-        if lit.points is not None and lit.occlusion is not None:
-            seen = lit.points.take(on_detector(lit.points, exposure)[0])
-            found.append(seen.id[lit.occlusion(seen.place)])
-    return np.concatenate(found)
 
 
 def on_detector(points: Sources, exposure: Exposure) -> tuple[Ints, list[Floats]]:

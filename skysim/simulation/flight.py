@@ -278,15 +278,9 @@ class Flight:
                 "observe, or after it",
             )
 
-    def simulate_motion(self, progress: Progress | None = None) -> Self:
-        """Simulate the rest of the motion, and return the flight. Only the frames that a filter needs are rendered.
-
-        Parameters
-        ----------
-        progress
-            Called as progress(t_s, duration_s) after every step of the motion
-        """
-        for _ in self.events(self.filter_schedules, progress=progress, captures_late=False):
+    def simulate_motion(self) -> Self:
+        """Simulate the rest of the motion, and return the flight. Only the frames that a filter needs are rendered."""
+        for _ in self.events(self.filter_schedules, captures_late=False):
             pass
         return self
 

@@ -38,7 +38,6 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.motion import (
     PRESCRIBED,
     ControlConfig,
-    MotionConfig,
     PointingConfig,
     ProfileConfig,
 )
@@ -47,7 +46,6 @@ from skysim.simulation.lights.light import KnownLight, Light, LightPlan, Seeds
 from skysim.simulation.lights.registry import build_lights
 from skysim.sources import catalog, stars
 from skysim.sources.camera_orbit import CameraOrbit, Viewpoint, build_orbit
-from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.photometry import Band
 from skysim.tracking import factory
 from skysim.tracking.tracker_interface import TRACKERS
@@ -105,15 +103,26 @@ def with_parts(
         config = (motion.control or ControlConfig()).model_copy(update={"law": law})
         motion = motion.model_copy(update={"control": config})
         programs = programs if law is controller else {**programs, law: controller}
+    is_named = isinstance(profile, str | Path)
     if profile is not None:
-        motion = with_profile(motion, profile)
+        # Along the profile alone, from its start; prescribed if there is no controller.
+        if is_named and not is_file(Path(profile)):
+            raise InputError("profile", f"{profile} is not a file", "a file, or a table")
+        file = str(profile) if is_named else GIVEN_TABLE
+        along = {
+            "start": "profile",
+            "rate_deg_s": (0.0, 0.0, 0.0),
+            "maneuver": (ProfileConfig.model_construct(kind="profile", file=file),),
+            "control": motion.control or ControlConfig(law=PRESCRIBED),
+        }
+        motion = motion.model_copy(update=along)
     scene = scene.model_copy(update={"motion": motion})
     if tracker is not None:
         name = tracker if isinstance(tracker, str) else name_of(tracker)
         estimator = None if name is tracker else factory.tracker_of(name, tracker)
         named = scene.tracker.model_copy(update={"name": name})
         scene = scene.model_copy(update={"tracker": named})
-    table = None if isinstance(profile, str | Path) else profile
+    table = None if is_named else profile
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {
         name: repr(str(part)) if isinstance(part, str | Path) else name_of(part)
@@ -139,22 +148,6 @@ def check_tracker(tracker: Any) -> None:
     """Raise InputError for what is no tracker."""
     if not isinstance(tracker, str):
         factory.tracker_of(name_of(tracker), tracker)
-
-
-def with_profile(motion: MotionConfig, profile: Any) -> MotionConfig:
-    """The motion along a profile alone, from the start of the profile; prescribed if there is no controller."""
-    if isinstance(profile, str | Path) and not is_file(Path(profile)):
-        raise InputError("profile", f"{profile} is not a file", "a file, or a table")
-    file = str(profile) if isinstance(profile, str | Path) else GIVEN_TABLE
-    element = ProfileConfig.model_construct(kind="profile", file=file)
-    return motion.model_copy(
-        update={
-            "start": "profile",
-            "rate_deg_s": (0.0, 0.0, 0.0),
-            "maneuver": (element,),
-            "control": motion.control or ControlConfig(law=PRESCRIBED),
-        }
-    )
 
 
 def name_of(part: Any) -> str:
@@ -287,24 +280,6 @@ class Lab:
             lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras)
         )
 
-    def with_camera(self, **changes: Any) -> Lab:
-        """The lab with changed fields of its main camera."""
-        return replace(self, cameras=(replace(self.camera, **changes), *self.cameras[1:]))
-
-    def with_light(self, light: Light) -> Lab:
-        """The lab with one light of the main camera replaced: that of the same class. Raises InputError."""
-        if self.camera.channels:
-            raise InputError("camera.detector.bayer", "no light can be replaced", "none")
-        return self.with_camera(
-            lights=tuple(
-                light if type(one) is type(light) else one for one in self.camera.lights
-            )
-        )
-
-    def with_sources(self, sources: Sources) -> Lab:
-        """The lab with other stars or LEDs for its main camera."""
-        return self.with_light(replace(self.camera.known, sources=sources))
-
     def of_camera(self, number: int) -> Lab:
         """The lab with only one of its cameras, which becomes the main one."""
         camera = self.cameras[number]
@@ -322,13 +297,6 @@ class Lab:
     def export_mjcf(self) -> str:
         """The lab as MJCF text, for MuJoCo's viewer and for pictures."""
         return mjcf_export.mjcf(self.vehicle, self.scene, self.camera.sources, self.start)
-
-    def export_leds(self) -> tuple[str, int]:
-        """The LEDs of the dome as `led_list` returns them. Raises InputError without a dome."""
-        scene = self.scene
-        if not scene.dome:
-            raise InputError("light.kind", f"{scene.light.kind} has no list of LEDs", "dome")
-        return led_list(scene.dome, self.camera.band, scene.name)
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
@@ -385,6 +353,15 @@ def camera_of(
     """The camera of a plan of its lights; the other arguments as in `StarCamera`."""
     camera = plan.scene.camera
     dtype = np.float32 if camera.detector.noise else np.float64
+    # The red, green and blue pixels of a color camera.
+    channels = []
+    colors = camera.detector.quantum_efficiency
+    for color, curve in colors if isinstance(colors, ColorEfficiencyConfig) else ():
+        band = Band.from_camera(camera, curve)
+        lights = build_lights(replace(plan, band=band, known=None))
+        letters = enumerate(camera.detector.bayer or "")
+        first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
+        channels.append(ColorChannel(first_px, band, lights))
     return StarCamera(
         name,
         plan.scene,
@@ -394,27 +371,11 @@ def camera_of(
         plan.band,
         np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
-        color_channels(plan),
+        tuple(channels),
         orbit,
         run_seed,
         mount_error,
     )
-
-
-def color_channels(plan: LightPlan) -> tuple[ColorChannel, ...]:
-    """The red, green and blue pixels of a color camera, from the plan of its lights; none if it is monochrome."""
-    camera = plan.scene.camera
-    colors = camera.detector.quantum_efficiency
-    if not isinstance(colors, ColorEfficiencyConfig):
-        return ()
-    channels = []
-    for color, curve in colors:
-        band = Band.from_camera(camera, curve)
-        lights = build_lights(replace(plan, band=band, known=None))
-        letters = enumerate(camera.detector.bayer or "")
-        first_px = tuple(divmod(n, 2) for n, one in letters if one == color[0].upper())
-        channels.append(ColorChannel(first_px, band, lights))
-    return tuple(channels)
 
 
 def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:

@@ -71,7 +71,16 @@ def check_reference(
             continue
         t_s, rate, acceleration = demands(leg, 1 / scene.control_rate_hz)
         key = f"motion.maneuver.{n}: {element.kind}"
-        check_rate(key, begin_s + t_s, rate, vehicle)
+        if vehicle.imu is not None:
+            limit_deg_s = vehicle.imu.gyro.rate_limit_deg_s
+            fastest = np.abs(rate).max(axis=1)
+            k = int(fastest.argmax())
+            if fastest[k] > math.radians(limit_deg_s) * (1 + ROUNDING):
+                raise InputError(
+                    key,
+                    f"{math.degrees(fastest[k]):.4g} deg/s about a body axis at {begin_s + t_s[k]:.6g} s",
+                    f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
+                )
         if not motion.is_prescribed:
             inertia = model.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
@@ -126,21 +135,6 @@ def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]
 def components(vector: Floats, digits: int) -> str:
     """A vector with commas; 0 for components below the last digit of the largest one."""
     return ", ".join(f"{one:.{digits}g}" for one in significant(vector, digits))
-
-
-def check_rate(key: str, t_s: Floats, rate_rad_s: Floats, vehicle: VehicleConfig) -> None:
-    """Raise InputError if a rate (K, 3) about a body axis saturates the gyros."""
-    if vehicle.imu is None:
-        return
-    limit_deg_s = vehicle.imu.gyro.rate_limit_deg_s
-    fastest = np.abs(rate_rad_s).max(axis=1)
-    n = int(fastest.argmax())
-    if fastest[n] > math.radians(limit_deg_s) * (1 + ROUNDING):
-        raise InputError(
-            key,
-            f"{math.degrees(fastest[n]):.4g} deg/s about a body axis at {t_s[n]:.6g} s",
-            f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
-        )
 
 
 # Actuators at their limits: forecast, and in words.
@@ -276,7 +270,9 @@ class TelemetryRecorder:
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
         self.steps_per_tick = steps
-        self.mounted = mounting_states(navigation)
+        # The mounting states of the filter, that of the main camera first.
+        states = navigation.filter.state.others if navigation and navigation.filter else ()
+        self.mounted = [name for name in states if name.startswith("mounting")]
         # Of the filter: sigma of the attitude, bias and its sigma, and estimate and sigma of each mounting.
         columns = [
             ("recorded", bool),
@@ -386,13 +382,6 @@ class TelemetryRecorder:
         }
 
 
-def mounting_states(navigation: Navigation | None) -> list[str]:
-    """Names of the filter's mounting states, that of the main camera first."""
-    if navigation is None or navigation.filter is None:
-        return []
-    return [name for name in navigation.filter.state.others if name.startswith("mounting")]
-
-
 def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     """(K, 3) rotation vector of the attitude error from a camera's mount error and temperature, in body axes.
 
@@ -443,7 +432,15 @@ class Motion:
         self.lab = lab
         self.reference = guidance.plan(scene.motion, lab.start, lab.profiles)
         check_reference(self.reference, scene, vehicle, duration_s)
-        self.simulation = build_simulation(lab, self.reference, duration_s, kept_s)
+        if scene.motion.is_prescribed:
+            self.simulation: Simulation = multibody.PrescribedMotion(
+                vehicle, lambda t_s: self.reference.state_at(t_s)[:2], duration_s, kept_s
+            )
+        else:
+            rate = guidance.body_rate_rad_s(scene, lab.start, lab.profiles)
+            self.simulation = multibody.Simulation(
+                vehicle, lab.start, rate, duration_s, kept_s
+            )
         self.vibration = Vibration.draw(
             scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
         )
@@ -558,19 +555,6 @@ class Motion:
 def history_s(lab: Lab) -> float:
     """Duration of past states that a frame of any camera needs when it is due."""
     return max(timing.history_s(camera.scene) for camera in lab.cameras)
-
-
-def build_simulation(
-    lab: Lab, reference: guidance.Reference, duration_s: float, kept_s: float | None
-) -> multibody.Simulation:
-    """The simulation at its start: by dynamics, or along the reference if the motion is prescribed."""
-    motion = lab.scene.motion
-    if motion.is_prescribed:
-        return multibody.PrescribedMotion(
-            lab.vehicle, lambda t_s: reference.state_at(t_s)[:2], duration_s, kept_s
-        )
-    rate = guidance.body_rate_rad_s(lab.scene, lab.start, lab.profiles)
-    return multibody.Simulation(lab.vehicle, lab.start, rate, duration_s, kept_s)
 
 
 def build_disturbances(

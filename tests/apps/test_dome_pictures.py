@@ -24,6 +24,7 @@ from skysim.experiments.dome_survey import survey_frames
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
+from tests.helpers.changed_light import with_sources
 
 RARE = 1e-6  # the seeds are fixed: it fails for a wrong law alone
 LED_SIGMA_M = 1e-3
@@ -84,7 +85,7 @@ def test_attitudes_err_as_their_covariance_says_where_the_dome_differs_from_its_
     sources = lab.camera.sources
     place = sources.place.copy()
     place[:, :3] += np.random.default_rng(2).normal(0, LED_SIGMA_M, (len(place), 3))
-    true = lab.with_sources(replace(sources, place=place))
+    true = with_sources(lab, replace(sources, place=place))
     held = survey_frames.stop_attitudes(lab.scene, "checks", 30, 20.0)
     nees = []
     for frame, truth in survey_frames.render_stops(true, held):

@@ -87,7 +87,7 @@ def test_overrides_are_named_and_replace_earlier_values() -> None:
     )
     assert found["light.led.drive.kind"].origin.what == "--set"
     assert found["vehicle.inertia"].origin.what == "--set"
-    assert found["vehicle.inertia"].value == ["5 kg m2", "6.5 kg m2", "9 kg m2"]
+    assert found["vehicle.inertia"].value == ["5 kg m2", "6.5 kg m2", "9.0 kg m2"]
     assert found["motion.control.law"].origin.what == "--set"
     assert found["motion.control.rate_hz"].origin.what == "default"
     kind = by_key("afit_simsat", light__layout="{kind: fibonacci, count: 900, cap_deg: 27}")

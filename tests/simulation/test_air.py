@@ -15,6 +15,7 @@ from skysim.simulation.lights.atmosphere import AirEffects, Skyline
 from skysim.simulation.lights.light import find_light
 from skysim.sources import air
 from skysim.tracking.factory import solve_frame
+from tests.helpers.changed_light import with_lights
 
 TIME = "2012-06-24T23:00:00"
 AIR = {
@@ -63,7 +64,7 @@ def test_the_air_raises_and_dims_stars_in_the_frame() -> None:
     airless = tuple(
         light for light in lab.camera.lights if not isinstance(light, AirEffects | Skyline)
     )
-    without = render_toward(lab.with_camera(lights=airless), level(lab, 30.0))[1].sources
+    without = render_toward(with_lights(lab, airless), level(lab, 30.0))[1].sources
     both, ours, bare = np.intersect1d(through.id, without.id, return_indices=True)
     assert len(both) > 30
     focal_px = lab.scene.camera.focal_px

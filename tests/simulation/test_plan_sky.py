@@ -65,7 +65,7 @@ def test_stray_light_that_costs_stars_is_warned_of() -> None:
         line,
     )
     assert lost
-    assert float(lost[1]) == pytest.approx(lit.camera.stray_e, rel=1e-2)
+    assert float(lost[1]) == pytest.approx(lit.camera.glow_e["stray light"], rel=1e-2)
     assert float(lost[2]) == pytest.approx(plain - sky_warnings.snr_limit_mag(lit), abs=0.15)
     better = f"{{angle_deg: [20, 50, 90, 120], pst: {[float(lost[3]) * one for one in (1e-3, 1e-7, 1e-9, 1e-12)]}}}"
     cured = plan_of("shefex2", **keys, camera__baffle=better)

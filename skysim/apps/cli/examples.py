@@ -1,27 +1,15 @@
 """Examples of every command, at the end of its `--help` and in docs/reference/command_line.md."""
 
-from pathlib import Path
-
 import typer
 
 from skysim.core.paths import DATA
 
-
-def read_examples(path: Path) -> dict[str, tuple[str, ...]]:
-    """Read the examples by the name of their command; "" is `skysim` itself.
-
-    The file has a paragraph for each command: its name with a colon, then a line for each example.
-    """
-    paragraphs = path.read_text(encoding="utf-8").strip().split("\n\n")
-    found = {}
-    for paragraph in paragraphs:
-        head, *lines = paragraph.splitlines()
-        name = head.removeprefix("skysim").strip(" :")
-        found[name] = tuple(lines)
-    return found
-
-
-EXAMPLES = read_examples(DATA / "examples.txt")
+# By the name of the command; "" is `skysim` itself. The file has a paragraph for each command: its name with a colon,
+# then a line for each example.
+EXAMPLES: dict[str, tuple[str, ...]] = {}
+for paragraph in (DATA / "examples.txt").read_text("utf-8").strip().split("\n\n"):
+    head, *lines = paragraph.splitlines()
+    EXAMPLES[head.removeprefix("skysim").strip(" :")] = tuple(lines)
 
 
 def epilog(name: str) -> str:

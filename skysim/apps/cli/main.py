@@ -89,18 +89,6 @@ def options(
     """Simulate a star-tracker laboratory: motion, light sources, camera, attitude determination, scoring."""
 
 
-def listing_hint(text: str, context: typer.Context | None) -> str:
-    """A hint for an unknown command such as `skysim study list`: the group lists its items without a command."""
-    group = getattr(context, "command", None)
-    if (
-        context is None
-        or not text.startswith("No such command")
-        or not getattr(group, "invoke_without_command", False)
-    ):
-        return ""
-    return f" Allowed: {', '.join(getattr(group, 'commands', {}))}; `{context.command_path}` alone lists."
-
-
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.running_as_command = True
@@ -129,7 +117,14 @@ def main() -> None:
         if not hasattr(error, "format_message"):
             raise
         text = " ".join(error.format_message().split()) or "give a command; see skysim --help"
-        code = print_error(text + listing_hint(text, getattr(error, "ctx", None)))
+        # Of an unknown command such as `skysim study list`: the group lists its items without a command.
+        context = getattr(error, "ctx", None)
+        group = getattr(context, "command", None)
+        lists = getattr(group, "invoke_without_command", False)
+        if context and lists and text.startswith("No such command"):
+            names = ", ".join(getattr(group, "commands", {}))
+            text += f" Allowed: {names}; `{context.command_path}` alone lists."
+        code = print_error(text)
     if code == 130:  # typer's own answer to Ctrl-C
         print_error("stopped")
     sys.exit(code if isinstance(code, int) else 0)

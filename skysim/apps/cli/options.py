@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import shlex
 import sys
@@ -210,16 +209,6 @@ def command_line() -> str:
 def selected_stages(**stages: str | None) -> dict[str, str]:
     """The tracker stages for which the command line names an algorithm."""
     return {stage: name for stage, name in stages.items() if name is not None}
-
-
-def datetime_from_iso(text: str | None) -> datetime.datetime | None:
-    """The date of --time. Raises InputError."""
-    if text is None:
-        return None
-    try:
-        return datetime.datetime.fromisoformat(text)
-    except ValueError:
-        raise InputError(f"--time {text}", "", "ISO 8601, e.g. 2012-06-22T21:00:00") from None
 
 
 # Errors with the option that a user typed in place of the key.

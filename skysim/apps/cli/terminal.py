@@ -42,7 +42,7 @@ def progress(items: Iterable[T], total: int, what: str, quiet: bool = False) -> 
         yield from shown.track(items, total=total, description=printable(what))
 
 
-def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
+def bar(*columns: ProgressColumn) -> Bar:
     """A transient progress bar on stderr: description, then columns. Disabled if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import (
@@ -61,16 +61,14 @@ def bar(*columns: ProgressColumn, quiet: bool = False) -> Bar:
         *columns,
         console=console,
         transient=True,
-        disable=quiet or not console.is_terminal,
+        disable=not console.is_terminal,
     )
 
 
 @contextmanager
-def progress_callback(
-    what: str, quiet: bool = False
-) -> Iterator[Callable[[float, float], None]]:
+def progress_callback(what: str) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr and yield its update function done(completed, total)."""
-    with bar(quiet=quiet) as shown:
+    with bar() as shown:
         task = shown.add_task(printable(what))
         yield lambda now, everything: shown.update(task, completed=now, total=everything)
 
@@ -190,19 +188,18 @@ def print_remarks(solution: dict[str, Any]) -> None:
     if not solution["hint"]:
         return
     print(f"\n{printable(solution['file'])}: {printable(solution['status'])}")
-    if solution["roll_deg"] is None:
+    refused = solution["roll_deg"] is None
+    if refused:
         print(
             f"  seen:   {solution['lights']} lights, the brightest pixel {solution['brightest_dn']:g} DN,"
             f" the background {solution['background_dn']:g} DN"
         )
-    if solution["roll_deg"] is None and "leds" not in solution:
+    if refused and "leds" not in solution:
         fields = " and ".join(
             f"{narrow:g}° to {wide:g}°" for narrow, wide in solution["tried_fov_deg"]
         )
         print(f"  tried:  fields {fields} wide, stars to V {solution['catalog_limit_mag']:g}")
-    print(
-        f"  {'likely' if solution['roll_deg'] is None else 'note'}: {printable(solution['hint'])}"
-    )
+    print(f"  {'likely' if refused else 'note'}: {printable(solution['hint'])}")
 
 
 def print_json(data: Any) -> None:

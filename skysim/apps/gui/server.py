@@ -46,11 +46,15 @@ QUIET_S = 1.0  # time without a closed page and without a new frame before close
 PATIENCE_S = 60.0  # time after which they are collected even while pages get frames
 
 
-def freeze() -> None:
-    """Exclude imported objects from garbage collection, and limit automatic collections to new objects.
+def prepare() -> None:
+    """Keep connections whose browsers answer late, and limit automatic garbage collections to new objects.
 
     A full collection takes half a second with 20 pages, during which no key is served. Only `ClosedPages` starts one.
     """
+    # NiceGUI derives both times from the reconnect time.
+    core.sio.eio.ping_interval = PING_INTERVAL_S
+    core.sio.eio.ping_timeout = PING_TIMEOUT_S
+    # Imported objects are never collected.
     gc.collect()
     gc.freeze()
     gc.set_threshold(*THRESHOLDS)
@@ -317,12 +321,6 @@ def report_path(out: Path, name: str, user: str = "") -> Path | None:
         return None
 
 
-def be_patient() -> None:
-    """Keep connections whose browsers answer late; NiceGUI derives both times from the reconnect time."""
-    core.sio.eio.ping_interval = PING_INTERVAL_S
-    core.sio.eio.ping_timeout = PING_TIMEOUT_S
-
-
 def stop_studies() -> None:
     """End the studies of all pages with the server; their trials so far are kept."""
     for process in StudyProcess.begun:
@@ -333,8 +331,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
     """Register all routes, and prepare the workers of tabs."""
     pool = Workers(workers)
     closed_pages = ClosedPages()
-    app.on_startup(be_patient)
-    app.on_startup(freeze)
+    app.on_startup(prepare)
     app.on_startup(partial(pool.prepare, str(find(scene).resolve())))
     app.on_shutdown(stop_studies)
 

@@ -273,8 +273,15 @@ def write_outputs(
     rows = result["leds"] if isinstance(reading, DomeReading) else result["stars"]
     report = reading.report
     if outputs.annotated:
+        from skysim.results.plots import annotate
+
         names = [one["name"] for one in rows]
-        files.write_image(outputs.annotated, annotated_image(reading.pixels, report, names))
+        match = report.attitude.match
+        detected_px = report.centroids.xy_px
+        matched_px = detected_px[match.observed if match else []]
+        files.write_image(
+            outputs.annotated, annotate(reading.pixels, detected_px, matched_px, names)
+        )
     if not report.attitude.solved:
         return
     if outputs.table:
@@ -495,14 +502,3 @@ def outcome_fields(
     assumed = outcome.tried[0].assumption
     hint = diagnosis.likely_cause(refusal) + f" ({assumed})" * bool(assumed)
     return seen | {"hint": hint}
-
-
-def annotated_image(image: NDArray, report: Report, names: list[str]) -> NDArray[np.uint8]:
-    """The image annotated with detections, matched lights and their names."""
-    from skysim.results.plots import annotate
-
-    match = report.attitude.match
-    detected_px = report.centroids.xy_px
-    if match is None:
-        return annotate(image, detected_px, np.empty((0, 2)))
-    return annotate(image, detected_px, detected_px[match.observed], names)

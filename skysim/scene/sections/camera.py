@@ -292,13 +292,7 @@ class ParticlesConfig(ConfigModel):
     diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
 
 
-def existing_curve(value: str) -> str:
-    """The name of a curve. Raises InputError if there is no such curve."""
-    curve_file(value)
-    return value
-
-
-Curve = Annotated[str, AfterValidator(existing_curve)]
+Curve = Annotated[str, AfterValidator(lambda name: curve_file(name) and name)]
 
 
 class EfficiencyConfig(ConfigModel):

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
@@ -110,19 +110,14 @@ class PatchBoardsConfig(ConfigModel):
     glue_tilt_deg: Annotated[Number, Field(ge=0, le=30)] = 0.0
     hardware_seed: Seed = 0
 
-    @field_validator("lit")
-    @classmethod
-    def check_lit(cls, value: tuple[int, int]) -> tuple[int, int]:
-        if not 1 <= value[0] <= value[1] <= HOLES:
+    @model_validator(mode="after")
+    def check_boards(self) -> PatchBoardsConfig:
+        if not 1 <= self.lit[0] <= self.lit[1] <= HOLES:
             raise InputError(
-                "",
-                f"{value} is not a range of LEDs on a 3x3 board",
+                "lit",
+                f"{self.lit} is not a range of LEDs on a 3x3 board",
                 "1 <= least <= most <= 9",
             )
-        return value
-
-    @model_validator(mode="after")
-    def check_spacing(self) -> PatchBoardsConfig:
         if self.spacing_m is None and not self.boards:
             raise InputError("", "patch_boards takes spacing, or boards by list")
         if self.spacing_m is not None and self.spacing_m < 3 * self.pitch_m:

@@ -282,12 +282,6 @@ def spectrum_file(spectrum: str) -> Path:
     return path
 
 
-def spectrum_exists(spectrum: str) -> str:
-    """The name of a spectrum. Raises InputError if it has no file."""
-    spectrum_file(spectrum)
-    return spectrum
-
-
 def spectrum_tag(value: Any) -> str:
     """Tag of the kind of spectrum: white, or a text that ends in .csv, is measured; any other value is a wavelength."""
     measured = isinstance(value, str) and (value == "white" or value.endswith(".csv"))
@@ -300,7 +294,10 @@ Wavelength = Annotated[
     Field(ge=300e-9, le=1100e-9),
 ]
 LedSpectrum = Annotated[
-    Annotated[Annotated[str, AfterValidator(spectrum_exists)], Tag("measured")]
+    Annotated[
+        Annotated[str, AfterValidator(lambda name: spectrum_file(name) and name)],
+        Tag("measured"),
+    ]
     | Annotated[Wavelength, Tag("wavelength")],
     Discriminator(spectrum_tag),
 ]

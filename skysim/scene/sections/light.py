@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -74,13 +74,14 @@ class SurfaceConfig(ConfigModel):
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 
-
-def check_below_apex(rim_height_m: float | None, apex_m: float) -> None:
-    """Raise InputError if a surface's rim is not below its apex."""
-    if rim_height_m is not None and rim_height_m >= apex_m:
-        raise InputError(
-            "rim_height", f"{rim_height_m:g} m is not below the apex", "less than apex"
-        )
+    @model_validator(mode="after")
+    def check_below_apex(self) -> Self:
+        rim_m = getattr(self, "rim_height_m", None)
+        if rim_m is not None and rim_m >= getattr(self, "apex_m", math.inf):
+            raise InputError(
+                "rim_height", f"{rim_m:g} m is not below the apex", "less than apex"
+            )
+        return self
 
 
 class RimmedConfig(SurfaceConfig):
@@ -93,7 +94,6 @@ class RimmedConfig(SurfaceConfig):
     def check_rim(self) -> Self:
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
-        check_below_apex(self.rim_height_m, getattr(self, "apex_m", math.inf))
         return self
 
 
@@ -168,7 +168,6 @@ class CylinderSurfaceConfig(SurfaceConfig):
     def check_extent(self) -> Self:
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
-        check_below_apex(self.rim_height_m, self.apex_m)
         return self
 
 
@@ -504,13 +503,6 @@ class LightConfig(ConfigModel):
         if kind not in CONFIGS and kind in PLUGINS.entry_points():
             PLUGINS.entry_points()[kind].load()  # the module registers the kind
         return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
-
-
-def add_kind(config: type[LightConfig]) -> str:
-    """Add a kind of light to the schema, and return its name, the literal of its `kind`."""
-    (kind,) = get_args(config.model_fields["kind"].annotation)
-    CONFIGS[kind] = config
-    return str(kind)
 
 
 FurtherLight = SerializeAsAny[LightConfig]

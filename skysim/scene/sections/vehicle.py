@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
@@ -30,7 +30,6 @@ from skysim.core.units import (
     Stiffness,
     Time,
     Torque,
-    Triple,
 )
 
 # Keys of `vehicle`, and the ideal torques.
@@ -39,13 +38,7 @@ TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 
 
-class ActuatorsConfig(ConfigModel):
-    """A set of actuators that a controller can command."""
-
-    stores_momentum: ClassVar[bool] = False
-
-
-class WheelsConfig(ActuatorsConfig):
+class WheelsConfig(ConfigModel):
     """Reaction wheels: every hinge joint `wheel_*` of the model.
 
     Attributes
@@ -62,7 +55,6 @@ class WheelsConfig(ActuatorsConfig):
         Speed of each wheel at the start; at rest if left out
     """
 
-    stores_momentum: ClassVar[bool] = True
     torque_limit_nm: TorqueLimit = 0.5
     speed_limit_rpm: Positive = 3000.0
     coulomb_nm: TorqueLevel = 0.0
@@ -78,7 +70,7 @@ class WheelsConfig(ActuatorsConfig):
         return self
 
 
-class FansConfig(ActuatorsConfig):
+class FansConfig(ConfigModel):
     """Fans: every site `fan_*` of the model exerts a thrust along its own z, in both directions.
 
     Attributes
@@ -93,7 +85,7 @@ class FansConfig(ActuatorsConfig):
     time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
 
 
-class CmgsConfig(ActuatorsConfig):
+class CmgsConfig(ConfigModel):
     """Control moment gyroscopes: hinge joints `gimbal_*`, each with the joint `rotor_*` of the same suffix.
 
     Attributes
@@ -110,7 +102,6 @@ class CmgsConfig(ActuatorsConfig):
         Greatest motor torque on the rotors of variable-speed CMGs; the rotor speeds are constant if left out
     """
 
-    stores_momentum: ClassVar[bool] = True
     rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
     gimbal_rate_limit_deg_s: Positive = 60.0
     gimbal_time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.01
@@ -315,19 +306,15 @@ class VehicleConfig(ConfigModel):
     imu: ImuConfig | None = None
     gimbals: GimbalsConfig | None = None
 
-    @field_validator("inertia_kg_m2")
-    @classmethod
-    def check_inertia(cls, value: Triple | None) -> Triple | None:
-        if value and (min(value) <= 0 or 2 * max(value) > sum(value)):
+    @model_validator(mode="after")
+    def check_body(self) -> VehicleConfig:
+        inertia = self.inertia_kg_m2
+        if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(
-                "",
-                f"{value} is not possible for a rigid body",
+                "inertia",
+                f"{inertia} is not possible for a rigid body",
                 "positive, none above the sum of the others",
             )
-        return value
-
-    @model_validator(mode="after")
-    def check_free_mount(self) -> VehicleConfig:
         if self.mount == "free" and self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":

@@ -56,7 +56,17 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     count = exposure.frames
     index = np.unique(np.linspace(0, count - 1, min(count, MAX_FRAMES)).astype(int))
     t_s = exposure.first_s + index / exposure.rate_hz + exposure.time_s / 2
-    every = attitudes_at(lab, t_s)
+    jitter, _ = jitter_in_exposures(lab, t_s, exposure.time_s)
+    if scene.motion.control is None:
+        # Without a controller the rate is the initial one.
+        rates = guidance.body_rate_rad_s(scene, lab.start)
+        lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rates))
+    else:
+        reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+        states = [reference.state_at(float(t)) for t in t_s]
+        wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
+        lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
+    every = CheckedAttitudes(lab_from_body, rates + jitter, t_s)
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
     chosen.add(int(every.speed_rad_s.argmax()))
@@ -67,21 +77,6 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
         free = tilts_rad(every)[rows] <= math.radians(scene.vehicle.tilt_stop_deg)
         rows = rows[free] if free.any() else rows[:1]
     return CheckedAttitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
-
-
-def attitudes_at(lab: Lab, t_s: Floats) -> CheckedAttitudes:
-    """The commanded attitudes at (N,) times; without a controller those of the constant initial rate."""
-    scene = lab.scene
-    jitter, _ = jitter_in_exposures(lab, t_s, scene.exposure.time_s)
-    if scene.motion.control is None:
-        rate = guidance.body_rate_rad_s(scene, lab.start)
-        lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rate))
-        return CheckedAttitudes(lab_from_body, rate + jitter, t_s)
-    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-    states = [reference.state_at(float(t)) for t in t_s]
-    wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
-    lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
-    return CheckedAttitudes(lab_from_body, rates + jitter, t_s)
 
 
 def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Floats, Floats]:

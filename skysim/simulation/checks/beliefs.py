@@ -184,7 +184,8 @@ def known_lights(
     merge_rad = assumed_settings(scene).merge_px / scene.camera.focal_px
     stars = catalog.merge_doubles(replace(stars, vectors=directions), merge_rad)
     sources = lab.camera.sources
-    row, star = common(sources.id, stars.id)
+    row = np.flatnonzero(np.isin(sources.id, stars.id))
+    star = rows_of(sources.id[row], stars.id)
     place = normalized(sources.place[:, :3])
     rate_e_s = sources.strength * lab.camera.optics.collecting_m2
     shift = neighbor_shift(place, rate_e_s, row, camera)
@@ -263,13 +264,6 @@ def response_px(
     pull = neighbor_e * (weight * slope * other).sum(axis=1)
     stiffness = total_e * (weight * slope**2).sum(axis=1)
     return pull / stiffness
-
-
-def common(first: Ints, second: Ints) -> tuple[Ints, Ints]:
-    """Rows of the numbers that are in both lists, in the order of the first list."""
-    _, a, b = np.intersect1d(first, second, return_indices=True)
-    order = np.argsort(a)
-    return a[order], b[order]
 
 
 def describe(beliefs: Beliefs, scene: Scene) -> list[str]:

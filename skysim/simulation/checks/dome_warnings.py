@@ -25,7 +25,7 @@ from skysim.simulation.lights.lab_room import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import surface
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
-from skysim.sources.dome.surface import Radial, Surface
+from skysim.sources.dome.surface import Radial
 
 # Largest rms distance of the fitted ellipsoid from the surface that gives no warning. For a camera whose line of
 # sight passes 0.2 m beside the bearing, 1 m under the dome, it puts the intersection of the line of sight with the
@@ -40,14 +40,45 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     """The warnings about assumptions of the tracker, one line each, for a camera inside the dome."""
     light = scene.dome
     assert light is not None
-    inside = surface.build_surface(light.surface)
-    lines = [
-        surface_fit_warning(light, inside),
-        ellipsoid_warning(inside),
-        image_width_warning(scene, sources, mount),
-        exposure_warning(scene, sources),
-    ]
-    return [line for line in lines if line]
+    config = light.surface
+    inside = surface.build_surface(config)
+    lines = []
+    # 1. The distance of the points of a surveyed surface from the fitted one.
+    fit = inside.fit if isinstance(inside, Radial) else None
+    if fit and isinstance(config, SurveyedSurfaceConfig):
+        lines.append(
+            f"light.surface: {config.file}: the points differ from the fitted surface of degree {config.degree} by"
+            f" {fit.rms_m * 1e3:.2g} mm rms, {fit.max_residual_m * 1e3:.2g} mm at most"
+        )
+    # 2. That of the surface from the ellipsoid.
+    rms_m = inside.nearest_ellipsoid().rms_m
+    if rms_m > MAX_ELLIPSOID_RMS_M:
+        lines.append(
+            f"light.surface: differs by {rms_m * 1e3:.2g} mm rms from the ellipsoid that the tracker assumes; solvers"
+            " that use the surface (ray_on_surface, thesis) have errors of that size"
+        )
+    # 3. Images that the local detector takes for background. That of a disk of diameter D at the distance d has the
+    # width D f / d. Defocus of a thin lens with the pupil A adds A |1 / d - 1 / focus| f.
+    if scene.tracker.detector == "local":
+        camera = scene.camera
+        distance_m = np.linalg.norm(sources.place[:, :3], axis=1)
+        typical_m = float(np.median(distance_m - np.linalg.norm(mount.camera_body_m)))
+        blur = camera.pupil_m * abs(1 / typical_m - 1 / camera.focus_m)
+        width = 2 * float(np.median(sources.radius_m)) / typical_m + blur
+        if (width_px := camera.focal_px * width) > MAX_IMAGE_PX:
+            lines.append(
+                f"tracker.detector: LED images are {width_px:.0f} px wide; local treats images wider than"
+                f" {MAX_IMAGE_PX:.0f} px as background; use threshold"
+            )
+    # 4. Exposures shorter than the LED drive's cycle, so that a frame shows only some of the LEDs.
+    time_s = scene.exposure.time_s
+    cycles_s = sources.period_s[sources.on_s < sources.period_s]
+    if len(cycles_s) and time_s < (cycle_s := float(np.median(cycles_s))):
+        lines.append(
+            f"exposure.time: {time_s:g} s is shorter than the LED drive's cycle of {cycle_s:g} s: a frame"
+            f" covers {100 * time_s / cycle_s:.2g} % of a cycle"
+        )
+    return lines
 
 
 def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
@@ -59,66 +90,6 @@ def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
     return (
         f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
         " start: a frame may show no LED; allowed: inside"
-    )
-
-
-def surface_fit_warning(light: DomeConfig, inside: Surface) -> str:
-    """The distance of the points of a surveyed surface from the fitted one, in words; empty for other surfaces."""
-    config = light.surface
-    fit = inside.fit if isinstance(inside, Radial) else None
-    if fit is None or not isinstance(config, SurveyedSurfaceConfig):
-        return ""
-    return (
-        f"light.surface: {config.file}: the points differ from the fitted surface of degree {config.degree} by"
-        f" {fit.rms_m * 1e3:.2g} mm rms, {fit.max_residual_m * 1e3:.2g} mm at most"
-    )
-
-
-def ellipsoid_warning(inside: Surface) -> str:
-    """Warn if the surface differs by more than MAX_ELLIPSOID_RMS_M rms from the ellipsoid that the tracker assumes."""
-    rms_m = inside.nearest_ellipsoid().rms_m
-    if rms_m <= MAX_ELLIPSOID_RMS_M:
-        return ""
-    return (
-        f"light.surface: differs by {rms_m * 1e3:.2g} mm rms from the ellipsoid that the tracker assumes; solvers that"
-        " use the surface (ray_on_surface, thesis) have errors of that size"
-    )
-
-
-def image_width_warning(scene: Scene, sources: Sources, mount: Mount) -> str:
-    """Warn if the local detector would treat the image of an LED as background.
-
-    The image of a disk of diameter D at the distance d has the width D f / d. Defocus of a thin lens with the pupil A
-    adds A |1 / d - 1 / focus| f.
-    """
-    if scene.tracker.detector != "local":
-        return ""
-    camera = scene.camera
-    distance_m = np.linalg.norm(sources.place[:, :3], axis=1) - np.linalg.norm(
-        mount.camera_body_m
-    )
-    typical_m = float(np.median(distance_m))
-    blur = camera.pupil_m * abs(1 / typical_m - 1 / camera.focus_m)
-    width_px = camera.focal_px * (2 * float(np.median(sources.radius_m)) / typical_m + blur)
-    if width_px <= MAX_IMAGE_PX:
-        return ""
-    return (
-        f"tracker.detector: LED images are {width_px:.0f} px wide; local treats images wider than {MAX_IMAGE_PX:.0f} px"
-        " as background; use threshold"
-    )
-
-
-def exposure_warning(scene: Scene, sources: Sources) -> str:
-    """Warn if the exposure is shorter than the LED drive's cycle, so that a frame shows only some of the LEDs."""
-    duty_cycled = sources.on_s < sources.period_s
-    if not duty_cycled.any():
-        return ""
-    cycle_s = float(np.median(sources.period_s[duty_cycled]))
-    if scene.exposure.time_s >= cycle_s:
-        return ""
-    return (
-        f"exposure.time: {scene.exposure.time_s:g} s is shorter than the LED drive's cycle of {cycle_s:g} s: a frame"
-        f" covers {100 * scene.exposure.time_s / cycle_s:.2g} % of a cycle"
     )
 
 

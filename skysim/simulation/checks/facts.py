@@ -446,15 +446,22 @@ def expected_error(plan: Plan) -> Fact:
             f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
         }
     chosen = plan.frames if np.isfinite(values["frames"]["roll_arcsec"]) else plan.reach
-    lines += [
-        f"{angle}: {cause_text(chosen, angle)}"
-        for angle in ("cross", "roll")
-        if chosen.predicted() and causes(chosen, angle)
-    ]
+    # The causes with their size and their share of the variance.
+    named: set[str] = set()
+    for angle in ("cross", "roll"):
+        sizes = causes(chosen, angle)
+        named |= sizes.keys()
+        if chosen.predicted() and sizes:
+            variance = math.fsum(size**2 for size in sizes.values())
+            parts = [
+                f"{name} {short(size)}{ARCSEC} ({100 * size**2 / variance:.0f} %)"
+                for name, size in sizes.items()
+                if size**2 >= MIN_SHARE * variance
+            ]
+            lines.append(f"{angle}: {', '.join(parts)}")
     lines.append(
         "cross: sqrt(x² + y²), x and y the errors about both axes across the boresight"
     )
-    named = {name for angle in ("cross", "roll") for name in causes(chosen, angle)}
     if named & {*SURVEYED, *(["focal length"] if plan.beliefs.focal_sigma else [])}:
         lines.append(
             "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
@@ -549,18 +556,6 @@ def causes(sampled: Sampled, angle: str) -> dict[str, float]:
         for name, value in sorted(size.items(), key=lambda item: -item[1])
         if value > 0
     }
-
-
-def cause_text(sampled: Sampled, angle: str) -> str:
-    """The causes as text, with their size and their share of the variance."""
-    sizes = causes(sampled, angle)
-    total = math.fsum(size**2 for size in sizes.values())
-    parts = [
-        f"{name} {short(size)}{ARCSEC} ({100 * size**2 / total:.0f} %)"
-        for name, size in sizes.items()
-        if size**2 >= MIN_SHARE * total
-    ]
-    return ", ".join(parts)
 
 
 FACTS: tuple[Callable[[Plan], Fact | None], ...] = (

@@ -64,7 +64,11 @@ MAX_TAG_ARCSEC = 1.0
 
 
 def saturation(plan: Plan) -> str:
-    """Warn if many lights are saturated."""
+    """Warn if many lights are saturated, with the keys that make every light dimmer, those of the LEDs first.
+
+    An exposure is recommended only if it is not shorter than SHORTEST_S and the LED drive's cycle, in which each LED is
+    lit once, and an f-number only up to LARGEST_F_NUMBER. Stars always get an exposure.
+    """
     ratio = fill(plan)
     scene = plan.scene
     full = float((ratio >= 1).mean()) if len(ratio) else 0.0
@@ -75,30 +79,22 @@ def saturation(plan: Plan) -> str:
         f"{100 * full:.0f} % of the lights are saturated, the median light at {short(np.median(ratio), 2)} times"
         f" {plan.full_e:.0f} electrons; change it to"
     )
-    (first, value), *more = dimmer(plan, factor).items()
+    cures = led_strength(scene, factor)
+    sources = plan.lab.camera.sources
+    cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
+    exposure_s = factor * scene.exposure.time_s
+    if exposure_s >= max(cycle_s, SHORTEST_S) or not cures:
+        cures["exposure.time"] = f"{short(1e3 * exposure_s, 2)} ms"
+    f_number = scene.camera.f_number / math.sqrt(factor)
+    if f_number <= LARGEST_F_NUMBER:
+        cures["camera.f_number"] = short(f_number, 2)
+    (first, value), *more = cures.items()
     others = "".join(f", or {key} to {other}" for key, other in more)
     if factor < FILTER_BELOW and isinstance(transmission := scene.camera.transmission, float):
         others += (
             f", or camera.transmission to {short(factor * transmission, 2)}, a gray filter"
         )
     return f"{first}: {text} {value}{others}"
-
-
-def dimmer(context: Context, factor: float) -> dict[str, str]:
-    """Keys with values that make every light dimmer by this factor, those of the LEDs first.
-
-    An exposure is recommended only if it is not shorter than SHORTEST_S and the LED drive's cycle, in which each LED is
-    lit once, and an f-number only up to LARGEST_F_NUMBER. Stars always get an exposure.
-    """
-    scene = context.scene
-    sources = context.lab.camera.sources
-    cures = led_strength(scene, factor)
-    cycle_s = float(sources.period_s[sources.on_s < sources.period_s].max(initial=0.0))
-    if factor * scene.exposure.time_s >= max(cycle_s, SHORTEST_S) or not cures:
-        cures["exposure.time"] = f"{short(1e3 * factor * scene.exposure.time_s, 2)} ms"
-    if scene.camera.f_number / math.sqrt(factor) <= LARGEST_F_NUMBER:
-        cures["camera.f_number"] = short(scene.camera.f_number / math.sqrt(factor), 2)
-    return cures
 
 
 def led_strength(scene: Scene, factor: float) -> dict[str, str]:

@@ -8,13 +8,13 @@
 4. Do the same for each head, and combine the expected errors.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from skysim.camera import wcs
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics import guidance
@@ -173,36 +173,7 @@ def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
         if fact.name == "expected error":
             frames = fact.values["frames"]
             return frames["cross_arcsec"], frames["roll_arcsec"]
-    return float("nan"), float("nan")
-
-
-def information(cross: float, roll: float) -> Floats:
-    """(3, 3) inverse covariance about the camera's axes in rad^-2, of errors in arcsec; zeros without a solution.
-
-    The variance of cross is the sum of those about x and y, half of it each.
-    """
-    if not np.isfinite([cross, roll]).all():
-        return np.zeros((3, 3))
-    across2 = (cross * ARCSEC_RAD) ** 2 / 2
-    along2 = (roll * ARCSEC_RAD) ** 2
-    return np.diag([1 / across2, 1 / across2, 1 / along2])
-
-
-def together_arcsec(lab: Lab, errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Expected cross and roll error of all cameras together about the boresight of the main one.
-
-    The information of solutions with independent errors adds up: P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation
-    from the axes of camera n to those of the main one.
-    """
-    total = np.zeros((3, 3))
-    main = lab.camera.mount.cam_from_body
-    for camera, error in zip(lab.cameras, errors, strict=True):
-        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
-        total += R_main_from_cam @ information(*error) @ R_main_from_cam.T
-    if not total.any():
-        return float("nan"), float("nan")
-    variance = np.diag(np.linalg.inv(total)) / ARCSEC_RAD**2
-    return float(np.sqrt(variance[:2].sum())), float(np.sqrt(variance[2]))
+    return math.nan, math.nan
 
 
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
@@ -213,7 +184,20 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
         f"{name}: {errors_text(*error)}"
         for name, error in zip(names, errors[1:], strict=True)
     ]
-    combined = together_arcsec(lab, errors)
+    # Of all cameras about the boresight of the main one. The information of solutions with independent errors adds up:
+    # P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation from the axes of camera n to those of the main one. A camera
+    # without a solution has none.
+    total = np.zeros((3, 3))
+    main = lab.camera.mount.cam_from_body
+    for camera, (cross, roll) in zip(lab.cameras, errors, strict=True):
+        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
+        # The variance of cross is the sum of those about x and y, half of it each.
+        information = 1 / np.array([cross**2 / 2, cross**2 / 2, roll**2])
+        total += R_main_from_cam @ np.diag(np.nan_to_num(information)) @ R_main_from_cam.T
+    combined = (math.nan, math.nan)
+    if total.any():
+        x, y, z = np.diag(np.linalg.inv(total)).tolist()
+        combined = (math.sqrt(x + y), math.sqrt(z))
     lines.append(
         f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts"
     )

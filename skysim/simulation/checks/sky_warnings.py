@@ -30,7 +30,7 @@ from skysim.simulation.checks.findings import few_lights
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.views import peak_share
 from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.lens import STRAY_LIGHT, stray_e_s
 from skysim.simulation.lights.light import find_light
 from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad
@@ -114,7 +114,17 @@ def bodies_near(plan: Plan) -> Iterator[str]:
         if in_field(
             cam_from_lab[n].apply(body.place.direction), body.radius_rad, lab.scene.camera
         ):
-            yield f"{what} is in the field, {far}: {short(peak_fill(plan, body), 2)} times saturation"
+            # Electrons in its brightest pixel at rest. A partly lit body counts as a full disk of the lit area.
+            camera = plan.camera
+            lit = (1 + math.cos(body.place.phase_rad)) / 2
+            radius = math.tan(body.radius_rad) * math.sqrt(lit)
+            radius_px = np.array([camera.optics.camera.focal_px * radius])
+            lens2_px2 = np.array([camera.lens_px**2])
+            none = np.zeros(1)
+            share = float(peak_share(lens2_px2, radius_px, none, none)[0])
+            light_e = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
+            fill = light_e * share / plan.full_e
+            yield f"{what} is in the field, {far}: {short(fill, 2)} times saturation"
         elif lab.scene.camera.baffle is None and off_rad < math.radians(
             NEAR_DEG.get(name, 0.0)
         ):
@@ -128,23 +138,6 @@ def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> 
     xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
     size_px = np.array([camera.width_px, camera.height_px])
     return bool((xy_px < size_px / 2 + camera.focal_px * math.tan(radius_rad)).all())
-
-
-def peak_fill(context: Context, body: BodyLight) -> float:
-    """Electrons in the brightest pixel of a body at rest over saturation.
-
-    A partly lit body counts as a full disk of the lit area.
-    """
-    camera = context.camera
-    scene = context.scene
-    lit = (1 + math.cos(body.place.phase_rad)) / 2
-    radius_px = scene.camera.focal_px * math.tan(body.radius_rad) * math.sqrt(lit)
-    lens2_px2 = np.array([camera.lens_px**2])
-    radius = np.array([radius_px])
-    none = np.zeros(1)
-    electrons = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
-    share = float(peak_share(lens2_px2, radius, none, none)[0])
-    return electrons * share / context.full_e
 
 
 # Claimed errors: the expected normalized estimation error squared (NEES) under the stars.
@@ -247,7 +240,7 @@ def stray_light(plan: Plan) -> Iterator[str]:
     by_frame = [stray_e_s(lab.camera.lights, exposure) for exposure in plan.frames.exposures]
     stray_e = plan.camera.exposure_s * np.array([sum(one.values()) for one in by_frame])
     n = int(stray_e.argmax())
-    own_e2 = plan.camera.noise_e**2 - plan.camera.stray_e
+    own_e2 = plan.camera.noise_e**2 - plan.camera.glow_e.get(STRAY_LIGHT, 0.0)
     loss_mag = 1.25 * math.log10(1 + stray_e[n] / own_e2)
     if loss_mag <= MAX_LOSS_MAG:
         return
@@ -268,13 +261,18 @@ def exclusion(plan: Plan) -> Iterator[str]:
     limits = lab.scene.orbit.exclusion if lab.scene.orbit else None
     if limits is None:
         return
-    boresight = attitudes.boresights(at.lab_from_body, lab)
-    angles_deg = np.array(
-        [
-            beside_deg(plan, t, axis)
-            for t, axis in zip(at.t_s.tolist(), boresight, strict=True)
-        ]
-    )
+    # Angles from the Sun's center, the Earth's limb and the Moon's center.
+    rows = []
+    boresights = attitudes.boresights(at.lab_from_body, lab)
+    for t_s, boresight in zip(at.t_s.tolist(), boresights, strict=True):
+        here = lab.camera.viewpoint.observer_at(t_s)
+        sun, moon = (
+            float(angular_separation_deg(boresight, place(name, here).direction))
+            for name in ("sun", "moon")
+        )
+        limb_rad = limb_elevation_rad(here.from_earth.position_m, boresight)
+        rows.append([sun, math.degrees(float(limb_rad)), moon])
+    angles_deg = np.array(rows)
     limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
     for column, (name, limit_deg) in enumerate(limits_deg.items()):
         n = int(angles_deg[:, column].argmin())
@@ -284,17 +282,6 @@ def exclusion(plan: Plan) -> Iterator[str]:
                 f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
                 f" {attitudes.describe(at, n, lab)}, within {limit_deg:g}°; point farther away"
             )
-
-
-def beside_deg(context: Context, t_s: float, boresight: Floats) -> Floats:
-    """(3,) angles of a boresight from the Sun's center, the Earth's limb and the Moon's center at a time, in deg."""
-    here = context.lab.camera.viewpoint.observer_at(t_s)
-    sun, moon = (
-        float(angular_separation_deg(boresight, place(name, here).direction))
-        for name in ("sun", "moon")
-    )
-    limb_deg = math.degrees(float(limb_elevation_rad(here.from_earth.position_m, boresight)))
-    return np.array([sun, limb_deg, moon])
 
 
 # Limiting magnitudes of the camera, the simulated sky and the tracker's catalog.

@@ -26,8 +26,7 @@ from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigm
 from skysim.core.types import Floats, Ints, Sources
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
-from skysim.simulation.lights.lens import STRAY_LIGHT
-from skysim.simulation.lights.light import Beam, Exposure, Lit, Occluder, beam_of
+from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
 VISIBLE = -1  # number in place of an occluder's for a light that is not hidden
@@ -132,11 +131,6 @@ class CameraModel(NamedTuple):
     noise_e: float
     exposure_s: float
 
-    @property
-    def stray_e(self) -> float:
-        """Mean electrons in a pixel from stray light past the baffle."""
-        return self.glow_e.get(STRAY_LIGHT, 0.0)
-
     @classmethod
     def of(cls, lab: Lab) -> CameraModel:
         """The main camera of a lab, with the background at its initial attitude."""
@@ -144,7 +138,15 @@ class CameraModel(NamedTuple):
         detector = lab.scene.camera.detector
         exposure_s = lab.scene.exposure.time_s
         exposure = expected_exposure(lab.camera, lab.start, np.zeros(3), math.nan)
-        glow_e = glow_by_light_e(beam_of(lab.camera.lights, exposure), exposure_s)
+        # Extended light by name. Light with edges that hides other lights is not in their background.
+        lits = beam_of(lab.camera.lights, exposure).lits
+        glow_e = dict.fromkeys((lit.name for lit in lits), 0.0)
+        for lit in lits:
+            if lit.glow:
+                glow_e[lit.name] += exposure_s * float(np.mean(lit.glow()))
+            edged_e_s = lit.edged() if lit.edged and lit.hides is None else None
+            if edged_e_s is not None:
+                glow_e[lit.name] += exposure_s * float(np.median(edged_e_s))
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
         # Variances of the fixed pattern and of the read-out; a converter's step q has the variance q^2 / 12.
@@ -160,21 +162,6 @@ class CameraModel(NamedTuple):
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
         return cls(lab.camera.optics, lens_px, background_e, glow_e, noise_e, exposure_s)
-
-
-def glow_by_light_e(beam: Beam, exposure_s: float) -> dict[str, float]:
-    """Mean electrons in a pixel from the extended light of each light, by name, see `CameraModel`.
-
-    Light with edges that hides other lights is not in their background.
-    """
-    found = dict.fromkeys((lit.name for lit in beam.lits), 0.0)
-    for lit in beam.lits:
-        if lit.glow:
-            found[lit.name] += exposure_s * float(np.mean(lit.glow()))
-        edged_e_s = lit.edged() if lit.edged and lit.hides is None else None
-        if edged_e_s is not None:
-            found[lit.name] += exposure_s * float(np.median(edged_e_s))
-    return found
 
 
 def view(

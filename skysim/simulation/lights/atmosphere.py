@@ -4,7 +4,6 @@ Everything is computed for mid-exposure. The site rotates by 15" in a second, wh
 0.02" at an altitude of 15 deg.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skysim.camera.glow.air_glow import air_glow
@@ -12,14 +11,12 @@ from skysim.camera.glow.background import node_directions, viewing_geometry
 from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.simulation.lights.light import (
     AddedLight,
     Beam,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     Obstacle,
     Occluder,
@@ -90,14 +87,3 @@ def seen_points(sky: Sky, points: Sources, exposure: Exposure) -> Sources:
     return sky.twinkling(
         seen, exposure.optics.camera.pupil_m, exposure.window.exposure_s, rng
     )
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The effects of `light.air`; none without it."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.air and plan.catalog is not None:
-        air = Air.from_config(light.air, plan.scene.site, plan.catalog, plan.band)
-        yield AirEffects(air)
-        yield Skyline(air)
-        if light.air.glow:
-            yield AirGlow(air, light.air.glow)

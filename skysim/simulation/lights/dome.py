@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
 from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Floats, Sources
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.scene.sections.surroundings import ThermalConfig
 from skysim.simulation.lights.light import Exposure, KnownLight, LightPlan, Lit
 from skysim.simulation.lights.starlight import stars_of
@@ -105,13 +105,7 @@ class CollimatedDisplay(KnownLight):
     config: CollimatedDisplayConfig
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit(
-            "stars",
-            True,
-            self.sources,
-            self.emitter,
-            edged=black_pixels(self.config, exposure),
-        )
+        return super().during(exposure)._replace(edged=black_pixels(self.config, exposure))
 
 
 def black_pixels(
@@ -128,34 +122,20 @@ def black_pixels(
     return e_s
 
 
-# The light of the scene's section `light`.
-
-
-def of_dome(config: DomeConfig, plan: LightPlan) -> KnownLight:
-    """The LEDs of a dome. Raises InputError for LEDs off the surface, and for a dome that does not fit its room."""
-    return LedDome(
-        dome.sources(config, plan.band),
-        Emitter.from_config(config.led),
-        config,
-        plan.scene.thermal,
-    )
-
-
-def of_display(config: CollimatedDisplayConfig, plan: LightPlan) -> KnownLight:
-    """The stars on a display at the scene's start."""
-    assert plan.catalog is not None
-    shown = display.display_sources(config, plan.catalog, plan.scene.start_time, plan.band)
-    return CollimatedDisplay(shown, Emitter(), config)
-
-
-# By the kind of the scene's section `light`.
-KNOWN: dict[str, Callable[[Any, LightPlan], KnownLight]] = {
-    "dome": of_dome,
-    "stars": stars_of,
-    "collimated_display": of_display,
-}
-
-
 def known_light(plan: LightPlan) -> KnownLight:
-    """The light of the scene's section `light`; that of the plan if it has one."""
-    return plan.known or KNOWN[plan.scene.light.kind](plan.scene.light, plan)
+    """The light of the scene's section `light`, at the scene's start; that of the plan if it has one.
+
+    Raises InputError for LEDs off the surface, and for a dome that does not fit its room.
+    """
+    scene = plan.scene
+    light = scene.light
+    if plan.known:
+        return plan.known
+    if isinstance(light, DomeConfig):
+        leds = dome.sources(light, plan.band)
+        return LedDome(leds, Emitter.from_config(light.led), light, scene.thermal)
+    assert plan.catalog is not None
+    if isinstance(light, StarsConfig):
+        return stars_of(light, plan)
+    shown = display.display_sources(light, plan.catalog, scene.start_time, plan.band)
+    return CollimatedDisplay(shown, Emitter(), light)

@@ -1,6 +1,5 @@
 """The laboratory around the lights: wall and floor that reflect them, and obstacles that hide them."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,22 +9,18 @@ from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, wall_glow
 from skysim.core.types import Bools, Floats
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
-from skysim.scene.sections.light import DomeConfig
-from skysim.simulation.lights.dome import known_light
 from skysim.simulation.lights.light import (
     AddedLight,
     Beam,
     Exposure,
-    Light,
-    LightPlan,
     Lit,
     Obstacle,
     Occluder,
 )
-from skysim.sources.dome.interreflection import ReflectingDome, reflecting_dome
+from skysim.sources.dome.interreflection import ReflectingDome
 from skysim.sources.dome.led import warm_up_factor
 from skysim.sources.dome.mirror import mirrored
-from skysim.sources.dome.surface import Surface, build_surface
+from skysim.sources.dome.surface import Surface
 
 # Reflections: a glow if the surface scatters, images if it mirrors.
 
@@ -85,17 +80,6 @@ class Mirror(AddedLight):
         return Lit(images_of(lit.name), False, images, lit.emitter, hidden_by=lit.hidden_by)
 
 
-def build_wall(plan: LightPlan) -> Iterator[Light]:
-    """The light that the wall or the floor of a dome reflects."""
-    light = plan.scene.light
-    if isinstance(light, DomeConfig) and light.reflection:
-        dome = reflecting_dome(light, light.reflection, known_light(plan).sources)
-        if dome.diffuse is not None:
-            yield WallGlow(dome, light.led.warm_up)
-        if dome.config.mirrors:
-            yield Mirror(dome)
-
-
 # Obstacles between a light and the camera: parts of the vehicle, and the dome's wall.
 
 # For the ray to the camera, an LED is moved off its wall by this fraction of its distance from the bearing.
@@ -144,12 +128,3 @@ def behind_wall(wall: Surface, camera_m: Floats, position_m: Floats) -> Bools:
         # A ray beneath the rim meets no wall: its distance is NaN, which is not smaller.
         behind[n] = np.linalg.norm(wall_m - led_m) < np.linalg.norm(ray)
     return behind
-
-
-def build_obstacles(plan: LightPlan) -> Iterator[Light]:
-    """The obstacles, if `light.occlusion` is on; a collimated display has none in its beam."""
-    light = plan.scene.light
-    if getattr(light, "occlusion", False):
-        yield Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount))
-        if isinstance(light, DomeConfig):
-            yield DomeWall(build_surface(light.surface))

@@ -1,7 +1,7 @@
 """Effects of the lens and its baffle: stray light from outside the field, ghosts, and veiling glare."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,6 @@ from skysim.simulation.lights.light import (
     Beam,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     beam_of,
 )
@@ -37,7 +36,13 @@ class Baffle(AddedLight):
 
     def stray_e_s(self, beam: Beam, exposure: Exposure) -> dict[str, float]:
         """Stray light in electrons s^-1 px^-1, by the name of the body that emits it."""
-        bodies = [disc for lit in beam.lits for disc in visible_discs(lit)]
+        bodies: list[BodyLight] = []
+        for lit in beam.lits:
+            occludes = lit.occlusion
+            hidden = np.zeros(len(lit.discs), bool)
+            if occludes:
+                hidden = occludes(centers_of(lit.discs).place)
+            bodies += itertools.compress(lit.discs, ~hidden)
         found = stray_of_bodies_e_s_m2(self.config, bodies, exposure.boresight)
         for lit in beam.lits:
             if lit.around is not None:
@@ -46,15 +51,6 @@ class Baffle(AddedLight):
                 )
         pixel_m2 = exposure.optics.camera.pixel_m**2
         return {name: light * pixel_m2 for name, light in found.items()}
-
-
-def visible_discs(lit: Lit) -> Iterator[BodyLight]:
-    """The discs of a light whose centers are not hidden."""
-    occludes = lit.occlusion
-    hidden = (
-        occludes(centers_of(lit.discs).place) if occludes else np.zeros(len(lit.discs), bool)
-    )
-    return itertools.compress(lit.discs, ~hidden)
 
 
 def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
@@ -84,19 +80,3 @@ class Glare(AddedLight):
 
     def through(self, beam: Beam, exposure: Exposure) -> Beam:
         return beam._replace(glares=(*beam.glares, self.config))
-
-
-def build_baffle(plan: LightPlan) -> Iterator[Light]:
-    """The stray light of `camera.baffle`; none without it."""
-    baffle = plan.scene.camera.baffle
-    if baffle:
-        yield Baffle(baffle)
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The effects of `camera.ghosts` and `camera.glare`; none without them."""
-    camera = plan.scene.camera
-    if camera.ghosts:
-        yield Ghosts(camera.ghosts)
-    if camera.glare:
-        yield Glare(camera.glare)

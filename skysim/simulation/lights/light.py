@@ -320,6 +320,10 @@ class KnownLight(Light):
     sources: Sources
     emitter: Emitter
 
+    def during(self, exposure: Exposure) -> Lit:
+        """Stars whose places are constant during the scene."""
+        return Lit("stars", True, self.sources, self.emitter)
+
 
 class Obstacle(Light):
     """An object that hides lights; `during` returns its occluder, and is fast."""

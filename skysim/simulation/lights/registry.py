@@ -1,20 +1,29 @@
 """All kinds of lights, in the order in which their light passes to the lens, and the kinds that programs add.
 
-An entry of `LIGHTS` makes none, one or more lights from a `LightPlan`. An obstacle hides the lights before it; air,
-wall and lens change the lights before them. Lights are drawn in this order.
+`build_lights` makes them from a `LightPlan`. An obstacle hides the lights before it; air, wall and lens change the
+lights before them. Lights are drawn in this order.
 
 `register` adds a kind of the scene's list `lights`. Any imported module may call it, or a module of an installed
 package that an entry point of the group `skysim.lights` names (see scene/sections/light.py).
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
-from skysim.scene.sections.light import LightConfig, add_kind
-from skysim.simulation.lights import atmosphere, lab_room, lens, sky_bodies, starlight
+from skysim.dynamics import multibody
+from skysim.scene.sections.light import CONFIGS, LightConfig
+from skysim.simulation.lights.atmosphere import AirEffects, AirGlow, Skyline
 from skysim.simulation.lights.dome import known_light
+from skysim.simulation.lights.lab_room import DomeWall, Mirror, Vehicle, WallGlow
+from skysim.simulation.lights.lens import Baffle, Ghosts, Glare
 from skysim.simulation.lights.light import Light, LightPlan
+from skysim.simulation.lights.sky_bodies import Earth, Satellites, SolarSystem
+from skysim.simulation.lights.starlight import BackgroundLight
+from skysim.sources.air import Air
+from skysim.sources.dome.interreflection import reflecting_dome
+from skysim.sources.dome.surface import build_surface
+from skysim.sources.orbit_elements import check_epochs, read_elements
 
 KINDS: dict[str, Callable[[Any, LightPlan], Light]] = {}
 
@@ -29,32 +38,53 @@ def register(config: type[LightConfig], build: Callable[[Any, LightPlan], Light]
     build
         Function from a section and a plan to the light
     """
-    KINDS[add_kind(config)] = build
-
-
-def further_lights(plan: LightPlan) -> Iterator[Light]:
-    """The lights of the scene's list `lights`."""
-    for config in plan.scene.lights:
-        yield KINDS[config.kind](config, plan)
-
-
-LIGHTS: dict[str, Callable[[LightPlan], Iterable[Light]]] = {
-    "background": starlight.build,
-    "stars, LEDs or a display": lambda plan: [known_light(plan)],
-    "Sun, Moon and planets": sky_bodies.build_solar_system,
-    "Earth": sky_bodies.build_earth,
-    "satellites": sky_bodies.build_satellites,
-    "air": atmosphere.build,
-    "further lights": further_lights,
-    "wall": lab_room.build_wall,
-    "baffle": lens.build_baffle,
-    "vehicle and dome": lab_room.build_obstacles,
-    "lens": lens.build,
-}
+    (kind,) = get_args(config.model_fields["kind"].annotation)
+    CONFIGS[kind] = config
+    KINDS[kind] = build
 
 
 def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     """All lights of a camera. Raises InputError for unreadable files, and for a dome that does not fit its room."""
-    # Several entries need the known light; make it once.
-    plan = replace(plan, known=known_light(plan))
-    return tuple(light for build in LIGHTS.values() for light in build(plan))
+    scene = plan.scene
+    camera = scene.camera
+    dome = scene.dome
+    sky = scene.stars
+    # Light leaks and the glow of the sky; stars, LEDs or a display.
+    known = known_light(plan)
+    plan = replace(plan, known=known)
+    found: list[Light] = [BackgroundLight(scene.background), known]
+    if sky and sky.bodies:
+        found.append(SolarSystem(sky.bodies))
+    if scene.orbit:
+        found.append(Earth(scene.orbit.earth))
+    if sky and sky.satellites:
+        elements = None
+        if file := sky.satellites.file:
+            elements = read_elements(file)
+            check_epochs(file, elements, scene.start_time)
+        found.append(Satellites(sky.satellites, elements))
+    if sky and sky.air and plan.catalog is not None:
+        air = Air.from_config(sky.air, scene.site, plan.catalog, plan.band)
+        found += [AirEffects(air), Skyline(air)]
+        if sky.air.glow:
+            found.append(AirGlow(air, sky.air.glow))
+    found += [KINDS[config.kind](config, plan) for config in scene.lights]
+    # Light that the wall or the floor of a dome reflects.
+    if dome and dome.reflection:
+        wall = reflecting_dome(dome, dome.reflection, known.sources)
+        if wall.diffuse is not None:
+            found.append(WallGlow(wall, dome.led.warm_up))
+        if wall.config.mirrors:
+            found.append(Mirror(wall))
+    if camera.baffle:
+        found.append(Baffle(camera.baffle))
+    # A collimated display has no obstacles in its beam.
+    if getattr(scene.light, "occlusion", False):
+        found.append(Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount)))
+        if dome:
+            found.append(DomeWall(build_surface(dome.surface)))
+    if camera.ghosts:
+        found.append(Ghosts(camera.ghosts))
+    if camera.glare:
+        found.append(Glare(camera.glare))
+    return tuple(found)

@@ -1,17 +1,15 @@
 """The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
 from skysim.core.types import Bools, Floats
-from skysim.scene.sections.light import BodiesConfig, StarsConfig
+from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
     AddedLight,
     Exposure,
     Light,
-    LightPlan,
     Lit,
     Obstacle,
     Occluder,
@@ -19,7 +17,7 @@ from skysim.simulation.lights.light import (
 from skysim.sources.bodies import bodies_from
 from skysim.sources.camera_orbit import hidden_by_earth, sun_m
 from skysim.sources.ephemeris import GcrsState
-from skysim.sources.orbit_elements import MeanElements, check_epochs, read_elements
+from skysim.sources.orbit_elements import MeanElements
 from skysim.sources.satellites import (
     MovingLight,
     as_sources,
@@ -33,45 +31,29 @@ NAME = "the Earth"
 
 
 @dataclass(frozen=True)
-class DarkEarth(Obstacle):
-    """An Earth that only hides: stars one by one, and bodies as a whole.
+class Earth(Obstacle):
+    """The Earth, which hides stars one by one and bodies as a whole, and shines if it has a section `earth`."""
 
-    Satellites may be in front of it, so they follow it in the list of lights.
-    """
+    config: EarthConfig | None
 
     def during(self, exposure: Exposure) -> Lit:
-        position_m = exposure.observer.from_earth.position_m
+        here = exposure.observer
+        position_m = here.from_earth.position_m
 
         def hides(place: Floats) -> Bools:
             return hidden_by_earth(position_m, place[:, :3]) & (place[:, 3] == 0)
 
-        return Lit(NAME, hides=Occluder(NAME, hides, whole=True))
-
-
-@dataclass(frozen=True)
-class LitEarth(DarkEarth):
-    """An Earth that also shines."""
-
-    config: EarthConfig
-
-    def during(self, exposure: Exposure) -> Lit:
-        here = exposure.observer
-        seen_from = (self.config, here.from_earth.position_m, sun_m(here.tt_jd))
+        dark = Lit(NAME, hides=Occluder(NAME, hides, whole=True))
+        if self.config is None:
+            return dark
+        seen_from = (self.config, position_m, sun_m(here.tt_jd))
         optics = exposure.optics
         cam_from_lab = exposure.cam_from_lab
         band = exposure.band
-        dark = super().during(exposure)
         return dark._replace(
             edged=lambda: earth_light(*seen_from, optics, cam_from_lab, band),
             around=lambda: earth_around(*seen_from, band),
         )
-
-
-def build_earth(plan: LightPlan) -> Iterator[Light]:
-    """The Earth under a camera in orbit; none on the ground."""
-    orbit = plan.scene.orbit
-    if orbit:
-        yield LitEarth(orbit.earth) if orbit.earth else DarkEarth()
 
 
 # Artificial satellites: those of a file, and random ones.
@@ -118,17 +100,6 @@ class Satellites(AddedLight):
         )
 
 
-def build_satellites(plan: LightPlan) -> Iterator[Light]:
-    """The satellites of `light.satellites`; none without it. Raises InputError for an unreadable file."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.satellites:
-        elements = None
-        if file := light.satellites.file:
-            elements = read_elements(file)
-            check_epochs(file, elements, plan.scene.start_time)
-        yield Satellites(light.satellites, elements)
-
-
 # Sun, Moon and planets.
 
 
@@ -141,10 +112,3 @@ class SolarSystem(Light):
     def during(self, exposure: Exposure) -> Lit:
         bodies = bodies_from(self.config, exposure.observer, exposure.band)
         return Lit("Sun, Moon and planets", discs=tuple(bodies))
-
-
-def build_solar_system(plan: LightPlan) -> Iterator[Light]:
-    """The bodies of `light.bodies`; none without it."""
-    light = plan.scene.light
-    if isinstance(light, StarsConfig) and light.bodies:
-        yield SolarSystem(light.bodies)

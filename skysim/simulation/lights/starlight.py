@@ -1,6 +1,5 @@
 """Stars of a catalog, as seen from the ground or from an orbit, and extended light of the scene's `background`."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,20 +14,11 @@ from skysim.simulation.lights.light import (
     AddedLight,
     Exposure,
     KnownLight,
-    Light,
     LightPlan,
     Lit,
 )
 from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
-
-
-@dataclass(frozen=True)
-class FixedStars(KnownLight):
-    """Stars whose apparent places are constant during the scene."""
-
-    def during(self, exposure: Exposure) -> Lit:
-        return Lit("stars", True, self.sources, self.emitter)
 
 
 @dataclass(frozen=True)
@@ -86,7 +76,7 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
         velocity_m_s,
     )
     if viewpoint.orbit is None:
-        return FixedStars(shown, Emitter())
+        return KnownLight(shown, Emitter())
     return StarsInOrbit(shown, Emitter(), 1e3 * viewpoint.observer_at(0.0).velocity_km_s)
 
 
@@ -108,8 +98,3 @@ class BackgroundLight(AddedLight):
                 self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
             ),
         )
-
-
-def build(plan: LightPlan) -> Iterator[Light]:
-    """The light of the scene's section `background`."""
-    yield BackgroundLight(plan.scene.background)

@@ -38,9 +38,10 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     worker = Worker()
     info, view = worker.open("shefex2", {}, True, (40.0, 10.0, 5.0))
     assert view.result is not None
-    assert "identify with noise: solved" in log_panel.line(view, info)
-    assert f"error {view.result.cross_arcsec:.2f}″ across" in log_panel.line(view, info)
-    one = dict(zip(log_panel.COLUMNS, log_panel.row(view, info), strict=True))
+    line, row = log_panel.identification(view, info)
+    assert "identify with noise: solved" in line
+    assert f"error {view.result.cross_arcsec:.2f}″ across" in line
+    one = dict(zip(log_panel.COLUMNS, row, strict=True))
     np.testing.assert_allclose(
         [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
     )
@@ -48,7 +49,7 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
     assert not info.noise
-    assert "without noise" in log_panel.line(view, info)
+    assert "without noise" in log_panel.identification(view, info)[0]
     assert worker.workbench.frame is not None
     first = worker.workbench.frame.image_dn
     worker.render(False)

@@ -20,6 +20,7 @@ from skysim.scene.sections.surroundings import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.starlight import BackgroundLight
+from tests.helpers.changed_light import with_light, with_sources
 
 CONTROL = Control(mean_dn=100.0)
 GOOD = Observation(mean_dn=40.0, stars=12, overexposed=0)
@@ -135,7 +136,7 @@ def lab() -> Lab:
 def lit(lab: Lab, glare_e_s: float) -> Lab:
     """The lab with stray light from a body at the baffle's edge on the whole chip."""
     glow = (UniformGlowConfig(kind="uniform", e_s=glare_e_s),) if glare_e_s else ()
-    return lab.with_light(BackgroundLight(glow))
+    return with_light(lab, BackgroundLight(glow))
 
 
 def exposed(lab: Lab, time_s: float) -> Lab:
@@ -207,7 +208,7 @@ def test_one_planet_does_not_shorten_the_exposure_and_four_do(lab: Lab) -> None:
     for count, expected in ((1, 0.04), (6, 0.038)):
         strength = lab.camera.sources.strength.copy()
         strength[brightest[:count]] = 1e4 * strength[brightest[5]]
-        planets = lab.with_sources(replace(lab.camera.sources, strength=strength))
+        planets = with_sources(lab, replace(lab.camera.sources, strength=strength))
         states, seen = flown(planets, [0.0], 0.04, Control(mean_dn=150.0))
         assert seen[0].overexposed >= count
         assert states[0].time_s == pytest.approx(expected, abs=1e-9)

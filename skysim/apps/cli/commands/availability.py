@@ -66,7 +66,7 @@ def availability(
             "--off-deg, --around-deg", "have no effect with --law inertial", "--law zenith"
         )
     pointing = pointing_of(config, law, off_deg, around_deg)
-    with progress_callback("availability", quiet=json) as watch:
+    with progress_callback("availability") as watch:
         found = computed(config, pointing, SPANS_S[span], samples, watch)
     outside = found.outside(exclusion)
     available = np.all(list(outside.values()), axis=0)

@@ -26,8 +26,8 @@ from skysim.results.report import terminal_width
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
-    from skysim.scene.camera_sheet import Sheet
     from skysim.scene.opencv_calibration import OpencvCalibration
+    from skysim.scene.sections.camera import CameraConfig
 
 
 def complete_camera(incomplete: str) -> list[str]:
@@ -125,7 +125,7 @@ def camera_show(
 
     from skysim.scene import opencv_calibration
 
-    lens, body = read_camera(file, set_)
+    lens, chip = read_camera(file, set_)
     if lens is None and out:
         raise InputError(
             f"--out {out}", f"{file} has no lens", "--set camera.focal_length='16 mm'"
@@ -133,15 +133,13 @@ def camera_show(
     if lens is not None and out:
         write_file(out, opencv_calibration.text(lens))
     if json:
-        known = (
-            dataclasses.asdict(lens)
-            | {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
-            if lens
-            else {}
-        )
-        print_json(body | known)
+        known: dict[str, Any] = {"width_px": chip.width_px, "height_px": chip.height_px}
+        if lens:
+            known |= dataclasses.asdict(lens)
+            known |= {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
+        print_json(known)
         return
-    print("size             {width_px} x {height_px} px".format(**body))
+    print(f"size             {chip.width_px} x {chip.height_px} px")
     if lens is None:
         print("field of view    no lens: add --set camera.focal_length='16 mm'")
         return
@@ -161,8 +159,8 @@ def camera_show(
 
 def read_camera(
     name: str, overrides: list[str] | None
-) -> tuple[OpencvCalibration | None, dict[str, int]]:
-    """Calibration (None without a lens) and chip size of a scene, a camera file, a preset or an OpenCV file."""
+) -> tuple[OpencvCalibration | None, OpencvCalibration | CameraConfig]:
+    """Calibration (None without a lens) and size of a scene's camera, a camera file, a preset or an OpenCV file."""
     from skysim.core.yaml_reader import parse_overrides
     from skysim.scene import loader, opencv_calibration
 
@@ -174,7 +172,7 @@ def read_camera(
                 "a scene, a camera",
             )
         lens = opencv_calibration.read(Path(name))
-        return lens, {"width_px": lens.width_px, "height_px": lens.height_px}
+        return lens, lens
     values = parse_overrides(overrides)
     if not Path(name).suffix and name not in (
         known := loader.list_cameras() + loader.list_scenes()
@@ -191,10 +189,7 @@ def read_camera(
     has_lens = (
         not alone or "camera.focal_length" in values or "focal_length" in tree["camera"]
     )
-    return camera.calibration() if has_lens else None, {
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-    }
+    return camera.calibration() if has_lens else None, camera
 
 
 def asking(command: Callable[..., None]) -> Callable[..., None]:
@@ -249,8 +244,26 @@ def camera_new(
     write_file(out, camera_sheet.text(filled, name or out.stem))
     if json:
         print_json({"file": str(out), "missing": [one._asdict() for one in filled.missing]})
-    else:
-        print_new(out, filled)
+        return
+    lens, chip = read_camera(str(out), None)
+    field = f"; {lens.field_text()}" if lens else ""
+    print(f"{out}: {chip.width_px} x {chip.height_px} px{field}")
+    if filled.missing:
+        print(f"not stated, and assumed in {out}:")
+    width = min(max(terminal_width(), 40), 100)
+    for one in filled.missing:
+        name = one.name.replace("_", " ")
+        line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
+        print(
+            textwrap.fill(
+                line,
+                width,
+                initial_indent="  ",
+                subsequent_indent=" " * 21,
+                break_on_hyphens=False,
+            )
+        )
+    print(f"in a scene: camera: {{preset: {out}}}; skysim camera {out} shows it")
 
 
 def ask_all() -> dict[str, str]:
@@ -286,28 +299,3 @@ def ask_all() -> dict[str, str]:
             except InputError as error:
                 print_error(str(as_typed(error)))
     return answers
-
-
-def print_new(path: Path, filled: Sheet) -> None:
-    """Print the assumptions of a new camera file, and how to use it."""
-    lens, body = read_camera(str(path), None)
-    print(
-        "{path}: {width_px} x {height_px} px".format(path=path, **body)
-        + (f"; {lens.field_text()}" if lens else "")
-    )
-    if filled.missing:
-        print(f"not stated, and assumed in {path}:")
-    width = min(max(terminal_width(), 40), 100)
-    for one in filled.missing:
-        name = one.name.replace("_", " ")
-        line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
-        print(
-            textwrap.fill(
-                line,
-                width,
-                initial_indent="  ",
-                subsequent_indent=" " * 21,
-                break_on_hyphens=False,
-            )
-        )
-    print(f"in a scene: camera: {{preset: {path}}}; skysim camera {path} shows it")

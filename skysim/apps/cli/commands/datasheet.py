@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skysim.apps.cli.commands.study import Workers
 from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
@@ -17,7 +18,6 @@ from skysim.results.report_blocks import Column, Table, text_column
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames
-    from skysim.experiments.datasheet.model_fit import Agreement
 
 
 Quick = Annotated[
@@ -28,9 +28,6 @@ FieldCount = Annotated[
     typer.Option(
         help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.",
     ),
-]
-Processes = Annotated[
-    int | None, typer.Option(min=1, help="Number of processes; default: number of cores.")
 ]
 Folder = Annotated[
     Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
@@ -64,7 +61,7 @@ def datasheet(
     rates: Rates = None,
     seed: Seed = None,
     set_: Overrides = None,
-    workers: Processes = None,
+    workers: Workers = None,
     out: Folder = None,
     markdown: Annotated[Path | None, typer.Option(help="Also write a Markdown page.")] = None,
     model: ModelFolder = None,
@@ -155,14 +152,8 @@ def write_model(folder: Path | None, sheet: MeasuredFrames, fmu: bool, json: boo
     )
     if fmu:
         written.append(model_fit.write_fmu(folder))
-    if not json:
-        print_agreements(agreements)
-        for path in written:
-            print(path)
-
-
-def print_agreements(agreements: list[Agreement]) -> None:
-    """Print how well the model, fitted to each half of the fields, agrees with the other half."""
+    if json:
+        return
     rows = [[*one[:3], *one.p_values, *one[4:]] for one in agreements]
     heads = {
         "rate °/s": "g",
@@ -191,3 +182,5 @@ def print_agreements(agreements: list[Agreement]) -> None:
         " that the model of this half accepts."
     )
     print()
+    for path in written:
+        print(path)

@@ -150,8 +150,19 @@ def fly(
     with progress_callback("flying") as watch:
         for one in balance_procedure.balance(scene, plan, uncertainty, watch):
             flown.append(one)
-            if not json:
-                print_flight(balance_report.flight_row(len(flown), one))
+            if json:
+                continue
+            row = balance_report.flight_row(len(flown), one)
+            places = "/".join(f"{place:.3f}" for place in row["next_trim_mm"])
+            moves = row["next_trim_mm"] != row["trim_mm"]
+            moved = f"; trim masses to {places} mm" if moves else ""
+            after = row["after_contact"]
+            contact = f", {after} of them after a contact" if after else ""
+            print_wrapped(
+                f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
+                f" center of mass at {balance_report.offset_text(row)} um;"
+                f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
+            )
     return flown
 
 
@@ -162,22 +173,6 @@ def print_report(statistics: dict[str, Any], report: Report, json: bool) -> None
     else:
         report.print()
         print_wrapped(f"report: {statistics['report']}")
-
-
-def print_flight(row: dict[str, Any]) -> None:
-    """Print one flight: offset with its standard deviation, torque, next places of the trim masses."""
-    from skysim.experiments.balance_report import offset_text
-
-    places = "/".join(f"{one:.3f}" for one in row["next_trim_mm"])
-    moved = f"; trim masses to {places} mm" if row["next_trim_mm"] != row["trim_mm"] else ""
-    contact = (
-        f", {row['after_contact']} of them after a contact" if row["after_contact"] else ""
-    )
-    print_wrapped(
-        f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
-        f" center of mass at {offset_text(row)} um;"
-        f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
-    )
 
 
 def calibrate(
@@ -204,7 +199,7 @@ def calibrate(
     from skysim.experiments import home_calibration
 
     loaded = load(scene, None, seed, set_)
-    with progress_callback(loaded.title, quiet=json) as watch:
+    with progress_callback(loaded.title) as watch:
         known, frames = (
             home_calibration.measure_folder(images, loaded)
             if images
@@ -261,12 +256,11 @@ def characterize(
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
         given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        if conflict := next(
-            (name for name, value in given.items() if value is not None), None
-        ):
-            raise InputError(
-                f"--{conflict}", "has no effect with --frames-to", "one of the two"
-            )
+        for option, value in given.items():
+            if value is not None:
+                raise InputError(
+                    f"--{option}", "has no effect with --frames-to", "one of the two"
+                )
         write_simulated(config, frames_to, seed, json)
         return
     folders = characterize_camera.check_folders(darks, flats)

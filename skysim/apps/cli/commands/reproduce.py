@@ -45,18 +45,17 @@ def reproduce(
         print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
     page = out / "report.html"
-    chosen = [*([page] if report else []), *([markdown] if markdown else [])]
-    paths = [page_path(path) for path in chosen]
+    paths = [page_path(path) for path in (page if report else None, markdown) if path]
     from skysim.experiments.papers import reproduction
     from skysim.experiments.papers.papers_report import papers_report, section, verdict
 
     reproductions = []
     for id in reproduction.check_ids(ids):
-        with progress_callback(id, quiet=json) as watch:
-            options = reproduction.Options(quick, seed, watch)
-            reproductions.append(reproduction.reproduce(id, options))
+        with progress_callback(id) as watch:
+            done = reproduction.reproduce(id, reproduction.Options(quick, seed, watch))
+        reproductions.append(done)
         if not json:
-            print_blocks([section(reproductions[-1])])
+            print_blocks([section(done)])
     if paths:
         made = papers_report(reproductions, ids, quick, seed)
         for path in paths:

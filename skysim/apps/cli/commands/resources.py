@@ -70,6 +70,7 @@ def scenes_export(
     from skysim.core import files
     from skysim.results.files import gore_pages, templates
     from skysim.simulation.lab import build_lab
+    from skysim.sources.dome.layouts.led_list import led_list
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
@@ -82,7 +83,9 @@ def scenes_export(
         print(f"{path}: {count} pages; print them at 100 %")
         return
     if ending == ".csv":
-        text, cap_deg = lab.export_leds()
+        if not loaded.dome:
+            raise InputError("light.kind", f"{loaded.light.kind} has no list of LEDs", "dome")
+        text, cap_deg = led_list(loaded.dome, lab.camera.band, loaded.name)
         use = f"light.layout: {{kind: listed, cap_deg: {cap_deg}, file: {path}}}"
     elif ending in templates.TEMPLATES:
         text = templates.template(lab, ending)

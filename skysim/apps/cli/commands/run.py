@@ -63,10 +63,12 @@ def run(
     from skysim.simulation.flight import open_flight
 
     stages = selected_stages(
-        detector=detector, centroider=centroider, identifier=identifier, solver=solver
+        detector=detector,
+        centroider=centroider,
+        identifier=identifier,
+        solver=solver,
+        name=tracker,
     )
-    if tracker is not None:
-        stages["name"] = tracker
     loaded = load(
         scene,
         frames,
@@ -140,7 +142,6 @@ def render(
 
     loaded = load(scene, frames, seed, set_)
     folder = output_folder(out, loaded.name)
-    paths = list[str]()
     with open_flight(loaded) as flight:
         if warning := dome_warnings.camera_outside_warning(
             loaded, flight.lab.camera.mount, flight.lab.start
@@ -148,10 +149,10 @@ def render(
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
-            for shot in flight.shots(solves=False, progress=update):
-                paths.append(
-                    str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
-                )
+            paths = [
+                str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
+                for shot in flight.shots(solves=False, progress=update)
+            ]
     if json:
         terminal.print_json(paths)
     else:
@@ -184,7 +185,7 @@ def compare(
     recorder = None
     with (
         Flight(lab, UserParts(programs, tracker=entrants[tracker[0]])) as flight,
-        terminal.progress_callback(loaded.title, quiet=json) as update,
+        terminal.progress_callback(loaded.title) as update,
     ):
         for frame, truth, row_by_tracker in tracker_comparison.compare_frames(
             flight, entrants, update

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -15,7 +16,6 @@ from skysim.apps.cli.options import (
     Identifier,
     Json,
     SolverName,
-    datetime_from_iso,
     selected_stages,
 )
 from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
@@ -186,10 +186,16 @@ def solver_of(
         return plate_solver.make_dome_solver(dome, map_, stages)
     if map_ is not None:
         raise InputError("--map", "has no effect without --dome", "with --dome SCENE")
+    try:
+        time_utc = sky["time"] and datetime.datetime.fromisoformat(sky["time"])
+    except ValueError:
+        raise InputError(
+            f"--time {sky['time']}", "", "ISO 8601, e.g. 2012-06-22T21:00:00"
+        ) from None
     return plate_solver.make_solver(
         sky["fov"],
         sky["camera"],
-        datetime_from_iso(sky["time"]),
+        time_utc,
         stages,
         sky["catalog"],
         size_px=numbers("size", sky["size"], "x", 2, int),

@@ -105,8 +105,13 @@ def catalog_select(
     from skysim.sources import catalog
     from skysim.tracking.onboard_model import onboard_catalog
 
-    limits = {"bright": bright, "faintest": faintest, "north": north, "south": south}
-    options = {f"{name}_mag": limit for name, limit in limits.items()} | {"count": count}
+    options = {
+        "bright_mag": bright,
+        "faintest_mag": faintest,
+        "north_mag": north,
+        "south_mag": south,
+        "count": count,
+    }
     given = {name: value for name, value in options.items() if value is not None}
     known = list(inspect.signature(CATALOGS[rule]).parameters)[1:]
     if useless := [name for name in given if name not in known]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -314,20 +313,22 @@ def run_and_report(
 
     total = plan.study.trial_count(len(plan.points))
     resume_command = place.command("resume")
-    with (
-        store.writing(place.store) as stored,
-        interruptible(resume_command, stored),
-        closing(engine),
-    ):
-        runner.prepare_store(plan, stored, resumed, overrides)
-        if repeat_failed:
-            stored.delete_failed()
-        with trial_progress(plan.study.title, total) as update:
-            if plan.study.optimize is not None:
-                finished = search.search(plan, stored, engine, update).finished
-            else:
-                progress = runner.run(plan, stored, engine, update)
-                finished = progress.done == progress.trials
+    with store.writing(place.store) as stored, closing(engine):
+        try:
+            runner.prepare_store(plan, stored, resumed, overrides)
+            if repeat_failed:
+                stored.delete_failed()
+            with trial_progress(plan.study.title, total) as update:
+                if plan.study.optimize is not None:
+                    finished = search.search(plan, stored, engine, update).finished
+                else:
+                    progress = runner.run(plan, stored, engine, update)
+                    finished = progress.done == progress.trials
+        except KeyboardInterrupt:  # Ctrl-C or SIGTERM
+            print_error(
+                f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
+            )
+            raise
         counts = stored.counts()
     if not finished:
         print_error(
@@ -336,18 +337,6 @@ def run_and_report(
     if counts["failed"]:
         print_error(f"{counts['failed']} trials failed; list them: {place.command('status')}")
     write_report(plan, place, json, open_)
-
-
-@contextmanager
-def interruptible(resume_command: str, stored: Store) -> Iterator[None]:
-    """Within this context Ctrl-C and SIGTERM print the command that continues the run, and end it."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print_error(
-            f"{stored.counts()['done']} trials are stored; continue: {resume_command}"
-        )
-        raise
 
 
 def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
@@ -423,23 +412,6 @@ class Place(NamedTuple):
         return shell_command(*self, {}, verb)
 
 
-def located(study: str, out: Path | None) -> Place:
-    """The study's file and its output folder; `study` may also be the folder of its store. Raises InputError."""
-    folder = Path(study)
-    inside = Place(study, folder)
-    if out is not None or not inside.store.is_file():
-        return Place(study, out)
-    with inside.open() as stored:
-        file = stored.meta("file")
-    if not Path(file).is_file():
-        raise InputError(
-            study,
-            f"no such file as its study, {file or 'not stored'}",
-            f"STUDY --out {study}",
-        )
-    return Place(file, folder)
-
-
 def load_stored_plan(
     study: str,
     out: Path | None,
@@ -468,7 +440,19 @@ def load_stored_plan(
     from skysim.experiments.study.execution import runner
     from skysim.tracking import tracker_interface
 
-    place = located(study, out)
+    # The study's file, or the folder of its store.
+    place = Place(study, out)
+    inside = Place(study, Path(study))
+    if out is None and inside.store.is_file():
+        with inside.open() as stored:
+            file = stored.meta("file")
+        if not Path(file).is_file():
+            raise InputError(
+                study,
+                f"no such file as its study, {file or 'not stored'}",
+                f"STUDY --out {study}",
+            )
+        place = Place(file, Path(study))
     with place.open() as stored:
         overrides = stored.overrides() | parse_overrides(set_)
         plan = study_file.load(

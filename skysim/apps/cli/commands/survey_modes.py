@@ -30,6 +30,8 @@ from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
 
+SHOWN_STOPS = 12  # number of attitudes of a plan that are printed; the file has all
+
 
 @dataclass(frozen=True)
 class Request:
@@ -65,7 +67,7 @@ def plan_only(request: Request) -> dict[str, Any]:
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
     survey_procedure.write_plan(path, plan)
-    result = {
+    result: dict[str, Any] = {
         "scene": request.scene.name,
         "attitudes": survey_findings.stop_rows(plan.lab_from_body, plan.shown),
         "leds": plan.shown.shape[1],
@@ -78,8 +80,35 @@ def plan_only(request: Request) -> dict[str, Any]:
         "tilt_deg": request.tilt_deg,
         "plan": str(path),
     }
-    if not request.quiet:
-        print_plan(result)
+    if request.quiet:
+        return result
+    print_table(survey_report.stop_table(result["attitudes"][:SHOWN_STOPS]))
+    if len(result["attitudes"]) > SHOWN_STOPS:
+        print(f"... {len(result['attitudes'])} attitudes in all, in {result['plan']}")
+    print()
+    heads = ("LED place mm", "lever mm", "focal length px")
+    columns = [
+        Column("frames"),
+        text_column("LEDs measured"),
+        *(Column(head, format=".3g") for head in heads),
+    ]
+    keys = ("led_mm", "lever_mm", "focal_px")
+    rows = [
+        [
+            row["frames"],
+            "{} ({} to {})".format(row["measured"], *row["measured_range"]),
+            *(row[key] for key in keys),
+        ]
+        for row in result["predicted"]
+    ]
+    table = Table(columns, rows)
+    print_table(
+        table,
+        f"predicted errors (1σ) of {result['leds']} LEDs, centroids to {result['noise_px']:.2g} px",
+    )
+    print_wrapped(
+        f"{result['out_of_reach']} of {result['leds']} LEDs are out of reach of a tilt of {result['tilt_deg']:g}°"
+    )
     return result
 
 
@@ -93,7 +122,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     failures = [one for one in results if isinstance(one, InputError)]
     if not errors:
         raise failures[0]
-    result = {
+    result: dict[str, Any] = {
         "scene": request.scene.name,
         "frames": len(plan.shown),
         "surveys": repeat,
@@ -102,8 +131,25 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
         "false_alarms": sum(one.false_alarms for one in errors),
         "failures": [str(one) for one in failures],
     }
-    if not request.quiet:
-        print_comparison(result)
+    if request.quiet:
+        return result
+    columns = [
+        text_column("what"),
+        Column("predicted", format=".3g"),
+        Column("simulated", format=".3g"),
+        Column("ratio"),
+    ]
+    rows = []
+    for row in result["rows"]:
+        ratio = row["ratio"] and f"{row['ratio']:.2f} ± {row['ratio_sigma']:.2f}"
+        rows.append([row["what"], row["predicted"], row["simulated"], ratio])
+    print_table(Table(columns, rows))
+    print_wrapped(
+        f"{len(result['measured'])} surveys of {result['frames']} frames, {min(result['measured'])} to"
+        f" {max(result['measured'])} LEDs measured; {result['false_alarms']} faults reported, of none"
+    )
+    for failure in result["failures"]:
+        print_wrapped(f"one more survey failed: {failure}")
     return result
 
 
@@ -296,56 +342,3 @@ def write_report(
 
 
 # Terminal output of `--plan` and `--repeat`: the attitudes to hold, predicted and simulated errors.
-
-
-SHOWN_STOPS = 12  # number of attitudes of a plan that are printed; the file has all
-
-
-def print_plan(plan: dict[str, Any]) -> None:
-    print_table(survey_report.stop_table(plan["attitudes"][:SHOWN_STOPS]))
-    if len(plan["attitudes"]) > SHOWN_STOPS:
-        print(f"... {len(plan['attitudes'])} attitudes in all, in {plan['plan']}")
-    print()
-    heads = ("LED place mm", "lever mm", "focal length px")
-    columns = [
-        Column("frames"),
-        text_column("LEDs measured"),
-        *(Column(head, format=".3g") for head in heads),
-    ]
-    keys = ("led_mm", "lever_mm", "focal_px")
-    rows = [
-        [
-            row["frames"],
-            "{} ({} to {})".format(row["measured"], *row["measured_range"]),
-            *(row[key] for key in keys),
-        ]
-        for row in plan["predicted"]
-    ]
-    table = Table(columns, rows)
-    print_table(
-        table,
-        f"predicted errors (1σ) of {plan['leds']} LEDs, centroids to {plan['noise_px']:.2g} px",
-    )
-    print_wrapped(
-        f"{plan['out_of_reach']} of {plan['leds']} LEDs are out of reach of a tilt of {plan['tilt_deg']:g}°"
-    )
-
-
-def print_comparison(result: dict[str, Any]) -> None:
-    columns = [
-        text_column("what"),
-        Column("predicted", format=".3g"),
-        Column("simulated", format=".3g"),
-        Column("ratio"),
-    ]
-    rows = []
-    for row in result["rows"]:
-        ratio = row["ratio"] and f"{row['ratio']:.2f} ± {row['ratio_sigma']:.2f}"
-        rows.append([row["what"], row["predicted"], row["simulated"], ratio])
-    print_table(Table(columns, rows))
-    print_wrapped(
-        f"{len(result['measured'])} surveys of {result['frames']} frames, {min(result['measured'])} to"
-        f" {max(result['measured'])} LEDs measured; {result['false_alarms']} faults reported, of none"
-    )
-    for failure in result["failures"]:
-        print_wrapped(f"one more survey failed: {failure}")

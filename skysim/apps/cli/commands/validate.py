@@ -25,8 +25,6 @@ from skysim.apps.cli.options import (
 from skysim.apps.cli.terminal import print_check, print_error, print_json
 from skysim.core.errors import InputError
 
-KINDS = ("scene", "study")
-
 
 class FileVerdict(NamedTuple):
     """Result for one file: a description and warnings, or `fault`, the error in one line."""
@@ -55,10 +53,10 @@ def validate(
 ) -> None:
     """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
     if schema is not None:
-        if schema not in KINDS:
-            raise InputError(f"--schema {schema}", "", ", ".join(KINDS))
         from skysim.apps.cli import json_schema
 
+        if schema not in json_schema.KINDS:
+            raise InputError(f"--schema {schema}", "", ", ".join(json_schema.KINDS))
         print_json(json_schema.json_schema(schema))
         return
     if not files:

@@ -88,11 +88,6 @@ class Head:
         self.banner.set_text(state.banner, state.kind)
         self.live_button.set_visibility(state.kind != "live")
 
-    def set_message(self, text: str, color: str) -> None:
-        self.message.props["title"] = text  # tooltip with the full text
-        self.message.set_text(text)
-        self.message.classes(remove="good warn quiet", add=color)
-
     # Actions.
 
     async def go_live(self) -> None:

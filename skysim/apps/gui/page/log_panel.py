@@ -59,8 +59,9 @@ class LogPanel:
 
     def identified(self, view: FrameView, info: SceneInfo) -> None:
         """Log an identification with its attitude and error."""
-        self.add(line(view, info))
-        self.rows = [*self.rows[1 - MAX_ROWS :], row(view, info)]
+        text, row = identification(view, info)
+        self.add(text)
+        self.rows = [*self.rows[1 - MAX_ROWS :], row]
         self.button.set_enabled(True)
 
     def download(self) -> None:
@@ -69,26 +70,21 @@ class LogPanel:
         )
 
 
-def line(view: FrameView, info: SceneInfo) -> str:
-    """An identification as a line of text."""
-    noise = "with" if info.noise else "without"
-    result = view.result
-    if result is None or result.angles_deg is None:
-        return f"identify {noise} noise: {result.status if result else 'no result'}"
-    counts = f"{result.identified} of {len(result.detections)}"
-    angles = "  ".join(
-        f"{name} {angle:.4f}°"
-        for name, angle in zip(info.names, result.angles_deg, strict=True)
-    )
-    errors = f"error {result.cross_arcsec:.2f}″ across, {result.roll_arcsec:+.1f}″ about the boresight"
-    return f"identify {noise} noise: {result.status}, {counts}; {angles}; {errors}"
-
-
-def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
-    """An identification as values of COLUMNS; None or NaN where there is no solution."""
+def identification(view: FrameView, info: SceneInfo) -> tuple[str, tuple[Any, ...]]:
+    """An identification as a line of text, and as values of COLUMNS; None or NaN where there is no solution."""
     result = view.result
     assert result is not None
-    return (
+    text = f"identify {'with' if info.noise else 'without'} noise: {result.status}"
+    if result.angles_deg is not None:
+        angles = "  ".join(
+            f"{name} {angle:.4f}°"
+            for name, angle in zip(info.names, result.angles_deg, strict=True)
+        )
+        text += (
+            f", {result.identified} of {len(result.detections)}; {angles}; error {result.cross_arcsec:.2f}″ across,"
+            f" {result.roll_arcsec:+.1f}″ about the boresight"
+        )
+    row = (
         time.strftime("%H:%M:%S"),
         info.scene.name,
         info.noise,
@@ -104,3 +100,4 @@ def row(view: FrameView, info: SceneInfo) -> tuple[Any, ...]:
         *result.sigma_arcsec,
         result.wrong,
     )
+    return text, row

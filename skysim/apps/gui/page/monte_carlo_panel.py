@@ -3,6 +3,7 @@
 import math
 import signal
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -175,10 +176,21 @@ class MonteCarloPanel:
             started = await self.start_process()
         finally:
             self.starting = False
-        if started:
-            fault = await self.process.wait()
-            if self.page.is_open:
-                self.show_end("" if self.stopped else fault)
+        if not started:
+            return
+        fault = await self.process.wait()
+        if not self.page.is_open:
+            return
+        self.button.set_text("Start")
+        results = self.process.results()
+        if results:
+            self.show(results)
+        done = results.done if results else 0
+        if fault and not self.stopped:
+            self.page.show_message(fault)
+        self.show_count(done)
+        self.page.log(f"study ended: {done} of {self.process.total} trials")
+        self.list_reports()
 
     async def start_process(self) -> bool:
         """Start the process of the chosen study; return whether it has started."""
@@ -241,7 +253,15 @@ class MonteCarloPanel:
         if not (self.count.value and 1 <= self.count.value <= 100_000):
             raise InputError("runs", "", "1 to 100000")
         scene = forms.absolute_path(self.page.state.scene)
-        settings = scene, self.effective_overrides(scene, trial), trial, int(self.count.value)
+        # A study with changes of the scene that have no effect on a trial would be refused.
+        overrides = dict(self.page.state.overrides)
+        with suppress(ValidationError):  # the study's loader reports it in one line
+            section = TrialSection.model_validate({"trial": trial})
+            for key in unused_options.unused_overrides(
+                overrides, load(scene, overrides), section.trial
+            ):
+                del overrides[key]
+        settings = scene, overrides, trial, int(self.count.value)
         # A stopped run with unchanged settings is resumed from its own file.
         before = self.process.folder / "monte_carlo.yaml"
         if (
@@ -257,30 +277,6 @@ class MonteCarloPanel:
         path = folder / "monte_carlo.yaml"
         files.write_text(path, monte_carlo(*settings, self.run_number))
         return path
-
-    def effective_overrides(self, scene: str, trial: dict[str, Any]) -> dict[str, str]:
-        """The changes of the scene that have an effect on a trial; a study with others would be refused."""
-        overrides = dict(self.page.state.overrides)
-        try:
-            section = TrialSection.model_validate({"trial": trial})
-        except ValidationError:  # the study's loader reports it in one line
-            return overrides
-        unused = unused_options.unused_overrides(
-            overrides, load(scene, overrides), section.trial
-        )
-        return {key: text for key, text in overrides.items() if key not in unused}
-
-    def show_end(self, fault: str) -> None:
-        self.button.set_text("Start")
-        results = self.process.results()
-        if results:
-            self.show(results)
-        done = results.done if results else 0
-        if fault:
-            self.page.show_message(fault)
-        self.show_count(done)
-        self.page.log(f"study ended: {done} of {self.process.total} trials")
-        self.list_reports()
 
     async def show_study(self, name: str) -> None:
         """Show the results of a study of the page's folder, as after a reload; a stopped one can be continued."""

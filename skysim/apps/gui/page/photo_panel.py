@@ -8,7 +8,6 @@ from nicegui import ui
 
 from skysim.apps.gui.views import context, widgets
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
-from skysim.scene.sections.light import StarsConfig
 
 LIMIT_BYTES = 64 * 2**20
 
@@ -99,7 +98,7 @@ class PhotoPanel:
     def stages(self) -> Stages:
         """The algorithms that the user has chosen for stars; a dome's do not solve photographs."""
         info = self.page.scene_info
-        chosen = info.stages if info and isinstance(info.scene.light, StarsConfig) else {}
+        chosen = info.stages if info and info.scene.stars else {}
         return tuple((stage, name) for stage, name in chosen.items() if name != "default")
 
     def stop(self) -> None:

@@ -1,7 +1,5 @@
 """Plan panel: the scene's check, ambiguous fields on the dome, and attitudes of a survey, which can be flown."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -192,8 +190,7 @@ class PlanPanel:
     async def plan_survey(self) -> None:
         """Begin a new survey: plan its first attitudes."""
         with self.working():
-            question = f"A new survey forgets the {self.taken} frames of this one."
-            if self.taken and not await confirmed(question, "Begin anew"):
+            if self.taken and not await self.confirmed():
                 return
             found: SurveyPlan | None = await self.page.run_task(
                 "plan_survey", int(self.frames.value or 0), activity="planning the survey …"
@@ -201,6 +198,18 @@ class PlanPanel:
             if found is not None:
                 self.clear_survey()
                 self.show_survey([prediction_text(found)], found)
+
+    async def confirmed(self) -> bool:
+        """Ask the user to confirm that a new survey loses the frames of this one."""
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"A new survey forgets the {self.taken} frames of this one.")
+            with ui.row():
+                widgets.button("Begin anew", partial(dialog.submit, True))
+                widgets.button("Cancel", partial(dialog.submit, False), look="flat")
+        answer = await dialog
+        if not dialog.is_deleted:
+            dialog.delete()
+        return bool(answer)
 
     async def adjust(self) -> None:
         """Adjust the dome to the frames flown; show the results and the attitudes to hold next."""
@@ -266,25 +275,6 @@ class PlanPanel:
         data: bytes | None = await self.page.run_task("survey_map")
         if data is not None:
             ui.download(data, f"{Path(self.page.state.scene).stem}_leds.ecsv")
-
-
-async def confirmed(question: str, action: str) -> bool:
-    """Ask the user to confirm an action that loses something.
-
-    Parameters
-    ----------
-    action
-        Label of the button that confirms
-    """
-    with ui.dialog() as dialog, ui.card():
-        ui.label(question)
-        with ui.row():
-            widgets.button(action, partial(dialog.submit, True))
-            widgets.button("Cancel", partial(dialog.submit, False), look="flat")
-    answer = await dialog
-    if not dialog.is_deleted:
-        dialog.delete()
-    return bool(answer)
 
 
 def ambiguity_text(found: AmbiguityMap) -> str:

@@ -97,10 +97,8 @@ class AttitudeCard:
             if field.props.get("placeholder", "") != placeholder:
                 field.props["placeholder"] = placeholder
                 field.update()
-        self.show_result(image.result)
-
-    def show_result(self, result: TrackerResult | None) -> None:
-        """Display the tracker's angles, errors and status; dashes without a solution."""
+        # Dashes without a solution.
+        result = image.result
         if result is None or result.angles_deg is None:
             for label in (*self.estimates, *self.errors):
                 label.set_text("–")

@@ -194,7 +194,15 @@ class RunPanel:
         self.clear()
         self.simulate_button.set_text("Stop")
         self.page.show_message("")
-        done = await self.compute()
+        # Piece by piece, so that keys and other requests get their turn.
+        step = await self.page.ask("begin_flight")
+        while step is not None and not step.is_done and not self.stopping:
+            self.take(step)
+            step = await self.page.ask("advance_flight", BUDGET_S)
+        if step is not None:
+            self.take(step)
+        self.stopping = False
+        done = step is not None and step.is_done
         if not self.page.is_open:
             return
         self.computing = False
@@ -212,17 +220,6 @@ class RunPanel:
                 self.when_shown()
         elif self.rows and self.plays_when_done and done:
             self.start()
-
-    async def compute(self) -> bool:
-        """Compute piece by piece, so that keys and other requests get their turn; return whether all was computed."""
-        step = await self.page.ask("begin_flight")
-        while step is not None and not step.is_done and not self.stopping:
-            self.take(step)
-            step = await self.page.ask("advance_flight", BUDGET_S)
-        if step is not None:
-            self.take(step)
-        self.stopping = False
-        return step is not None and step.is_done
 
     def take(self, step: FlightStep) -> None:
         """Add new rows, residuals and curves of the flight."""

@@ -278,28 +278,18 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
 def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
     if strip.dots:
-        return axis | {"min": 0, "max": round_up(max(dot[1] for dot in strip.dots))}
-    return axis | (
-        decades([y for curve in strip.drawn for _, y in curve.points])
-        if strip.logarithmic
-        else {}
-    )
-
-
-def round_up(value: float) -> float:
-    """The next greater of 1, 2, 5, 10, ... times a power of ten."""
-    decade = 10.0 ** math.floor(math.log10(max(value, 1e-6)))
-    return float(
-        f"{next(step * decade for step in (1, 2, 5, 10) if step * decade >= value):.6g}"
-    )
-
-
-def decades(values: list[float]) -> dict[str, float]:
-    """Axis limits: whole decades that contain the values, at most the uppermost four."""
-    positive = [value for value in values if value > 0] or [1.0]
-    low = math.floor(math.log10(min(positive)))
-    high = math.ceil(math.log10(max(positive)))
-    return {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
+        # The next greater of 1, 2, 5, 10 times a power of ten.
+        most = max(dot[1] for dot in strip.dots)
+        decade = 10.0 ** math.floor(math.log10(max(most, 1e-6)))
+        end = next(step * decade for step in (1, 2, 5, 10) if step * decade >= most)
+        return axis | {"min": 0, "max": float(f"{end:.6g}")}
+    if strip.logarithmic:
+        # Whole decades that contain the values, at most the uppermost four.
+        values = [y for curve in strip.drawn for _, y in curve.points if y > 0] or [1.0]
+        low = math.floor(math.log10(min(values)))
+        high = math.ceil(math.log10(max(values)))
+        return axis | {"min": 10.0 ** max(low, high - 4), "max": 10.0 ** max(high, low + 1)}
+    return axis
 
 
 def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:

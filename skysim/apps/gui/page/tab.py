@@ -450,7 +450,10 @@ class Tab:
         if text == self.message_text:
             return
         self.message_text = text
-        self.head.set_message(text, color)
+        label = self.head.message
+        label.props["title"] = text  # tooltip with the full text
+        label.set_text(text)
+        label.classes(remove="good warn quiet", add=color)
         if text and color == "warn":
             self.log(text)
 

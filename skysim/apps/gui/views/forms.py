@@ -266,7 +266,7 @@ def with_kind(
 ) -> dict[str, str]:
     """Overrides that change a section's kind: to that of the file, or to another with the keys that it requires.
 
-    Keys that both kinds have, with the same type, keep their values; sections do not.
+    Keys that both kinds have keep their values if the new kind allows all of them; sections do not.
     """
     rest = {
         key: text
@@ -282,13 +282,9 @@ def with_kind(
     now = section_at(load(name, overrides), section)[1]
     kept = {
         info.alias or field: file_value(getattr(now, field), si_unit(field))
-        for field, info in (
-            type(now).model_fields.items() if isinstance(now, BaseModel) else ()
-        )
-        if field != "kind"
-        and field in now.model_fields_set
-        and field in model.model_fields
-        and model.model_fields[field].annotation == info.annotation
+        for field, info in model.model_fields.items()
+        if field in getattr(now, "model_fields_set", ())
+        and field != "kind"
         and not models(info.annotation)
     }
     found = first_section(model, kind, kept) or first_section(model, kind)

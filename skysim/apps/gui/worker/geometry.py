@@ -16,7 +16,7 @@ from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
 from skysim.results import scoring
 from skysim.scene.scene import Scene
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
+from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.scene.sections.motion import AttitudeConfig
 from skysim.simulation.lab import Lab
 from skysim.simulation.timing import MARGIN_S, exposure_window
@@ -81,12 +81,11 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
     Each is a place, a target and the direction up, in the lab frame, or in body axes if the place is on the vehicle;
     the vertical field of view, deg; and whether it is on the vehicle.
     """
-    camera = lab.scene.camera
     mount = lab.camera.mount
     body_from_cam = mount.cam_from_body.inv()
     pupil_m = mount.camera_body_m
     height_m = np.linalg.norm(model.eye_m - model.target_m)
-    field_deg = 2 * math.degrees(math.atan(camera.height_px / 2 / camera.focal_px))
+    field_deg = lab.scene.camera.calibration().field_deg[1]
     up = np.array([0.0, 0.0, 1.0])
     north = np.array([0.0, 1.0, 0.0])
     ahead = body_from_cam.apply([0.0, 0.0, 1.0])
@@ -122,12 +121,13 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
     """The true attitude of a frame's camera; under a dome also where its rays meet the surface."""
     lab_from_cam = truth.cam_from_lab.inv()
     rotation = lab_from_cam.as_matrix().ravel()
-    if not isinstance(lab.scene.light, DomeConfig):
+    light = lab.scene.dome
+    if light is None:
         return Pose(rotation)
     place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
     rays_cam = np.column_stack([lens.x, lens.y, np.ones(len(lens.x))])
     length = np.linalg.norm(rays_cam, axis=1)
-    dome = surface.build_surface(lab.scene.light.surface)
+    dome = surface.build_surface(light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
     # Depths along the boresight, to 0.01 mm; NaN where a ray meets nothing.
     depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
@@ -165,7 +165,7 @@ def from_angles(
         low, high = RANGES[name]
         if not (math.isfinite(angle) and low <= angle <= high):
             raise InputError(name, f"{angle:g} deg is not allowed", f"{low:g} to {high:g}")
-    if isinstance(scene.light, StarsConfig):
+    if scene.stars:
         return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
     roll, pitch, yaw = angles_deg
     start = AttitudeConfig.model_validate(
@@ -187,10 +187,9 @@ def moved(
     The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
     beyond the tilt stop.
     """
-    camera = scene.camera
-    field_rad = 2 * math.atan(camera.width_px / 2 / camera.focal_px)
-    rotation_vector = np.array([up * field_rad, right * field_rad, math.radians(roll_deg)])
-    new_from_cam = Rotation.from_rotvec(rotation_vector).inv()
+    field_deg = scene.camera.calibration().field_deg[0]
+    turn_deg = [up * field_deg, right * field_deg, roll_deg]
+    new_from_cam = Rotation.from_rotvec(turn_deg, degrees=True).inv()
     cam_from_lab = new_from_cam * mount.cam_from_body * lab_from_body.inv()
     return within_stop(scene, cam_from_lab.inv() * mount.cam_from_body)
 
@@ -241,7 +240,14 @@ class Push:
     """
 
     def __init__(self, lab: Lab, lab_from_body: Rotation) -> None:
-        require_vehicle(lab.scene)
+        if isinstance(lab.scene.light, CollimatedDisplayConfig):
+            raise InputError(
+                "", "the camera of this scene is on a bench: there is no vehicle to push"
+            )
+        if lab.scene.motion.is_prescribed:
+            raise InputError(
+                "", "the motion of this scene is prescribed: its vehicle cannot be pushed"
+            )
         self.lab = lab
         window = exposure_window(lab.scene, 0)
         self.start_s = window.open_s - MARGIN_S
@@ -299,15 +305,3 @@ def pull_torque_nm(
     return np.asarray(
         stiffness * moment / max(held @ held, float(np.linalg.norm(moment)), 1e-9)
     )
-
-
-def require_vehicle(scene: Scene) -> None:
-    """Raise InputError for a scene whose vehicle does not move by dynamics."""
-    if isinstance(scene.light, CollimatedDisplayConfig):
-        raise InputError(
-            "", "the camera of this scene is on a bench: there is no vehicle to push"
-        )
-    if scene.motion.is_prescribed:
-        raise InputError(
-            "", "the motion of this scene is prescribed: its vehicle cannot be pushed"
-        )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import TrackerResult, places_px
 from skysim.apps.gui.worker.photo import Photo
-from skysim.apps.gui.worker.workbench import Workbench
+from skysim.apps.gui.worker.workbench import Workbench, tracker_result
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.images import TOP_DOWN_CARD
@@ -51,7 +51,14 @@ def frame_files(
         }
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
-    if result := workbench.result:
+    if workbench.report:
+        result = tracker_result(
+            workbench.lab,
+            workbench.estimator,
+            workbench.frame,
+            workbench.truth,
+            workbench.report,
+        )
         contents["solution.json"] = file_io.to_json(solution_record(result)).encode()
     contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
     return contents

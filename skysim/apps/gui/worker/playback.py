@@ -16,7 +16,6 @@ from skysim.apps.gui.messages import (
     FlightRow,
     FlightStep,
     FrameView,
-    TrackerResult,
 )
 from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
@@ -26,7 +25,6 @@ from skysim.results import telemetry_report
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.timing import exposure_window
 
-NO_RESULT = TrackerResult("", (), 0.0)  # result for a frame that was not solved
 MAX_POINTS = 500  # approximate maximum number of points of a curve on the page
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
 # Maximum size of the frames in the file; further frames are rendered again when they are shown.
@@ -147,7 +145,8 @@ class Playback:
 def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
     """A frame of a flight in numbers, with those of the attitude filter from the flight's telemetry."""
     view = kept.view
-    result = view.result or NO_RESULT
+    result = view.result
+    assert result is not None  # every frame of a flight is solved
     cross_sigma, roll_sigma = result.sigma_arcsec
     errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     filter_arcsec = innovation_arcsec = math.nan

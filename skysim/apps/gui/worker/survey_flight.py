@@ -85,7 +85,16 @@ class Survey:
         allow(count)
         new, missed = self.new_frames(flight, views)
         taken = [*self.taken, *new]
-        frames = self.with_imu(taken)
+        # Frames with the IMU's attitudes.
+        measured = survey_frames.imu_attitudes(
+            self.scene,
+            Rotation.concatenate([frame.lab_from_body for frame in taken]),
+            UNCERTAINTY.imu_sigma_rad,
+        )
+        frames = [
+            survey_frames.SurveyFrame(frame.lights, at, frame.row)
+            for frame, at in zip(taken, measured, strict=True)
+        ]
         try:
             run = adjust.run_survey(frames, self.before, UNCERTAINTY)
             refusal = ""
@@ -105,7 +114,12 @@ class Survey:
             statistics["connected"] = int(run.survey.tied.sum())
             statistics["sigma_mm"] = 1e3 * run.accuracy.led_rms_m
             faults += survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
-        plan = self.next_plan(so_far, len(taken), count)
+        # Attitudes to hold next.
+        further = survey_findings.next_stops(
+            self.scene, so_far, self.before.margin_px, count, tilt_deg(self.scene)
+        )
+        step = plan_step(len(taken) + len(further.shown), further.accuracy)
+        plan = survey_plan(further.lab_from_body, further.shown, (step,))
         self.taken = taken
         self.run = run or self.run
         return SurveyFound(statistics, faults, so_far.model.leds.id, known_share(run), plan)
@@ -141,27 +155,6 @@ class Survey:
             lights = survey_frames.detect_lights(settings, camera, frame.image_dn)
             new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
         return new, holds - len(rows)
-
-    def with_imu(self, taken: Sequence[TakenFrame]) -> list[survey_frames.SurveyFrame]:
-        """Frames with the IMU's attitudes."""
-        lab_from_body = Rotation.concatenate([frame.lab_from_body for frame in taken])
-        measured = survey_frames.imu_attitudes(
-            self.scene, lab_from_body, UNCERTAINTY.imu_sigma_rad
-        )
-        return [
-            survey_frames.SurveyFrame(frame.lights, at, frame.row)
-            for frame, at in zip(taken, measured, strict=True)
-        ]
-
-    def next_plan(
-        self, so_far: survey_findings.Coverage, taken: int, count: int
-    ) -> SurveyPlan:
-        """Attitudes to hold after the frames taken so far."""
-        further = survey_findings.next_stops(
-            self.scene, so_far, self.before.margin_px, count, tilt_deg(self.scene)
-        )
-        step = plan_step(taken + len(further.shown), further.accuracy)
-        return survey_plan(further.lab_from_body, further.shown, (step,))
 
     def map_file(self) -> bytes:
         """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""

@@ -112,10 +112,10 @@ class Worker:
 
     @property
     def levels(self) -> pixels.PixelLevels:
-        """The newest frame of the workbench. Raises InputError if there is none."""
-        if self.workbench.frame is None:
-            raise InputError("", "no frame has been rendered")
-        return pixels.levels_of(self.workbench.frame.image_dn)
+        """The newest frame of the workbench."""
+        frame = self.workbench.frame
+        assert frame is not None
+        return pixels.levels_of(frame.image_dn)
 
     # Tasks.
 

@@ -28,7 +28,6 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
-from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
@@ -41,6 +40,7 @@ from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory, onboard_model
 
 STAGES = ("detector", "centroider", "identifier", "solver")
+MAX_WINDOWS = 200
 
 
 @dataclass
@@ -112,17 +112,17 @@ class Workbench:
     def scene_info(self) -> SceneInfo:
         """Properties of the scene for the page."""
         scene = self.scene
-        camera = scene.camera
+        lens = scene.camera.calibration()
         settings = factory.assumed_settings(scene)
         return SceneInfo(
             scene,
             scoring.angle_names(scene),
             id_prefix(self.lab),
-            2 * math.degrees(math.atan(camera.width_px / 2 / camera.focal_px)),
-            1 / camera.focal_px / ARCSEC_RAD,
+            lens.field_deg[0],
+            lens.arcsec_px,
             {name: getattr(settings, name) for name in STAGES},
             self.lab.duration_s,
-            camera.detector.noise,
+            scene.camera.detector.noise,
             self.geometry,
             self.lens,
         )
@@ -138,13 +138,6 @@ class Workbench:
         """The lab of the next run, with independent noise."""
         self.rendered_count += 1
         return self.lab.in_run(self.scene.seed + self.rendered_count)
-
-    @property
-    def result(self) -> TrackerResult | None:
-        """The tracker's solution of the newest frame; None if it was not solved."""
-        if self.frame is None or self.truth is None or self.report is None:
-            return None
-        return tracker_result(self.lab, self.estimator, self.frame, self.truth, self.report)
 
     def render(self, camera: StarCamera, trajectory: Trajectory, solve: bool) -> FrameView:
         """Render frame 0 of a camera in motion, solve it if `solve`, and return the view for the page."""
@@ -217,6 +210,12 @@ def tracker_result(
 ) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
     row = scoring.row(lab.camera, frame, truth, report)
+    # Lights in the field: tracking mode would search at their places in the next frame.
+    windows_px: list[tuple[float, float]] = []
+    if report.attitude.solved and not isinstance(estimator, factory.UserTracker):
+        _, xy_px = predicted_lights(estimator, report.attitude)
+        inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
+        windows_px = [(x, y) for x, y in xy_px[inside][:MAX_WINDOWS].tolist()]
     return TrackerResult(
         row.status,
         detections_of(estimator, report),
@@ -226,7 +225,7 @@ def tracker_result(
         row.roll_arcsec,
         (row.cross_sigma_arcsec, row.roll_sigma_arcsec),
         row.wrong,
-        search_windows_px(estimator, report.attitude),
+        tuple(windows_px),
     )
 
 
@@ -268,17 +267,6 @@ def predicted_lights(
     return estimator.stars.id, camera.pixels(
         attitude.cam_from_ref.apply(estimator.stars.vectors)
     )
-
-
-def search_windows_px(
-    estimator: factory.Estimator, attitude: Attitude
-) -> tuple[tuple[float, float], ...]:
-    """Predicted pixels of up to 200 lights in the field: where tracking mode would search in the next frame."""
-    if attitude.cam_from_ref is None or isinstance(estimator, factory.UserTracker):
-        return ()
-    _, xy_px = predicted_lights(estimator, attitude)
-    inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
-    return tuple((float(x), float(y)) for x, y in xy_px[inside][:200])
 
 
 def ambiguity(lab: Lab) -> AmbiguityMap:
