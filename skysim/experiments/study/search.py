@@ -164,9 +164,7 @@ class InvalidScene(Exception):
 
 def check(study: Study) -> None:
     """Validate section `optimize` of a study. Raises InputError with the key at fault."""
-    config = study.optimize
-    if config is None:
-        return
+    config = study.search
     if not study.factors:
         raise InputError("factors", "missing: the search chooses their levels", "one or more")
     for n, objective in enumerate(config.objectives):
@@ -190,12 +188,6 @@ def check(study: Study) -> None:
                 "levels, values, from and to",
             )
     check_cost(study.factors, config.cost)
-    trials = config.candidates * study.replicates
-    budget = study.budget.trials
-    if budget is not None and trials > budget:
-        raise InputError(
-            "budget.trials", budget, f"at least {trials}, the trials of the search"
-        )
 
 
 def check_response(response: str, where: str) -> None:

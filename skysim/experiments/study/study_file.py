@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -189,11 +188,13 @@ def check(plan: Plan, to_run: bool) -> None:
         if study.require:
             raise InputError("require", "has no effect in a search", "optimize.constraints")
         search.check(study)
-    if study.budget.trials is not None and plan.trials > study.budget.trials:
+    trials = study.trial_count(len(plan.points))
+    if study.budget.trials is not None and trials > study.budget.trials:
+        whole = "search" if study.optimize else "study"
         raise InputError(
             "budget.trials",
             study.budget.trials,
-            f"at least {plan.trials}, the trials of the study",
+            f"at least {trials}, the trials of the {whole}",
         )
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
@@ -217,7 +218,7 @@ def check(plan: Plan, to_run: bool) -> None:
     check_measured(
         study, {point.trial.kind for point in points}, [point.scene for point in points]
     )
-    unused_options.check(plan, points, partial(resolve_point, plan.spec))
+    unused_options.check(plan, points)
 
 
 def check_figures(plan: Plan) -> None:
