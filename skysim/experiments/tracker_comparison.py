@@ -119,8 +119,6 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     right = [row for row in rows if row.status == SOLVED and not row.wrong]
     unsolved = Counter(row.status for row in rows if row.status != SOLVED)
     failed = sum(count for status, count in unsolved.items() if status.startswith(FAILED))
-    cross = np.array([row.cross_arcsec for row in right] or [np.nan])
-    roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
     nees = np.array([row.nees for row in right if np.isfinite(row.nees)] or [np.nan])
     # Frames on which it failed are left out of the times: the time to a solution is unknown there.
     ms = np.array(
@@ -133,14 +131,11 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
         sum(row.wrong for row in rows),
         sum(unsolved.values()) - failed,
         failed,
-        float(np.median(cross)),
-        float(np.max(cross)),
-        float(np.median(roll)),
-        float(np.max(roll)),
-        float(np.mean(nees)),
-        float(np.median(ms)),
-        float(np.percentile(ms, 95)),
-        dict(unsolved.most_common()),
+        **metrics.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in right]),
+        nees=float(np.mean(nees)),
+        time_ms_median=float(np.median(ms)),
+        time_ms_p95=float(np.percentile(ms, 95)),
+        refusals=dict(unsolved.most_common()),
     )
 
 

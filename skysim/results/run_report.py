@@ -134,16 +134,11 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     `magnitude_errors`; for `scatter_arcsec` see there. Where the tracker claims errors, also `claims`.
     """
     solved = [row for row in rows if row.status == "solved"]
-    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
-    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
     return {
         "frames": len(rows),
         "solved": len(solved),
         "wrong": sum(row.wrong for row in solved),
-        "cross_arcsec_median": float(np.median(cross)),
-        "cross_arcsec_worst": float(np.max(cross)),
-        "roll_arcsec_median": float(np.median(roll)),
-        "roll_arcsec_worst": float(np.max(roll)),
+        **metrics.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
         "scatter_arcsec": scatter_arcsec(solved),
         **claims(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
