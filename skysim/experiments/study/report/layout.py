@@ -219,12 +219,10 @@ def expected_value(name: str) -> float | None:
 # Candidates of an optimization.
 
 
-def panels(
-    lines: PointRows, search: Search, costs: Mapping[int, float] | None
-) -> dict[str, Panel]:
-    """One panel per objective, constrained response and, if costs are given, cost; by name."""
-    names = dict.fromkeys(search.responses + ["cost"] * (costs is not None))
-    return {name: panel(name, lines, search, costs or {}) for name in names}
+def panels(lines: PointRows, search: Search, costs: Mapping[int, float]) -> dict[str, Panel]:
+    """One panel per objective, constrained response and cost; by name."""
+    names = dict.fromkeys([*search.responses, "cost"])
+    return {name: panel(name, lines, search, costs) for name in names}
 
 
 def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:

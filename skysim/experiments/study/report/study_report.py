@@ -48,7 +48,6 @@ from skysim.results.report_blocks import (
     Facts,
     Figure,
     Items,
-    Kind,
     Section,
     Table,
     Text,
@@ -206,10 +205,9 @@ def compose(
     `command` is the function of `commands`.
     """
     lines = select_responses(found.lines, responses(study))
-    front = [one.number for one in found.result.front] if found.result else []
-    costs = (
-        {one.number: one.cost for one in found.result.candidates} if found.result else None
-    )
+    result = found.result or SearchResult([], [], finished=False)
+    front = [one.number for one in result.front]
+    costs = {one.number: one.cost for one in result.candidates}
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
         *search_figures(lines, study, front, costs),
@@ -316,28 +314,20 @@ def points_section(
     lines: PointRows,
     study: Study,
     front: Sequence[int],
-    costs: Mapping[int, float] | None,
+    costs: Mapping[int, float],
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
     heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
-    kinds: list[Kind] = [
-        "number",
-        *("number" if one.numeric else "text" for one in axes.values()),
-    ]
-    kinds += ["number"] * len(heads[len(kinds) :])
-    columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
+    named = [name for name, one in axes.items() if not one.numeric]
+    columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [
-            line.point,
-            *(one.at(line) for one in axes.values()),
-        ]
+    for line, (number, *row_texts) in zip(lines[:ROWS], texts[:ROWS], strict=True):
+        keys = [one.at(line) for one in axes.values()]
         keys += [one.value for one in line.responses.values()]
-        tone: Tone = "marked" if line.point in front else ""
         row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
-        rows.append([Cell(str(line.point), tone, line.point), *row[1:]])
-    if costs is not None:
+        rows.append([Cell(number, "marked" if line.point in front else "", line.point), *row])
+    if study.optimize:
         columns.append(Column("cost", format=".4g"))
         rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
     note = "In brackets intervals of 95 %."
@@ -528,7 +518,7 @@ def search_figures(
     lines: PointRows,
     study: Study,
     front: Sequence[int],
-    costs: Mapping[int, float] | None,
+    costs: Mapping[int, float],
 ) -> list[Figure]:
     """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
     if study.optimize is None or not lines:
