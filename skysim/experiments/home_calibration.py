@@ -36,14 +36,13 @@ from estimator.calibration.home_position import (
     instrument_brightness,
     separation_rad,
 )
-from estimator.catalog.catalog import unit
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Bools, Floats, Ints, Record
+from skysim.core.types import Bools, Floats, Ints, Record, normalized
 from skysim.experiments.dome_survey import survey_images
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -274,9 +273,9 @@ def calibrated(
     first = np.unique(stop, return_index=True)[1]
     brightness = np.array([one.brightness for one in common])
     brightest = np.argsort(-brightness[0])[:QUEST_LEDS]
-    at_home = unit(lab_m[0, brightest])
+    at_home = normalized(lab_m[0, brightest])
     algorithm_deg = [
-        euler_deg(quest(at_home, unit(body_m[n, brightest]), np.ones(len(brightest))))
+        euler_deg(quest(at_home, normalized(body_m[n, brightest]), np.ones(len(brightest))))
         if np.array_equal(common[n].led, common[0].led)
         else np.full(3, np.nan)
         for n in first
@@ -332,7 +331,7 @@ def scaled(known: Assumed, first: Sighting, clicks: int) -> Camera:
 
 def pair_angles_rad(body_m: Floats) -> Floats:
     """(..., N (N - 1) / 2) angles of (..., N, 3) points about the bearing."""
-    directions = body_m / np.linalg.norm(body_m, axis=-1, keepdims=True)
+    directions = normalized(body_m)
     a, b = np.triu_indices(directions.shape[-2], 1)
     return separation_rad(directions[..., a, :], directions[..., b, :])
 

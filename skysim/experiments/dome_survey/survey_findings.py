@@ -29,6 +29,7 @@ from skysim.experiments.dome_survey.survey_prior import (
 )
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
+from skysim.sources.dome.layouts.placing import tilts_rad
 
 # A survey after its last round: frames, correspondences, light of each LED, stray lights.
 
@@ -470,8 +471,7 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
 
 def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
-    up = lab_from_body.apply([0.0, 0.0, 1.0])
-    tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
+    tilt_deg = np.degrees(tilts_rad(lab_from_body.apply([0.0, 0.0, 1.0])))
     roll, pitch, yaw = euler_deg(lab_from_body).T
     return rows_of_columns(
         roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, tilt_deg=tilt_deg, leds=shown.sum(axis=1)

@@ -39,7 +39,6 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.files import recording
-from skysim.results.plots import annotate, visible
 from skysim.results.run import Recorder
 from skysim.simulation.checks import check
 from skysim.simulation.lab import Lab
@@ -434,11 +433,7 @@ def replay(
 
 def write_annotated(folder: Path, frame: Frame, truth: Truth, report: Report) -> None:
     """Write a frame with the lights that the tracker found, those that it matched, and the true ones."""
-    match = report.attitude.match
-    xy_px = report.centroids.xy_px
-    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-    truth_px = truth.sources.xy_px[visible(truth.sources)]
-    picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
+    picture = scoring.annotated(frame, truth, report)
     write_image(folder / f"frame_{frame.index:04d}.annotated.png", picture)
 
 
