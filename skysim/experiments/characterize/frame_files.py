@@ -193,10 +193,10 @@ def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
         )
 
 
-def describe(setting: Setting) -> str:
+def describe(one: Setting | Level) -> str:
     """An exposure and temperature for a message."""
-    at = "" if setting.temperature_c is None else f" at {setting.temperature_c:g} °C"
-    return f"{setting.exposure_s:g} s{at}"
+    at = "" if one.temperature_c is None else f" at {one.temperature_c:g} °C"
+    return f"{one.exposure_s:g} s{at}"
 
 
 # Simulated darks and flats of a scene's camera, written as files to try and to test the command.
@@ -312,14 +312,14 @@ POLYPLETS = 110
 def check_darks(darks: Stack) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
     for level in darks.levels:
-        medians = darks.medians[setting_of(level)]
+        medians = darks.medians[Setting(level.exposure_s, level.temperature_c)]
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
         middle = float(np.median([median for median, _ in medians]))
         worst, path = max(medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
                 path,
-                f"not dark: median {worst:g} DN, the other frames of {describe(setting_of(level))} {middle:g} DN",
+                f"not dark: median {worst:g} DN, the other frames of {describe(level)} {middle:g} DN",
                 "darks with the lens capped",
             )
     for level in darks.levels:
@@ -334,15 +334,10 @@ def check_darks(darks: Stack) -> None:
         )
 
 
-def setting_of(level: Level) -> Setting:
-    """The setting of a level."""
-    return Setting(level.exposure_s, level.temperature_c)
-
-
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
     folder = darks.folder
-    which = f"the darks of {describe(setting_of(level))}"
+    which = f"the darks of {describe(level)}"
     mean = level.mean_dn
     noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
     zeros = float(np.mean(mean < 1))
@@ -406,7 +401,7 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
             f" {0.6 * longest:.2g} s",
         )
     for one, signal in zip(flats.levels, signals, strict=True):
-        which = f"the flats of {describe(setting_of(one))}"
+        which = f"the flats of {describe(one)}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
                 flats.folder,

@@ -435,12 +435,6 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
     )
 
 
-def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> Bools:
-    """(L,) whether the signal of each flat is at most FIT_RANGE of the greatest."""
-    signal = by_level(points, "mean_dn") - black_dn
-    return signal <= FIT_RANGE * signal.max()
-
-
 def saturated(points: Sequence[TransferPoint]) -> Bools:
     """(L,) whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
     variance = by_level(points, "variance_dn2")

@@ -132,7 +132,8 @@ def fitted_transfer(
         for one in darks
     ]
     black_dn = min(point.moments.mean_dn for point in dark_points)
-    below = photon_transfer.unsaturated(flat_points, black_dn)
+    signal = by_level(flat_points, "mean_dn") - black_dn
+    below = signal <= photon_transfer.FIT_RANGE * signal.max()
     fitted = list(compress(flats, below))
     lit = list(compress(flat_points, below))
     changes = [one.difference_dn2 for one in fitted]

@@ -15,7 +15,6 @@ from skysim.experiments.datasheet.variance_components import (
     bounded,
     mean_known,
     mean_square_ratio,
-    rms,
     squares_by_field,
 )
 from skysim.experiments.study import answer
@@ -149,8 +148,11 @@ def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
 
 
 def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
-    """The rms error about one axis across and about the boresight, by `rms_` and the name of the group."""
-    return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
+    """The rms error of right attitudes about one axis, by `rms_` and the name of the group of axes."""
+    squares = sheet.errors(rows) ** 2
+    return {
+        f"rms_{name}": math.sqrt(mean_known(squares[axes])) for name, axes in GROUPS.items()
+    }
 
 
 def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:

@@ -224,7 +224,10 @@ def lowering_section(statement: Statement) -> StatementSection:
         "Each change alone, at rest, on the same fields, units and noise as before: what is left of the error's mean"
         " square, in percent, with 95 % intervals. Below 100 the change lowers the error."
     )
-    rows = [[one["cause"], *ratio_cells(one)] for one in statement.causes]
+    rows = []
+    for one in statement.causes:
+        percents = (np.array(one[name]) * 100 for name in variance_components.GROUPS)
+        rows.append([one["cause"], *(bounded(Bounded(*ratio)) for ratio in percents)])
     return StatementSection(
         "What dominates, and what would lower it",
         texts,
@@ -232,14 +235,6 @@ def lowering_section(statement: Statement) -> StatementSection:
         rows,
         ["causes"],
     )
-
-
-def ratio_cells(row: Record) -> list[str]:
-    """Cells of the ratios of mean squares, in percent."""
-    return [
-        bounded(Bounded(*(100 * part for part in row[name])))
-        for name in variance_components.GROUPS
-    ]
 
 
 def probability_section(statement: Statement) -> StatementSection:

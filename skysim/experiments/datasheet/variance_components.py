@@ -252,8 +252,3 @@ def causes(sheet: MeasuredFrames) -> list[Record]:
             row[group] = mean_square_ratio(squares, squares_by_field(sheet, before, axes))
         found.append(row)
     return sorted(found, key=lambda one: one["across"].value + one["about"].value)
-
-
-def rms(sheet: MeasuredFrames, rows: list[int], axes: slice) -> float:
-    """Root mean square of the errors about one axis, arcseconds, over all frames with a right attitude."""
-    return math.sqrt(mean_known(sheet.errors(rows)[axes] ** 2))
