@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.calibration.mass_dynamics import MOMENT, BearingRecord, MassEstimate
-from estimator.calibration.mass_properties import estimate_with_noise, filter_mass
+from estimator.calibration.mass_properties import estimate_with_noise
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import quantity
-from skysim.dynamics import multibody
+from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments import balance_flight
 from skysim.experiments.balance_flight import (
@@ -166,7 +166,10 @@ def balance(
             in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch
         )
         records.append(flown.record)
-        estimate = estimated(records, assumptions)
+        try:
+            estimate = estimate_with_noise(records, assumptions.lab, assumptions.prior)
+        except ImageError as error:  # it does not converge
+            raise InputError("balance", error) from error
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
@@ -195,24 +198,7 @@ def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) 
     scene = balance_flight.excited_by_wheels(
         scene, multibody.build(scene.vehicle), plan.tilt_deg, plan.longer
     )
-    return balance_flight.with_frames(scene, balance_flight.maneuver_s(scene))
-
-
-def estimated(records: list[BearingRecord], assumptions: Assumptions) -> MassEstimate:
-    """The batch estimate. Raises InputError if it does not converge."""
-    try:
-        return estimate_with_noise(records, assumptions.lab, assumptions.prior)
-    except ImageError as error:
-        raise InputError("balance", error) from error
-
-
-def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
-    """The last estimate of the filter in flight. Raises InputError for too few attitudes."""
-    try:
-        *_, last = filter_mass(record, assumptions.lab, assumptions.prior)
-    except ImageError as error:
-        raise InputError("balance", error) from error
-    return last
+    return balance_flight.with_frames(scene, guidance.plan(scene.motion).duration_s)
 
 
 def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene) -> Floats:

@@ -7,10 +7,13 @@ from typing import Any
 import numpy as np
 
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
+from estimator.calibration.mass_properties import filter_mass
+from estimator.core.errors import ImageError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
-from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
+from skysim.experiments.balance_procedure import BalancePlan, Iteration
 from skysim.results.plots import bgr_image
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -133,8 +136,12 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
 
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
-    """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
-    return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
+    """As `estimate_rows`, for the filter in flight at the end of one iteration. Raises InputError for few attitudes."""
+    try:
+        *_, last = filter_mass(one.flight.record, assumptions.lab, assumptions.prior)
+    except ImageError as error:
+        raise InputError("balance", error) from error
+    return estimate_rows(one.flight, last)
 
 
 def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
