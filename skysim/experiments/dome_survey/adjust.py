@@ -336,7 +336,15 @@ def adjust_connected(
         try:
             # The loss is robust, and the values assumed before the survey are measurements.
             survey = dome_survey.survey(
-                [dome_frame(*pairs[k]) for k in selected],
+                [
+                    DomeFrame(
+                        match.led,
+                        frame.lights.xy_px[match.light],
+                        frame.lights.sigma_px[match.light],
+                        frame.body_from_lab,
+                    )
+                    for frame, match in map(pairs.__getitem__, selected)
+                ],
                 prior.leds,
                 prior.lever,
                 prior.camera,
@@ -435,15 +443,4 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
         own_m2=leds.covariance_m2,
         common_m=leds.common_m,
         common_camera=leds.common_camera,
-    )
-
-
-def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
-    """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
-    lights = frame.lights
-    return DomeFrame(
-        match.led,
-        lights.xy_px[match.light],
-        lights.sigma_px[match.light],
-        frame.body_from_lab,
     )

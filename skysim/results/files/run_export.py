@@ -48,7 +48,7 @@ def message(
 
     The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
     quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
-    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError as `check_epochs`.
+    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch, or the epochs do not ascend.
 
     Parameters
     ----------
@@ -63,7 +63,11 @@ def message(
     a_from_b
         K rotations
     """
-    check_epochs(name, utc)
+    if not utc:
+        raise InputError(name, "no attitude to write")
+    for before, after in itertools.pairwise(utc):
+        if after <= before:
+            raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
     head = {
         "CCSDS_AEM_VERS": "2.0",
         "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
@@ -95,15 +99,6 @@ def message(
         "DATA_STOP",
     ]
     return "".join(f"{ascii_line(line)}\n" for line in lines)
-
-
-def check_epochs(name: str, utc: Sequence[datetime.datetime]) -> None:
-    """Raise InputError if there is no epoch, or the epochs do not ascend."""
-    if not utc:
-        raise InputError(name, "no attitude to write")
-    for before, after in itertools.pairwise(utc):
-        if after <= before:
-            raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
 
 
 def continuous_quaternions(xyzw: Floats) -> Floats:

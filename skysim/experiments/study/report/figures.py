@@ -1,11 +1,9 @@
 """Draw a study's figures, each as a PNG. `layout` selects their contents."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +13,7 @@ from skysim.experiments.study.report import layout
 from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
 from skysim.experiments.study.table import (
     Axis,
+    Index,
     PointRows,
     axis,
     is_sampled,
@@ -24,10 +23,6 @@ from skysim.experiments.study.table import (
 from skysim.experiments.study.thresholds import crossings, thresholds_of
 from skysim.results.metrics import MORE_IS_BETTER, is_proportion, split_name
 from skysim.results.plots import INK, MARKS, png
-
-if TYPE_CHECKING:
-    from skysim.experiments.study.table import Index
-
 
 # Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes.
 
