@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
@@ -195,7 +196,7 @@ def geodesic_vertices(frequency: int, class_: str) -> Floats:
     corners = icosahedron()
     # Corners with their weights: a vertex on an edge is the same from both faces.
     weights = set[tuple[tuple[int, int], ...]]()
-    for face in icosahedron_faces():
+    for face in ConvexHull(corners).simplices.tolist():
         for lattice in lattice_points(frequency, class_):
             pairs = zip(face, lattice, strict=True)
             weights.add(tuple(sorted((corner, n) for corner, n in pairs if n)))
@@ -224,18 +225,3 @@ def icosahedron() -> Floats:
     between = azimuth + np.pi / 5
     lower = np.column_stack([ring * np.cos(between), ring * np.sin(between), np.full(5, -z)])
     return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])
-
-
-def icosahedron_faces() -> list[tuple[int, int, int]]:
-    """The corners of the icosahedron's 20 faces, as rows of `icosahedron`."""
-    faces = []
-    for n in range(5):
-        following = (n + 1) % 5
-        upper = 1 + n
-        next_upper = 1 + following
-        lower = 6 + n
-        next_lower = 6 + following
-        # A face at the zenith, two between the rings, one at the nadir.
-        faces += [(0, upper, next_upper), (upper, lower, next_upper)]
-        faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
-    return faces
