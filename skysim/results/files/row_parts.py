@@ -7,6 +7,7 @@ NaN or None in arrays. Trials are in the order of point and replicate, from whic
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -156,16 +157,16 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+@dataclass(eq=False)
 class Part:
     """A part: its file, its numbers of rows and of wrong attitudes, and the points of its first and its last row."""
 
-    def __init__(self, path: Path, rows: int, wrong: int, first: int, last: int) -> None:
-        self.path = path
-        self.rows = rows
-        self.wrong = wrong
-        self.first = first
-        self.last = last
-        self._trials: tuple[int, Array] = (0, np.empty(0, np.int64))
+    path: Path
+    rows: int
+    wrong: int
+    first: int
+    last: int
+    _trials: tuple[int, Array] = (0, np.empty(0, np.int64))
 
     def trials(self, replicates: int) -> Array:
         """(N,) numbers of its trials, where a point has so many. Raises InputError for a part that is not as listed."""

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 from uuid import uuid4
@@ -165,13 +166,13 @@ def collect_rows(
 JOBS: dict[str, Job] = {}  # job of each run that this worker serves
 
 
+@dataclass(eq=False)
 class JobPlugin(WorkerPlugin):
     """Worker plugin that gives every worker a run's job, including workers that join later."""
 
-    def __init__(self, name: str, job: Job, code: str) -> None:
-        self.name = name
-        self.job = job
-        self.code = code
+    name: str
+    job: Job
+    code: str
 
     def setup(self, worker: Any) -> None:
         """Store the job on the worker. Raises InputError if its code version differs from the run's."""

@@ -233,10 +233,13 @@ def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float
         ]
     else:
         summaries = [line.responses[name][:3] for line in lines]
-    bounds = []
-    for one in search.constraints:
-        if one.response == name:
-            bounds += [bound for bound in (one.at_least, one.at_most) if bound is not None]
+    bounds = [
+        bound
+        for one in search.constraints
+        if one.response == name
+        for bound in (one.at_least, one.at_most)
+        if bound is not None
+    ]
     title = label(name)
     for goal in search.objectives:
         if goal.response == name:
