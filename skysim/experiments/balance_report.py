@@ -14,7 +14,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
 from skysim.experiments.balance_procedure import BalancePlan, Iteration
-from skysim.results.plots import bgr_image
+from skysim.results.plots import png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -249,10 +249,10 @@ def write_all(
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
     bar_nm = statistics["torque_bar_nm"]
-    image = bgr_image(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
-    files.write_image(picture, image)
+    image = png(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
+    files.write_bytes(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))
-    report = balance_report(statistics, picture.read_bytes(), command)
+    report = balance_report(statistics, image, command)
     report.save(folder / "report.html")
     return report

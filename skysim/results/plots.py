@@ -73,15 +73,9 @@ def figure_png(fig: Any, **options: Any) -> bytes:
 
 
 def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> Picture:
-    """(H, W, 3) BGR image of the figure that `draw` fills, in the default style of matplotlib."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=size_in, layout="constrained")
-    canvas = FigureCanvasAgg(fig)
-    draw(fig)
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
+    """(H, W, 3) BGR image of the figure that `draw` fills, in the shared style."""
+    encoded = np.frombuffer(png(draw, size_in), np.uint8)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
 
 
 def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
