@@ -13,7 +13,6 @@ from skysim.core.errors import InputError, printable
 from skysim.core.types import Record
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
-from skysim.experiments.characterize.frame_files import read_stack
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -351,9 +350,9 @@ def measure_sensor(
     """The sensor from folders of darks and flats. Raises InputError for frames that cannot be used."""
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
-    darks = read_stack(darks_folder, shape, bits)
+    darks = frame_files.read_stack(darks_folder, shape, bits)
     frame_files.check_darks(darks)
-    flats = read_stack(flats_folder, shape, bits)
+    flats = frame_files.read_stack(flats_folder, shape, bits)
     usable = sensor_fit.usable_pixels(darks.levels)
     shortest = min(darks.levels, key=lambda one: one.exposure_s)
     frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))

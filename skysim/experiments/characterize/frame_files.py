@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from skysim.camera import detector
-from skysim.camera.detector import Detector
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
@@ -254,7 +253,7 @@ def frames_of(
 ) -> Iterator[NDArray[np.uint16]]:
     """The frames of a shot by the simulated detector in uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
-    made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
+    made = detector.Detector.from_camera(camera.model_copy(update={"detector": at_it}))
     key = (
         int(shot.kind == "flats"),
         round(1e6 * shot.exposure_s),

@@ -23,13 +23,6 @@ from skysim.core.files import make_folder, write_text
 from skysim.core.types import Bools, Floats, Record
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments.datasheet import scene_changes
-from skysim.experiments.datasheet.scene_changes import (
-    FIXED_PATTERN,
-    OFF_DEG,
-    beside,
-    excluding_bodies,
-    side_px,
-)
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, resolve_point
@@ -157,7 +150,7 @@ def require_fields(fields: int, solved: int, least: int, problem: str) -> None:
 def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that differ from unit to unit: chip, survey, LEDs."""
     chip = scene.camera.detector
-    has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
+    has_pattern = any(getattr(chip, key) for key in scene_changes.FIXED_PATTERN)
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
     return seeds + dome_seeds(scene)
 
@@ -255,8 +248,10 @@ class Designer:
             yield from self.draws("cause", pairs, change, cause=name)
         for name, change in scene_changes.disturbances(self.scene).items():
             yield from self.draws("disturbance", 1, change, disturbance=name)
-        for body, off_deg in itertools.product(excluding_bodies(self.scene), OFF_DEG):
-            change = beside(body, off_deg, off_deg)
+        for body, off_deg in itertools.product(
+            scene_changes.excluding_bodies(self.scene), scene_changes.OFF_DEG
+        ):
+            change = scene_changes.beside(body, off_deg, off_deg)
             yield from self.draws("exclusion", 1, change, body=body, off_deg=off_deg)
 
     def terms(self) -> Iterator[DatasheetCell]:
@@ -285,7 +280,7 @@ class Designer:
         """Rates with streaks of these lengths, to two digits; about the boresight those at the edge of the field."""
         pixel_deg = self.pixel_deg
         if experiment == "boresight":
-            pixel_deg = math.degrees(2 / side_px(self.scene))
+            pixel_deg = math.degrees(2 / scene_changes.side_px(self.scene))
         per_px = pixel_deg / self.scene.exposure.time_s
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
@@ -427,7 +422,9 @@ class MeasuredFrames:
         for experiment in RATES:
             rate = max(self.levels(experiment, "rate_deg_s"))
             right = self.right(self.rows(experiment, rate_deg_s=rate)).all(axis=0)
-            longest = self.designer.rates_deg_s([side_px(self.scene)], experiment)[0]
+            longest = self.designer.rates_deg_s(
+                [scene_changes.side_px(self.scene)], experiment
+            )[0]
             if right.mean() >= MOST_FAIL and 2 * rate <= longest:
                 found.append(experiment)
         return found

@@ -12,8 +12,7 @@ from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
 from skysim.experiments.datasheet.performance import Counts, bracket_text
 from skysim.experiments.datasheet.variance_components import Bounded, Components
-from skysim.results import metrics
-from skysim.results.metrics import Summary
+from skysim.results.metrics import TAILS, Summary
 
 NAMES = {
     "bias": "bias",
@@ -205,7 +204,7 @@ def unit_text(units: int) -> str:
     from scipy.special import chdtri
 
     freedom = units - 1
-    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in metrics.TAILS)
+    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in TAILS)
     return (
         f"These intervals are over the fields, for the {units} units that were measured, which both sides of the"
         f" comparison have. Where the bias scatters among units, {units} of them bound its size for all units to a"

@@ -18,7 +18,6 @@ from estimator.attitude.dome_map import LedMap
 from estimator.calibration import dome_survey, survey_faults, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
-from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats
 from skysim.experiments.dome_survey.survey_findings import (
@@ -353,7 +352,7 @@ def adjust_connected(
                 fit_noise=True,
                 assumed=before,
             )
-        except Unconnected as error:
+        except survey_subset.Unconnected as error:
             if len(error.frames) > MAX_UNCONNECTED * len(selected):
                 raise InputError("", error) from None
             selected = np.delete(selected, error.frames).tolist()

@@ -15,12 +15,12 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from skysim.core.types import Bools, Floats, Record
-from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import (
     GATE_SIGMAS,
     Correspondences,
     SurveyFrame,
     match_by_imu,
+    planned_stops,
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
@@ -259,7 +259,7 @@ def next_stops(
 ) -> NextStops:
     """Up to `count` attitudes after those held so far."""
     model = so_far.model
-    further = survey_frames.planned_stops(
+    further = planned_stops(
         scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
     )
     attitudes = Rotation.concatenate([so_far.held, further.inv()])

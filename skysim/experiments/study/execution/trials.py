@@ -23,7 +23,6 @@ from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera.detector import AddedCharge
 from skysim.core import errors, quaternion
-from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
@@ -187,7 +186,7 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
         errors.raise_wrapped(raised)
         if len(seeds) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
-        if isinstance(raised, InputError):
+        if isinstance(raised, errors.InputError):
             scene = scene or REFUSED
             error = str(raised)
         else:

@@ -9,8 +9,18 @@ import numpy as np
 
 from skysim.core.types import Floats, Record
 from skysim.experiments.study.plan import Curve, Heat, Map, Study
-from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.report.layout import (
+    MAX_POINTS_WITH_BARS,
+    MAX_X_WITH_BARS,
+    Grid,
+    Panel,
+    Series,
+    draws_medians,
+    expected_value,
+    grid,
+    limits,
+    series,
+)
 from skysim.experiments.study.table import (
     Axis,
     Index,
@@ -119,7 +129,7 @@ def figure_png(lines: PointRows, figure: Curve | Heat, study: Study) -> bytes:
         return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
     if is_sampled(study):
         return png(lambda fig: draw_scatter(fig, lines, figure, study), (7.0, 4.4))
-    cells = layout.grid(lines, figure, study)
+    cells = grid(lines, figure, study)
     rows, columns = cells.value.shape
     width_in = min(max(2.6 + 0.6 * columns, 4.6), 9.6)
     height_in = min(max(1.2 + 0.42 * rows, 2.6), 7.0)
@@ -134,11 +144,11 @@ def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
     axes = fig.subplots()
     x_axis = axis(study, lines, figure.x)
     sampled = is_sampled(study)
-    shown = layout.series(lines, figure, study)
-    dots = layout.draws_medians(study, x_axis, sum(len(one.x) for one in shown))
+    shown = series(lines, figure, study)
+    dots = draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_x_axis(axes, x_axis)
-    if (expected := layout.expected_value(figure.y)) is not None:
+    if (expected := expected_value(figure.y)) is not None:
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
     inks = colors(len(shown), group_axis)
@@ -187,10 +197,10 @@ def set_up_y_axis(
 ) -> None:
     """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
-    expected = layout.expected_value(name)
+    expected = expected_value(name)
     marked = [np.array([expected])] if expected is not None else []
     values = [*(one.value for one in shown), *marked]
-    low, high = layout.limits(values, bounds, log, is_proportion(name))
+    low, high = limits(values, bounds, log, is_proportion(name))
     if log:
         logarithmic(axes, "y", low, high)
     axes.set_ylim(low, high)
@@ -208,7 +218,7 @@ def draw_line(
 
     offset = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
     low, high = drawn_interval(axes, one)
-    if x_axis.numeric and len(x_axis.levels) > layout.MAX_X_WITH_BARS:
+    if x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS:
         offset = axes.transData
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
@@ -487,7 +497,7 @@ def pareto_png(
         y = other.value[marked]
         low = other.low[marked]
         high = other.high[marked]
-        axes.set_ylim(*layout.limits([other.value], [low, high], False, False))
+        axes.set_ylim(*limits([other.value], [low, high], False, False))
         axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(x, y, "D--", color=ORANGE, label="front")
         style: Any = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}

@@ -26,7 +26,6 @@ from skysim.experiments.study.table import (
 )
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
-from skysim.results.metrics import Summary
 
 MAX_X_WITH_BARS = (
     12  # maximum number of x values for error bars; with more, intervals are drawn as a band
@@ -297,7 +296,7 @@ def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
 
 
 def curve_note(
-    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[Summary]
+    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[metrics.Summary]
 ) -> str:
     """The meaning of the lines and bars of a curve."""
     x_axis = axis(study, lines, figure.x)

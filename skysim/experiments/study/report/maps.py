@@ -23,7 +23,6 @@ from skysim.experiments.study.table import PointRows, group_points
 from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
-from skysim.results.metrics import Columns
 from skysim.results.plots import png
 
 CELL_TRIALS = 25  # mean number of trials in a cell
@@ -87,7 +86,7 @@ def direction_maps(
     return panels
 
 
-def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
+def direction_map(label: str, columns: metrics.Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
     if not columns:
         return DirectionMap(label, False, [], [])

@@ -14,7 +14,6 @@ from skysim.experiments.study import answer, search, thresholds
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
-from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
 from skysim.experiments.study.search import SearchResult
 from skysim.experiments.study.table import (
@@ -38,7 +37,6 @@ from skysim.experiments.study.table import (
 )
 from skysim.experiments.study.worst import ColumnsOf, ranked, worst_trials
 from skysim.results import metrics
-from skysim.results.metrics import Columns
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -341,7 +339,7 @@ def points_section(
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
 
-def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
+def pooled_blocks(plan: Plan, columns: metrics.Columns, replay: str) -> list[Block]:
     """A sampled design as a whole: each response with its spread, its dependence on the factors, the worst trials."""
     responses = list(plan.study.responses)
     for quantity in quantities(responses):
@@ -470,7 +468,7 @@ def study_figures(
     return blocks
 
 
-def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
+def worst_table(panels: Sequence[maps.DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
     columns = [
         text_column("worst"),
