@@ -107,9 +107,8 @@ def factors_cost(config: Cost, levels: Mapping[str, Value]) -> float:
 
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
 MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
-MISSING_VIOLATION = (
-    1e3  # violation of a candidate without a value; larger than usual relative violations
-)
+# Violation of a candidate without a value; larger than usual relative violations.
+MISSING_VIOLATION = 1e3
 MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 
 

@@ -44,9 +44,8 @@ from skysim.simulation.checks import check
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
-CHUNK_S = (
-    0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
-)
+# Run time of a chunk: long relative to its overhead, short in case a worker dies.
+CHUNK_S = 0.25
 # Beyond so many workers chunks are longer, so that MANY / CHUNK_S end per second: a Dask scheduler handles hundreds.
 MANY = 16
 MAX_CHUNK = 5000  # maximum number of trials in a chunk

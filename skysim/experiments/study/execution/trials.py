@@ -63,9 +63,8 @@ from skysim.sources.air import topocentric_axes
 from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
 
-GYRO_RAD_S = (
-    1e-5  # standard deviation that a frame trial's gyro claims: 2 arcseconds per second
-)
+# Standard deviation that a frame trial's gyro claims: 2 arcseconds per second.
+GYRO_RAD_S = 1e-5
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
 BLOCK = 64  # number of centroid trials that run together
 REFUSED = "refused"  # stands for the hash of a scene that cannot be built

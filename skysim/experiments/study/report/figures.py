@@ -111,13 +111,11 @@ def halo() -> Any:
 
 
 MAX_TICKS = 16  # maximum number of levels that have a tick each
-MAX_WRAPPED_LABELS = (
-    8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
-)
+# Maximum number of tick labels that are wrapped; with more, long ones are rotated.
+MAX_WRAPPED_LABELS = 8
 LABEL_WIDTH = 88  # characters that fit below an axis
-MAX_CELLS_WITH_TEXT = (
-    12  # maximum rows and columns of a heat map with values written in its cells
-)
+# Maximum rows and columns of a heat map with values written in its cells.
+MAX_CELLS_WITH_TEXT = 12
 MAX_LABELED_POINTS = 12  # maximum number of Pareto points that are labeled
 GRAY = "#8fa1b3"
 ORANGE = "#d55e00"

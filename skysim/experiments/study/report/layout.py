@@ -27,19 +27,15 @@ from skysim.experiments.study.table import (
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
 
-MAX_X_WITH_BARS = (
-    12  # maximum number of x values for error bars; with more, intervals are drawn as a band
-)
-MAX_POINTS_WITH_BARS = (
-    60  # sampled points with error bars; with more, a running median is drawn
-)
-MOST_LINES = (
-    7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
-)
+# Maximum number of x values for error bars; with more, intervals are drawn as a band.
+MAX_X_WITH_BARS = 12
+# Sampled points with error bars; with more, a running median is drawn.
+MAX_POINTS_WITH_BARS = 60
+# Maximum number of lines in an automatic curve; with more levels it becomes a heat map.
+MOST_LINES = 7
 MOST_FIGURES = 24  # maximum number of automatic figures
-LOG_RESPONSE_RATIO = (
-    30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
-)
+# Minimum ratio of largest to smallest response for an automatic logarithmic axis.
+LOG_RESPONSE_RATIO = 30
 FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
 
 

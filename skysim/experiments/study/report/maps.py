@@ -29,9 +29,8 @@ CELL_TRIALS = 25  # mean number of trials in a cell
 MAX_CELLS = 240  # maximum number of cells of a panel
 MIN_VALUES = 5  # a cell with fewer values is hatched
 SPARE = 1.6  # mean number of trials in a cell over the least number that a quantile takes
-MAX_NUMBERED = (
-    70  # maximum number of cells of a panel with their numbers of trials written in them
-)
+# Maximum number of cells of a panel with their numbers of trials written in them.
+MAX_NUMBERED = 70
 SKY_RANGE_DEG = (-90.0, 90.0)
 MARK = "#111111"  # color of the marks of the worst trials
 EDGE_POINTS = 24  # points along each edge of a cell

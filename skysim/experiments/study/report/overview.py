@@ -44,9 +44,8 @@ from skysim.simulation.lab import Lab, UserParts, build_lab
 
 Texts = list[tuple[str, str]]  # names with texts, or texts with the names of points
 NUMBER = re.compile(r"\d[\d.]*")
-MAX_CHECKED = (
-    16  # maximum number of scenes that are checked: building one takes up to a second
-)
+# Maximum number of scenes that are checked: building one takes up to a second.
+MAX_CHECKED = 16
 
 
 class Overview(NamedTuple):
