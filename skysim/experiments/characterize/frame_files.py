@@ -338,7 +338,7 @@ def check_dark(darks: Stack, level: Level) -> None:
     folder = darks.folder
     which = f"the darks of {describe(level)}"
     mean = level.mean_dn
-    noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
+    noise_dn = max(math.sqrt(np.median(level.variance_dn2)), 0.3)
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:
         raise InputError(
@@ -350,7 +350,6 @@ def check_dark(darks: Stack, level: Level) -> None:
         raise InputError(
             folder, f"{which} are equal in every pixel", "frames of their own, no copies"
         )
-    noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
     allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians)
     if (extent := float(np.ptp(medians))) > allowed_dn:

@@ -51,13 +51,13 @@ class Estimate(NamedTuple):
     def normal(cls, value: float, sigma: float) -> Estimate:
         """A normal estimate: value ± 1.96 sigma."""
         half = SIGMAS * sigma
-        return cls(float(value), float(sigma), float(value - half), float(value + half))
+        return cls(*map(float, (value, sigma, value - half, value + half)))
 
     @classmethod
     def lognormal(cls, value: float, sigma: float) -> Estimate:
         """An estimate of a positive number whose logarithm is normal, such as a standard deviation."""
         factor = math.exp(min(SIGMAS * sigma / value, 50.0)) if value > 0 else 1.0
-        return cls(float(value), float(sigma), float(value / factor), float(value * factor))
+        return cls(*map(float, (value, sigma, value / factor, value * factor)))
 
     @classmethod
     def logistic(cls, logit: float, sigma: float) -> Estimate:

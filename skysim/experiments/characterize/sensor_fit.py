@@ -270,20 +270,19 @@ def dark_parameters(
         value = ratio * one.value / gain
         return Estimate.lognormal(value, value * math.hypot(one.sigma / one.value, relative))
 
-    if not fixed_pattern.is_resolved(rates, noise):
+    dark = None
+    if fixed_pattern.is_resolved(rates, noise):
+        dark = fixed_pattern.fit(rates, noise, greatest)
+        found.estimates.update(dark_e_s=in_electrons(dark.mean), dsnu=dark.dsnu)
+        fraction = dark.hot_pixels
+        hot = dark.hot
+    else:
         unresolved(found, own, rates, noise, float(times.max()))
         # A few hot pixels change no median.
         fraction, hot = fixed_pattern.hot_tail(rates, noise, greatest)
-        found.estimates["hot_pixels"] = fraction
-        if hot is not None:
-            found.estimates["hot_e_s"] = in_electrons(hot)
-        return None
-    dark = fixed_pattern.fit(rates, noise, greatest)
-    found.estimates["dark_e_s"] = in_electrons(dark.mean)
-    found.estimates["dsnu"] = dark.dsnu
-    found.estimates["hot_pixels"] = dark.hot_pixels
-    if dark.hot is not None:
-        found.estimates["hot_e_s"] = in_electrons(dark.hot)
+    found.estimates["hot_pixels"] = fraction
+    if hot is not None:
+        found.estimates["hot_e_s"] = in_electrons(hot)
     return dark
 
 
