@@ -82,7 +82,7 @@ class DatasetPlan:
     frames: int
     frames_per_shard: int
     formats: tuple[str, ...]
-    compress: bool = False
+    compress: bool
 
     @property
     def shards(self) -> int:

@@ -57,13 +57,13 @@ def run_report(
     rows: Sequence[FrameRow],
     *,
     stages_ms: Mapping[str, float],
-    computer: str = "",
+    computer: str,
     annotated: Picture,
     motion: Section,
     views: Sequence[Path],
     facts: Sequence[tuple[str, Sequence[str]]],
     findings: Sequence[str],
-    judged: Sequence[Judgment] = (),
+    judged: Sequence[Judgment],
 ) -> Report:
     """The report of a run. A single frame has no plot against time.
 

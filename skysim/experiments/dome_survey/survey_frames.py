@@ -134,7 +134,7 @@ class SurveyFrame:
 
     lights: Centroids
     body_from_lab: Rotation
-    index: int = 0
+    index: int
 
 
 def render_stops(

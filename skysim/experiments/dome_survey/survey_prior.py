@@ -59,7 +59,7 @@ class SurveyUncertainty:
     led_sigma_m: float
     lever_sigma_m: float
     focal_error: float
-    fit_distortion: bool = False
+    fit_distortion: bool
 
     def focal_sigma_px(self, camera: Camera) -> float:
         """Standard deviation of the assumed focal length of a camera."""
@@ -235,8 +235,7 @@ def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
 
 def as_listed(scene: Scene) -> Scene:
     """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without simulated errors."""
-    tracker = scene.tracker.model_copy(update={"survey": SurveyErrorsConfig(), "map": None})
-    return scene.model_copy(update={"tracker": tracker})
+    return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
 
 
 def with_map(scene: Scene, path: str) -> Scene:

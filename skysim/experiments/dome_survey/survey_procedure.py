@@ -179,7 +179,7 @@ def survey_images(
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
     settings: Settings,
-    watch: Progress | None = None,
+    watch: Progress | None,
 ) -> SurveyRun:
     """Survey from images. `frames` are those with an attitude; the others are identified with the LEDs so far.
 

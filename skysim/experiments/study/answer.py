@@ -48,7 +48,7 @@ CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) -> list[str]:
+def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> list[str]:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES.
 
     Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES

@@ -142,9 +142,7 @@ def plan_of(
     return plan
 
 
-def make_plan(
-    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
-) -> Plan:
+def make_plan(path: Path, study: Study, trial: Tree, programs: Programs, text: str) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(

@@ -66,7 +66,7 @@ class Progress:
     """
 
     trials: int
-    done: int = 0
+    done: int
     failed: int = 0
     wrong: int = 0
     now: int = 0

@@ -4,7 +4,6 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -71,9 +70,9 @@ class Overview(NamedTuple):
     rows: Texts
     findings: list[str]
     may_be_ambiguous: bool
-    fixed: tuple[str, ...] = ()
-    require: Mapping[str, float] = MappingProxyType({})
-    survey_share: float = 0.0
+    fixed: tuple[str, ...]
+    require: Mapping[str, float]
+    survey_share: float
 
 
 def overview(plan: Plan) -> Overview:

@@ -103,13 +103,13 @@ class Analysis(NamedTuple):
 
     lines: PointRows
     about: Overview
-    verdict: str = ""
-    headline: Sequence[str] = ()
-    ranges: Sequence[str] = ()
-    indices: Sequence[Index] = ()
-    result: SearchResult | None = None
-    pooled: Sequence[Block] = ()
-    judged: Sequence[Sequence[Judgment]] = ()
+    verdict: str
+    headline: Sequence[str]
+    ranges: Sequence[str]
+    indices: Sequence[Index]
+    result: SearchResult | None
+    pooled: Sequence[Block]
+    judged: Sequence[Sequence[Judgment]]
 
     @property
     def answers(self) -> list[str]:

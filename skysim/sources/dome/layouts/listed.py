@@ -49,8 +49,8 @@ class LedFile(NamedTuple):
     """
 
     coordinates: Floats
-    level: Floats | None = None
-    id: Ints | None = None
+    level: Floats | None
+    id: Ints | None
 
 
 def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:

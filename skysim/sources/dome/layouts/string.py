@@ -72,7 +72,7 @@ class Tape(NamedTuple):
     tilt_rad: Floats
     azimuth_rad: Floats
     length_m: Floats
-    closed: bool = False
+    closed: bool
 
     def led_count(self, pitch_m: float) -> int:
         """Number of LEDs that fit; on a ring the last has a pitch to the first."""
