@@ -22,6 +22,7 @@ from skysim.results.metrics import (
     right_within,
     split_name,
 )
+from skysim.sources.dome.surface import directions
 
 COUNT = 3  # number of worst trials that a report lists
 DIRECTION = (
@@ -124,15 +125,15 @@ def worst_trials(
     axis = np.empty((0, 3))
     chosen = list[WorstTrial]()
     for rows in worst_first(keys, np.flatnonzero(counted)):
-        directions = unit_directions(subset(columns, rows))
-        left = np.all(~(directions @ axis.T > near), axis=1)
+        unit = unit_directions(subset(columns, rows))
+        left = np.all(~(unit @ axis.T > near), axis=1)
         while len(chosen) < count and left.any():
             nearest = int(np.argmax(left))
             row = int(rows[nearest])
             chosen.append(worst_trial(row_of(columns, row), float(values[row]), flights))
             left[nearest] = False
-            left &= ~(directions @ directions[nearest] > near)
-            axis = np.concatenate([axis, directions[nearest : nearest + 1]])
+            left &= ~(unit @ unit[nearest] > near)
+            axis = np.concatenate([axis, unit[nearest : nearest + 1]])
         if len(chosen) == count:
             break
     return chosen
@@ -180,10 +181,7 @@ def unit_directions(columns: Columns) -> Floats:
     body = columns["body_tilt_deg"], columns["body_azimuth_deg"]
     boresight = 90 - columns["boresight_dec_deg"], columns["boresight_ra_deg"]
     zenith, azimuth = np.radians(np.where(in_dome, body, boresight))
-    across = np.sin(zenith)
-    return np.stack(
-        [across * np.cos(azimuth), across * np.sin(azimuth), np.cos(zenith)], axis=1
-    )
+    return directions(zenith, azimuth)
 
 
 def ranked(response: str) -> str:

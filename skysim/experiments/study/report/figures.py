@@ -313,11 +313,12 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
     places = np.array([x_axis.coordinate(one) for one in x_axis.levels])
     if x_axis.log:
         pad = max((places[-1] / places[0]) ** 0.04, 1.05)
-        logarithmic(axes, "x", places[0] / pad, places[-1] * pad)
-        axes.set_xlim(places[0] / pad, places[-1] * pad)
+        ends = places[0] / pad, places[-1] * pad
+        logarithmic(axes, "x", *ends)
     else:
         pad = (0.04 * np.ptp(places) or 0.5) if x_axis.numeric else 0.5
-        axes.set_xlim(places[0] - pad, places[-1] + pad)
+        ends = places[0] - pad, places[-1] + pad
+    axes.set_xlim(*ends)
     positions = np.log(places) if x_axis.log else places
     close = len(places) > 1 and np.diff(positions).min() < 0.055 * np.ptp(positions)
     if x_axis.numeric and (len(places) > MAX_TICKS or close):
@@ -364,11 +365,11 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         origin="lower" if cells.y.numeric else "upper",
     )
     rows, columns = cells.value.shape
-    for row, column in np.argwhere(~np.isfinite(cells.value)):
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **HATCHED))
-    for row, column in np.argwhere(cells.few & np.isfinite(cells.value)):
-        dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **dotted))
+    known = np.isfinite(cells.value)
+    dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
+    for chosen, style in ((~known, HATCHED), (cells.few & known, dotted)):
+        for row, column in np.argwhere(chosen):
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **style))
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
         write_values(axes, cells, image)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
