@@ -341,34 +341,29 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     lab = setup.lab
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
+    near = attitudes.near
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
     if lab.scene.dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
-        least = math.cos(math.radians(high))
-        most = math.cos(math.radians(low))
-        tilts = [math.acos(min(rng.uniform(least, most), 1.0)) for rng in rngs]
-        drawn = [
-            zyz(first, tilt, last - first)
-            for (first, last), tilt in zip(turns, tilts, strict=True)
-        ]
-        return Rotation.from_quat(drawn, scalar_first=True)
-    near = attitudes.near
-    low, high = (math.radians(dec) for dec in attitudes.dec_deg)
-    if near:  # a body is the pole
-        high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
-    least = math.sin(low)
-    most = math.sin(high)
-    zeniths = [math.acos(min(max(rng.uniform(least, most), -1.0), 1.0)) for rng in rngs]
-    lab_from_cam = [
-        zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)
-    ]
-    if near:
-        lab_from_pole = lab_from_body_pole(near.body, lab.scene)
-        lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
-    cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
-    drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
+        ends = math.cos(math.radians(high)), math.cos(math.radians(low))
+    else:
+        low, high = (math.radians(dec) for dec in attitudes.dec_deg)
+        if near:  # a body is the pole
+            high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
+        ends = math.sin(low), math.sin(high)
+    zeniths = [math.acos(min(max(rng.uniform(*ends), -1.0), 1.0)) for rng in rngs]
+    angles = [(*turn, zenith) for turn, zenith in zip(turns, zeniths, strict=True)]
+    if lab.scene.dome:
+        drawn = [zyz(first, tilt, last - first) for first, last, tilt in angles]
+    else:
+        drawn = [zyz(first, zenith, last) for first, last, zenith in angles]
+        if near:
+            lab_from_pole = lab_from_body_pole(near.body, lab.scene)
+            drawn = [quaternion.multiply(lab_from_pole, each) for each in drawn]
+        cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
+        drawn = [quaternion.multiply(each, cam_from_body) for each in drawn]
     return Rotation.from_quat(drawn, scalar_first=True)
 
 
