@@ -9,7 +9,6 @@ import numpy as np
 
 from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
-from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     CURVATURE,
@@ -52,7 +51,7 @@ class MeasuredSensor(NamedTuple):
     estimates: dict[str, Estimate]
     remarks: list[str]
     transfer: Transfer
-    dark: DarkCurrent | None
+    dark: fixed_pattern.DarkCurrent | None
     dark_temperature_c: float | None
     flats: list[TransferPoint]
     linearity_error: float
@@ -229,10 +228,10 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 def dark_parameters(
     found: Findings,
     darks: Sequence[Level],
-    planes: Planes,
+    planes: fixed_pattern.Planes,
     own: int,
     ratio: float,
-) -> DarkCurrent | None:
+) -> fixed_pattern.DarkCurrent | None:
     """Add dark current, DSNU and hot pixels to the findings, from the rates of the pixels in darks of one temperature.
 
     Parameters
@@ -254,7 +253,7 @@ def dark_parameters(
     rates = pixel_rates.mean(axis=0)[steady]
     counts = np.array([one.count for one in darks])
     times = exposures_s(darks)
-    noise = RateNoise(
+    noise = fixed_pattern.RateNoise(
         float(np.sum(weights**2 * read / counts)),
         float(np.sum(weights**2 * gain * times / counts)),
     )
@@ -290,7 +289,7 @@ def unresolved(
     found: Findings,
     own: int,
     rates: Floats,
-    noise: RateNoise,
+    noise: fixed_pattern.RateNoise,
     longest_s: float,
 ) -> None:
     """Add the mean dark current alone, if its scatter over the pixels is below the noise; remark what it needs."""

@@ -35,7 +35,6 @@ from skysim.experiments.study.plan import Constraint, Cost, Plan, Search, Study,
 from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
 from skysim.results.files.parts import parts_list
-from skysim.results.metrics import Columns, Summary
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -130,7 +129,7 @@ class Candidate(NamedTuple):
     number: int
     levels: dict[str, Value]
     objectives: tuple[float, ...]
-    figures: dict[str, Summary]
+    figures: dict[str, metrics.Summary]
     cost: float
     feasible: bool
     refused: bool
@@ -205,7 +204,9 @@ def check_response(response: str, where: str) -> None:
 # Evaluation of a candidate.
 
 
-def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
+def evaluate_candidate(
+    plan: Plan, number: int, point: Point, columns: metrics.Columns
+) -> Candidate:
     """The candidate computed from the columns of all its trials, and its cost."""
     config = plan.study.search
     figures = {
@@ -239,7 +240,7 @@ def violation(limit: Constraint, value: float) -> float:
     return max(excess)
 
 
-def scene_error(columns: Columns) -> str:
+def scene_error(columns: metrics.Columns) -> str:
     """Why a candidate's scene was rejected; empty if the scene is valid."""
     errors = zip(columns["scene"], columns["error"], strict=True)
     return next((str(error) for scene, error in errors if scene == REFUSED), "")

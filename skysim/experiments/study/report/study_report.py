@@ -15,7 +15,6 @@ from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.experiments.study.search import SearchResult
 from skysim.experiments.study.table import (
     Index,
     PointRows,
@@ -107,7 +106,7 @@ class Analysis(NamedTuple):
     headline: Sequence[str]
     ranges: Sequence[str]
     indices: Sequence[Index]
-    result: SearchResult | None
+    result: search.SearchResult | None
     pooled: Sequence[Block]
     judged: Sequence[Sequence[Judgment]]
 
@@ -203,7 +202,7 @@ def compose(
     `command` is the function of `commands`.
     """
     lines = select_responses(found.lines, responses(study))
-    result = found.result or SearchResult([], [], finished=False)
+    result = found.result or search.SearchResult([], [], finished=False)
     front = [one.number for one in result.front]
     costs = {one.number: one.cost for one in result.candidates}
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
@@ -403,7 +402,7 @@ def with_key(summary: Any) -> Cell:
     return Cell(format_summary(summary), key=summary.value)
 
 
-def front_table(study: Study, result: SearchResult | None) -> list[Block]:
+def front_table(study: Study, result: search.SearchResult | None) -> list[Block]:
     """The front of a search."""
     if result is None:
         return []
