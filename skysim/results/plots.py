@@ -72,12 +72,6 @@ def figure_png(fig: Any, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> Picture:
-    """(H, W, 3) BGR image of the figure that `draw` fills, in the shared style."""
-    encoded = np.frombuffer(png(draw, size_in), np.uint8)
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
-
-
 def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
     """A figure with one panel above the other over a common time axis, heights in inches, and its axes from the top.
 

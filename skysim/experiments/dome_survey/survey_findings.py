@@ -168,19 +168,14 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
 def light_table(run: SurveyRun) -> LightTable:
     """The light of each LED in the frames, measured and expected."""
     index = np.array([frame.index for frame in run.frames])
-    return LightTable(
-        light_at_unit_distance(run),
-        run.held.shown(*margins(run)),
-        run.prior.expected_light(index),
-    )
-
-
-def margins(run: SurveyRun) -> tuple[Floats, float]:
-    """Margin of the chip for each LED, and least distance between LEDs, including the errors of their places."""
+    # The margin of the chip includes the errors of the places. Two images do not merge at twice the reach of one.
     margin_px = run.prior.margin_px
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
-    # Two images do not merge at twice the reach of one.
-    return margin_px + GATE_SIGMAS * place_px, 2 * margin_px
+    return LightTable(
+        light_at_unit_distance(run),
+        run.held.shown(margin_px + GATE_SIGMAS * place_px, 2 * margin_px),
+        run.prior.expected_light(index),
+    )
 
 
 def light_at_unit_distance(run: SurveyRun) -> Floats:

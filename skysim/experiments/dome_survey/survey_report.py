@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -28,7 +29,7 @@ from skysim.experiments.dome_survey.survey_findings import (
 from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
 from skysim.results import metrics
-from skysim.results.plots import INK, bgr_image, png
+from skysim.results.plots import INK, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -383,7 +384,8 @@ def survey_figure(
         for axes, panel in zip(rest, panels, strict=True):
             draw_errors(axes, *panel)
 
-    return bgr_image(draw, (7 * (1 + len(panels)), 6.5))
+    drawn = np.frombuffer(png(draw, (7 * (1 + len(panels)), 6.5)), np.uint8)
+    return np.asarray(cv2.imdecode(drawn, cv2.IMREAD_COLOR), np.uint8)
 
 
 def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
