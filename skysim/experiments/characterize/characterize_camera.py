@@ -219,28 +219,6 @@ DIGITS = 6
 Stated = dict[str, tuple[Any, str]]  # value and comment by key
 
 
-def preset_text(
-    camera: Record,
-    config: CameraConfig,
-    sensor: MeasuredSensor,
-    night: Night | None,
-    name: str,
-) -> str:
-    """The text of the preset: YAML with the source of each value.
-
-    Parameters
-    ----------
-    camera
-        The raw section of the camera that was measured
-    """
-    head = [
-        f"# {printable(name)}, measured. Written by `skysim characterize`.",
-        "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
-    ]
-    found = measured(sensor) | (measured_lens(config, night) if night else {})
-    return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
-
-
 def measured(sensor: MeasuredSensor) -> Stated:
     """Value and comment by key of the section camera; an estimate below 0 becomes 0."""
     found = {
@@ -388,7 +366,12 @@ def write_results(
         If the preset is not a valid camera.
     """
     path = files.make_folder(folder) / "camera.yaml"
-    files.write_text(path, preset_text(raw, config, found, night, name))
+    head = [
+        f"# {printable(name)}, measured. Written by `skysim characterize`.",
+        "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
+    ]
+    values = measured(found) | (measured_lens(config, night) if night else {})
+    files.write_text(path, "\n".join([*head, *yaml_lines(list(lines(raw, values))), ""]))
     loader.load_camera(path, PLACEHOLDER_LENS)  # as a scene reads it
     statistics = {
         "camera": name,

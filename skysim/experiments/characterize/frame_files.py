@@ -414,18 +414,14 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
                 f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
             )
         if BRIGHT * top < signal < FIT_RANGE * top:
-            check_flat(flats.folder, which, block_medians(one.mean_dn) - black_dn)
-
-
-def check_flat(folder: Path, which: str, medians: Floats) -> None:
-    """Raise InputError for a flat whose blocks' medians differ too much."""
-    extent = float(np.ptp(medians) / medians.mean())
-    if extent > MAX_FLAT_RANGE:
-        raise InputError(
-            folder,
-            f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
-            f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
-        )
+            medians = block_medians(one.mean_dn) - black_dn
+            extent = float(np.ptp(medians) / medians.mean())
+            if extent > MAX_FLAT_RANGE:
+                raise InputError(
+                    flats.folder,
+                    f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
+                    f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
+                )
 
 
 def block_side(image: Floats) -> int:

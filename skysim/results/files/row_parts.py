@@ -59,16 +59,12 @@ class Rows(Mapping[str, Array]):
             columns = [source(name) for source in self.sources]
             column = columns[0] if len(columns) == 1 else np.concatenate(columns)
             del columns
-            self._keep(name, column if self.order is None else column[self.order])
+            column = column if self.order is None else column[self.order]
+            left = KEPT_BYTES - column.nbytes
+            while self._kept and sum(one.nbytes for one in self._kept.values()) > left:
+                del self._kept[next(iter(self._kept))]
+            self._kept[name] = column
         return self._kept[name]
-
-    def _keep(self, name: str, column: Array) -> None:
-        while (
-            self._kept
-            and sum(one.nbytes for one in self._kept.values()) + column.nbytes > KEPT_BYTES
-        ):
-            del self._kept[next(iter(self._kept))]
-        self._kept[name] = column
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)

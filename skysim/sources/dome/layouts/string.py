@@ -74,11 +74,6 @@ class Tape(NamedTuple):
     length_m: Floats
     closed: bool
 
-    def led_count(self, pitch_m: float) -> int:
-        """Number of LEDs that fit; on a ring the last has a pitch to the first."""
-        fit = int(self.length_m[-1] / pitch_m)
-        return max(fit, 1) if self.closed else fit + 1
-
     def rays(self, at_m: Floats) -> Floats:
         """(N, 3) unit vectors from the bearing to places along the tape."""
         tilt_rad = np.interp(at_m, self.length_m, self.tilt_rad)
@@ -107,10 +102,10 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     if not tapes:
         zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
         return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
-    design_m = [
-        config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float)
-        for tape in tapes
-    ]
+    # As many as fit; on a ring the last has a pitch to the first.
+    fit = [int(tape.length_m[-1] / config.pitch_m) for tape in tapes]
+    counts = [max(n, 1) if tape.closed else n + 1 for n, tape in zip(fit, tapes, strict=True)]
+    design_m = [config.pitch_m * np.arange(n, dtype=float) for n in counts]
     rng = random_stream(config.hardware_seed, TAPE_STREAM)
     stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
     # The pitch errs by a factor for each tape, the glue sideways along it.
@@ -118,7 +113,7 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     for tape, at_m, factor in zip(tapes, design_m, stretch, strict=True):
         sideways_m = scaled_errors(config.glue_scatter_m, wander(at_m, rng))
         place_m.append(aside(surface, tape, factor * at_m, sideways_m))
-    number = np.repeat(np.arange(len(tapes)), [len(at_m) for at_m in design_m])
+    number = np.repeat(np.arange(len(tapes)), counts)
     return Wound(np.concatenate(place_m), number, np.concatenate(design_m))
 
 
