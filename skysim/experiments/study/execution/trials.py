@@ -309,14 +309,16 @@ def flight_outcomes(
         yield shot.truth.t_s, replace(one, exposure_ms=1e3 * shot.frame.exposure_s)
 
 
-def one_by_one(
-    run: Callable[[TrialSetup, int], Outcome],
-) -> Callable[[TrialSetup, Sequence[int]], list[Outcome]]:
+# From a setup and seeds to the outcomes of the trials.
+Trials = Callable[[TrialSetup, Sequence[int]], list[Outcome]]
+
+
+def one_by_one(run: Callable[[TrialSetup, int], Outcome]) -> Trials:
     """Outcomes of trials that are run one by one."""
     return lambda setup, seeds: [run(setup, seed) for seed in seeds]
 
 
-TRIALS: dict[str, Callable[[TrialSetup, Sequence[int]], list[Outcome]]] = {
+TRIALS: dict[str, Trials] = {
     "centroids": run_centroid_trials,
     "frames": one_by_one(run_frame_trial),
     "flight": one_by_one(run_flight_trial),

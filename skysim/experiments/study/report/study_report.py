@@ -54,6 +54,7 @@ from skysim.results.report_blocks import (
 )
 from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 
+Command = Callable[[str], str]  # from a verb to the shell command that applies it to a study
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
 STUDY_FILE = "The study file"
@@ -128,9 +129,7 @@ def study_report(plan: Plan, store: Store) -> Report:
     return compose(plan.study, store, analyze(plan, store, command), command)
 
 
-def commands(
-    plan: Plan, store: Store, study: str = "", out: Path | None = None
-) -> Callable[[str], str]:
+def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Command:
     """The function from a verb to the shell command that applies it to a study, with overrides if the verb runs it.
 
     Parameters
@@ -156,7 +155,7 @@ def shell_command(study: str, out: Path | None, overrides: OverrideTexts, verb: 
     return shlex.join(words)
 
 
-def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
+def analyze(plan: Plan, store: Store, command: Command) -> Analysis:
     """The analysis of the trials in a store; `command` is the function of `commands`."""
     study = plan.study
     about = overview(plan)
@@ -195,7 +194,7 @@ def compose(
     study: Study,
     store: Store,
     found: Analysis,
-    command: Callable[[str], str],
+    command: Command,
 ) -> Report:
     """The report of an analyzed study: its question, its answer, one figure, and then the details.
 

@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
@@ -46,7 +47,7 @@ BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a mi
 
 
 def dimmed(
-    places: Callable[[Any, Surface, np.random.Generator], Floats],
+    places: Callable[[Any, Surface, Generator], Floats],
 ) -> Callable[[Any, Surface, LedConfig, Band], Sources]:
     """The layout of LEDs at a spread's places, each with a random level of the layout's `dimming`."""
 
@@ -58,23 +59,19 @@ def dimmed(
     return layout
 
 
-def fibonacci(config: FibonacciConfig, surface: Surface, _rng: np.random.Generator) -> Floats:
+def fibonacci(config: FibonacciConfig, surface: Surface, _rng: Generator) -> Floats:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
     return project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
 
 
-def random_places(
-    config: RandomPlacesConfig, surface: Surface, rng: np.random.Generator
-) -> Floats:
+def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> Floats:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     return project_from_bearing(
         surface, scattered_cap(config.count, np.radians(config.cap_deg), rng)
     )
 
 
-def poisson_disk(
-    config: PoissonDiskConfig, surface: Surface, rng: np.random.Generator
-) -> Floats:
+def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -118,7 +115,7 @@ def poisson_disk(
     return darts_m[thin(darts_m, config.spacing_m)]
 
 
-def optimized(config: OptimizedConfig, surface: Surface, rng: np.random.Generator) -> Floats:
+def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse

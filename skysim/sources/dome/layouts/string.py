@@ -16,6 +16,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
@@ -117,7 +118,7 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     return Wound(np.concatenate(place_m), number, np.concatenate(design_m))
 
 
-def wander(at_m: Floats, rng: np.random.Generator) -> Floats:
+def wander(at_m: Floats, rng: Generator) -> Floats:
     """Standard normal numbers at increasing places of a tape, correlated by exp(-d / GLUE_M) (Gauss-Markov).
 
     x_n = rho x_(n-1) + sqrt(1 - rho^2) g_n, rho = exp(-(d_n - d_(n-1)) / GLUE_M).
@@ -280,7 +281,7 @@ def marked_m(
     surface: Surface,
     place_m: Floats,
     outward_m: Floats,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Floats:
     """(N, 3) places of holes that a laser marks for designed places (N, 3) of a surface that is outward_m off there.
 
