@@ -57,19 +57,9 @@ from skysim.tracking.tracker_interface import OWN, TRACKERS
 
 SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
-FLIGHT_QUANTITIES = (
-    "availability",
-    "filter_arcsec",
-    "filter_worst_arcsec",
-    "drift_arcsec",
-    "pointing_arcsec",
-    "pointing_worst_arcsec",
-    "saturated_s",
-    "exposure_ms",
-)
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
+    **dict.fromkeys(metrics.FLIGHT_QUANTITIES, ("flight",)),
     **dict.fromkeys(("streak_px", "detect_ms", "computer_ms"), ("frames", "flight")),
 }
 
