@@ -30,6 +30,7 @@ from skysim.results.report_blocks import (
 )
 from skysim.results.requirements import NOT_MET, Judgment
 
+Rows = Sequence[FrameRow]
 # Settings that help where the tracker's own refusal names none.
 HELP = {
     NO_STARS: "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)",
@@ -54,7 +55,7 @@ def run_report(
     title: str,
     command: str,
     angles: tuple[str, str, str],
-    rows: Sequence[FrameRow],
+    rows: Rows,
     *,
     stages_ms: Mapping[str, float],
     computer: str,
@@ -127,7 +128,7 @@ ERROR_CAPTION = (
 MOTION_CAPTION = "Attitude, estimates and actuators against time."
 
 
-def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
+def summary(rows: Rows) -> dict[str, Any]:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
     Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
@@ -146,7 +147,7 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     }
 
 
-def claims(solved: Sequence[FrameRow]) -> dict[str, float]:
+def claims(solved: Rows) -> dict[str, float]:
     """Rms errors and claimed ones in arcsec, mean NEES, and the mean share of the survey; empty without a claim."""
     known = [row for row in solved if math.isfinite(row.nees)]
     if not known:
@@ -162,7 +163,7 @@ def claims(solved: Sequence[FrameRow]) -> dict[str, float]:
     }
 
 
-def claims_text(rows: Sequence[FrameRow]) -> str:
+def claims_text(rows: Rows) -> str:
     """The claimed and the real errors in words; empty without a claim."""
     run = summary(rows)
     if "nees_mean" not in run:
@@ -176,7 +177,7 @@ def claims_text(rows: Sequence[FrameRow]) -> str:
     return CLAIMS.format(**run) + survey
 
 
-def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
+def magnitude_errors(rows: Rows) -> dict[str, Any]:
     """Mean and standard deviation of measured minus catalog magnitude over the stars of all frames; empty without any.
 
     The sum of squares about the common mean is that within the frames and that of the frames' means.
@@ -196,7 +197,7 @@ def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
     }
 
 
-def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
+def scatter_arcsec(solved: Rows) -> list[float]:
     """Standard deviations of the three estimated angles about straight lines in time, fitted by least squares.
 
     A laboratory without a truth measures it at rest or at a constant rate. NaN for fewer than three frames.
@@ -213,13 +214,13 @@ def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
     return (3600 * np.sqrt(squares / (len(t_s) - 2))).tolist()
 
 
-def magnitude_text(rows: Sequence[FrameRow]) -> str:
+def magnitude_text(rows: Rows) -> str:
     """The magnitude errors in words; empty without any."""
     errors = magnitude_errors(rows)
     return MAGNITUDES.format(**errors) if errors else ""
 
 
-def verdict(rows: Sequence[FrameRow]) -> Verdict:
+def verdict(rows: Rows) -> Verdict:
     """How many frames were solved, how many of them wrongly, and the errors."""
     run = summary(rows)
     tone: Tone = "good" if run["solved"] == run["frames"] else "warning"
@@ -233,7 +234,7 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
     return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
 
 
-def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
+def required(judged: Sequence[Judgment], rows: Rows) -> Items:
     """The judgments of requirements in words, and how many independent draws the frames are if they are fewer."""
     lines = [one.text() for one in judged]
     draws = max((one.draws for one in judged), default=math.inf)
@@ -246,7 +247,7 @@ def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
     return Items(lines, "Requirements" if lines else "", "bad" if unmet else "")
 
 
-def refusals(rows: Sequence[FrameRow], findings: Sequence[str]) -> list[str]:
+def refusals(rows: Rows, findings: Sequence[str]) -> list[str]:
     """Each reason why frames were not solved, their number, and the settings that would help.
 
     Whether stars are too few in too long or too short an exposure is known to the check, by its `findings`.
@@ -275,7 +276,7 @@ def motion_section(
     return Section("Motion", [*plot, Items(lines), Items(findings, tone="warning")])
 
 
-def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
+def frame_table(angles: tuple[str, str, str], rows: Rows) -> Table:
     """One row per frame: truth, estimate, errors, lights and time; `angles` names the three angles."""
     columns = [
         Column("frame"),
@@ -304,7 +305,7 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
     return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))
 
 
-def error_figure(rows: Sequence[FrameRow]) -> bytes:
+def error_figure(rows: Rows) -> bytes:
     """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
     fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]

@@ -32,6 +32,7 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
+Numbers = NDArray[np.uint16]  # (H, W) digital numbers of a frame
 TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
@@ -65,7 +66,7 @@ def image_files(folder: Path) -> list[Path]:
     return list(found.values())
 
 
-def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, Numbers]]:
     """The frames of a folder. Raises InputError for a frame that cannot be used."""
     tables: dict[Path, dict[str, Setting]] = {}
     for path in image_files(folder):
@@ -77,7 +78,7 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
         yield path, setting, raw_numbers(path, picture)
 
 
-def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
+def raw_numbers(path: Path, picture: images.ViewedImage) -> Numbers:
     """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
     pixels = picture.pixels
     if pixels.ndim != 2 or picture.mosaic:
@@ -167,7 +168,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     return stack
 
 
-def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
+def padding_bits(frame: Numbers, bits: int) -> int:
     """Number of bits by which the numbers are shifted to the left; 0 if they are within the camera's range."""
     if frame.max() < 2**bits:
         return 0
@@ -248,9 +249,7 @@ def capacity_e(config: DetectorConfig) -> float:
     return min(config.full_well_e, (2**config.bits - 1 - config.offset_dn) * config.gain_e_dn)
 
 
-def frames_of(
-    camera: CameraConfig, shot: PlannedFrame, seed: int
-) -> Iterator[NDArray[np.uint16]]:
+def frames_of(camera: CameraConfig, shot: PlannedFrame, seed: int) -> Iterator[Numbers]:
     """The frames of a shot by the simulated detector in uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
     made = detector.Detector.from_camera(camera.model_copy(update={"detector": at_it}))

@@ -26,6 +26,8 @@ from skysim.experiments.characterize.photon_transfer import (
     propagate,
 )
 
+Levels = Sequence[Level]
+Temperatures = Sequence[float | None]  # None: unknown
 # Standard deviations above the median dark, beyond which pixels are left out of the photon transfer.
 HOT_SIGMAS = 20.0
 HIT_SIGMAS = 8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
@@ -66,7 +68,7 @@ class Findings(NamedTuple):
     remarks: list[str]
 
 
-def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
+def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
     """Every parameter from levels of darks and flats that have passed the checks of `frame_files`.
 
     The dark current is stated at the darks' temperature that is nearest to that of the flats.
@@ -117,9 +119,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
 
 
 def fitted_transfer(
-    darks: Sequence[Level],
-    flats: Sequence[Level],
-    temperatures: Sequence[float | None],
+    darks: Levels,
+    flats: Levels,
+    temperatures: Temperatures,
     flat_points: Sequence[TransferPoint],
     usable: Bools,
 ) -> tuple[Transfer, list[Level]]:
@@ -140,7 +142,7 @@ def fitted_transfer(
     return photon_transfer.fit([*dark_points, *lit], flicker), fitted
 
 
-def usable_pixels(darks: Sequence[Level]) -> Bools:
+def usable_pixels(darks: Levels) -> Bools:
     """Pixels that no particle has hit, and that are not hot in any dark.
 
     Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
@@ -165,7 +167,7 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Bools:
     )
 
 
-def nearest_index(temperatures: Sequence[float | None], temperature_c: float | None) -> int:
+def nearest_index(temperatures: Temperatures, temperature_c: float | None) -> int:
     """Index of the darks' temperature that is nearest to a temperature; 0 if one of them is unknown."""
     if temperature_c is None or temperatures[0] is None:
         return 0
@@ -175,7 +177,7 @@ def nearest_index(temperatures: Sequence[float | None], temperature_c: float | N
 
 
 def best_temperature(
-    temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer, own: int
+    temperatures: Temperatures, darks: Levels, transfer: Transfer, own: int
 ) -> int:
     """Index of the temperature at which the dark charge grows most from the shortest to the longest dark frame.
 
@@ -227,7 +229,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 
 def dark_parameters(
     found: Findings,
-    darks: Sequence[Level],
+    darks: Levels,
     planes: fixed_pattern.Planes,
     own: int,
     ratio: float,
@@ -313,7 +315,7 @@ def unresolved(
     )
 
 
-def doubling(found: Findings, temperatures: Sequence[float | None]) -> None:
+def doubling(found: Findings, temperatures: Temperatures) -> None:
     """Add the temperature step that doubles the dark current: ln 2 over the slope of ln D, by a weighted line.
 
     The same pixels are compared at all temperatures, so their scatter does not matter.

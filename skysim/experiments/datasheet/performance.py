@@ -23,6 +23,7 @@ from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.tracking import factory
 
+Rows = list[Record]
 CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude that a datasheet may claim
 LEVELS = (0.683, 0.954, 0.997)  # probabilities of the quantiles
 LIMITS = (0.95, 0.9)  # probabilities of a right attitude that bound a rate or an acceleration
@@ -65,7 +66,7 @@ def tally(right: Any, false: Any) -> Counts:
     )
 
 
-def claims(found: Counts) -> list[Record]:
+def claims(found: Counts) -> Rows:
     """Which of CLAIMS the frames show, and how many more frames each needs if none of them fails."""
     failures = found.frames - found.right
     return [
@@ -81,7 +82,7 @@ def claims(found: Counts) -> list[Record]:
     ]
 
 
-def quantiles(sheet: MeasuredFrames) -> list[Record]:
+def quantiles(sheet: MeasuredFrames) -> Rows:
     """Quantiles of the errors' magnitude over independent frames, with intervals between order statistics."""
     errors = sheet.errors(sheet.rows("sky")).reshape(3, -1)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
@@ -155,7 +156,7 @@ def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
     }
 
 
-def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
+def by_rate(sheet: MeasuredFrames, experiment: str) -> Rows:
     """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude.
 
     Parameters
@@ -172,7 +173,7 @@ def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
     return found
 
 
-def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[Record]:
+def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> Rows:
     """Noise-equivalent angle, error and outcomes by the levels of a key, ascending; empty without the experiment."""
     return [
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
@@ -201,7 +202,7 @@ class Limit(NamedTuple):
     fields: int
 
 
-def bracket(rows: list[Record], key: str) -> Limit:
+def bracket(rows: Rows, key: str) -> Limit:
     """The limit in a rate or an acceleration, from rows in ascending order of it."""
     fewest = min(row["counts"].frames for row in rows)
     share = next(
@@ -223,7 +224,7 @@ def bracket(rows: list[Record], key: str) -> Limit:
 UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²", "off_deg": "°"}
 
 
-def bracket_text(what: str, rows: list[Record], key: str) -> str:
+def bracket_text(what: str, rows: Rows, key: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
     limit = bracket(rows, key)
     unit = UNITS[key]
@@ -241,7 +242,7 @@ def bracket_text(what: str, rows: list[Record], key: str) -> str:
     return f"{text}{false_claims_text(rows, key)}" if "nees" in rows[0] else text
 
 
-def false_claims_text(rows: list[Record], key: str) -> str:
+def false_claims_text(rows: Rows, key: str) -> str:
     """A sentence on the levels at which the errors are not as the tracker claims; empty without any.
 
     All levels together at CONFIDENCE, as a study judges its points (`answer.jointly`).
@@ -277,7 +278,7 @@ def solution_times_s(sheet: MeasuredFrames) -> Floats:
     return np.array(found[TIMED:])
 
 
-def disturbances(sheet: MeasuredFrames) -> list[Record]:
+def disturbances(sheet: MeasuredFrames) -> Rows:
     """Outcomes and errors under each disturbance, the undisturbed frames first."""
     undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
     cases = {"none": undisturbed}
@@ -293,7 +294,7 @@ def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
     return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
 
 
-def exclusions(sheet: MeasuredFrames) -> list[Record]:
+def exclusions(sheet: MeasuredFrames) -> Rows:
     """Outcomes and errors by the angle of the boresight from bright bodies, the farthest first."""
     angles = sorted(sheet.levels("exclusion", "off_deg"), reverse=True)
     return [

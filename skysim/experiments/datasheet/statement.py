@@ -10,7 +10,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts, bracket_text
+from skysim.experiments.datasheet.performance import Counts, Rows, bracket_text
 from skysim.experiments.datasheet.variance_components import Bounded, Components
 from skysim.results.metrics import TAILS, Summary
 
@@ -22,7 +22,6 @@ NAMES = {
     "temporal": "temporal noise",
     "total": "sum",
 }
-Rows = list[Record]
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
@@ -375,7 +374,7 @@ def rate_section(statement: Statement) -> StatementSection:
 RATE_HEADERS = ["rate °/s", "streak px", *PAIR_HEADERS]
 
 
-def rate_rows(rows: list[Record]) -> list[list[str]]:
+def rate_rows(rows: Rows) -> list[list[str]]:
     """The cells of rows by rate."""
     return [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.3g}", *pair_cells(row)]

@@ -21,6 +21,7 @@ EXTRA = "needs optional packages: pip install 'skysim[export]'"
 KEPT_BYTES = 250_000_000  # size of the columns kept in memory for further use; the oldest are dropped first
 
 Array = NDArray[Any]
+Columns = Mapping[str, Array]
 Source = Callable[[str], Array]  # the column of some rows by its name
 
 
@@ -80,7 +81,7 @@ class Rows(Mapping[str, Array]):
         return {name: self.sources[source](name)[here : here + 1] for name in self.names}
 
 
-def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
+def row_of(columns: Columns, number: int) -> Columns:
     """The columns of one row."""
     one = slice(number, number + 1)
     return (
@@ -90,7 +91,7 @@ def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
     )
 
 
-def subset(columns: Mapping[str, Array], rows: Array | slice) -> Rows:
+def subset(columns: Columns, rows: Array | slice) -> Rows:
     """Some rows of a table, by their numbers or from one to another."""
     count = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
     return Rows(tuple(columns), [lambda name: columns[name][rows]], [count])
@@ -104,7 +105,7 @@ def can_write_parts() -> bool:
     return importlib.util.find_spec("pyarrow") is not None
 
 
-def to_arrow(columns: Mapping[str, Array]) -> Any:
+def to_arrow(columns: Columns) -> Any:
     """An Arrow table; missing values (NaN, None) are null."""
     import pyarrow
 
@@ -118,7 +119,7 @@ def to_arrow(columns: Mapping[str, Array]) -> Any:
     )
 
 
-def write_part(path: Path, columns: Mapping[str, Array]) -> None:
+def write_part(path: Path, columns: Columns) -> None:
     """Write a part. It appears whole and on the disk, or not at all."""
     import pyarrow.parquet
 
