@@ -2,15 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Frame, FrameRow, Truth
+from skysim.core.types import Frame, FrameRow, Record, Truth
 from skysim.core.units import ConfigModel
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
@@ -33,8 +32,7 @@ def with_config(config: Config, section: str, **values: Any) -> Config:
     return config.model_copy(update={head: changed})
 
 
-@dataclass(frozen=True, slots=True)
-class TrackerScore:
+class TrackerScore(NamedTuple):
     """Statistics of one tracker.
 
     Attributes
@@ -160,10 +158,10 @@ def write_scores(
     return scores
 
 
-def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
+def as_dicts(scores: Sequence[TrackerScore]) -> list[Record]:
     """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
-        asdict(score)
+        score._asdict()
         | {
             "right": score.right.value,
             "right_low": score.right.low,

@@ -5,13 +5,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from estimator.trackers.star_tracker import NO_STARS
-from skysim.core.types import FrameRow
+from skysim.core.types import FrameRow, Record
 from skysim.results import metrics
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
@@ -128,7 +127,7 @@ ERROR_CAPTION = (
 MOTION_CAPTION = "Attitude, estimates and actuators against time."
 
 
-def summary(rows: Rows) -> dict[str, Any]:
+def summary(rows: Rows) -> Record:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
     Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
@@ -177,7 +176,7 @@ def claims_text(rows: Rows) -> str:
     return CLAIMS.format(**run) + survey
 
 
-def magnitude_errors(rows: Rows) -> dict[str, Any]:
+def magnitude_errors(rows: Rows) -> Record:
     """Mean and standard deviation of measured minus catalog magnitude over the stars of all frames; empty without any.
 
     The sum of squares about the common mean is that within the frames and that of the frames' means.

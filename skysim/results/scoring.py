@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, FrameRow, Mount, Truth
+from skysim.core.types import Frame, FrameRow, Mount, Record, Truth
 from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
@@ -149,7 +149,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     from astropy.table import Table
 
     missing = (math.nan,) * 3
-    columns: dict[str, Any] = {
+    columns: Record = {
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")
     }

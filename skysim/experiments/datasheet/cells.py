@@ -6,9 +6,8 @@ thermal state, attitude and noise by number, so that terms can be separated and 
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.types import Bools, Floats, Record
-from skysim.core.yaml_reader import parse_yaml
+from skysim.core.yaml_reader import OverrideTexts, parse_yaml
 from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
@@ -66,8 +65,7 @@ TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # lengths of the streaks in trackin
 MISSED_PX = (3.0, 6.0, 12.0, 24.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Size:
+class Size(NamedTuple):
     """Numbers of fields, units, thermal states, attitudes in a field, frames at an attitude, and other cells.
 
     Attributes
@@ -108,6 +106,9 @@ class DatasheetCell(NamedTuple):
         return " ".join(
             [self.experiment, *(f"{key} {value}" for key, value in self.levels.items())]
         )
+
+
+Cells = Iterator[DatasheetCell]
 
 
 class Draw(NamedTuple):
@@ -227,7 +228,7 @@ class Designer:
         turns, state = divmod(number, self.states)
         return Draw((turns + state) % self.units, state, 10 + number)
 
-    def cells(self) -> Iterator[DatasheetCell]:
+    def cells(self) -> Cells:
         """All cells, in the order in which they are run."""
         yield from self.terms()
         combinations = self.units * self.states
@@ -254,7 +255,7 @@ class Designer:
             change = scene_changes.beside(body, off_deg, off_deg)
             yield from self.draws("exclusion", 1, change, body=body, off_deg=off_deg)
 
-    def terms(self) -> Iterator[DatasheetCell]:
+    def terms(self) -> Cells:
         """The crossed and nested design of `components`."""
         counts = (self.units, self.states, self.size.attitudes, self.size.frames)
         for numbers in itertools.product(*map(range, counts)):
@@ -263,7 +264,7 @@ class Designer:
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: Any
-    ) -> Iterator[DatasheetCell]:
+    ) -> Cells:
         """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
         for number in range(count):
             settings = self.settings(self.in_turn(number)) | {
@@ -288,22 +289,20 @@ class Designer:
         """Accelerations that bend a path by these lengths in a time, to two digits."""
         return [float(f"{bend * self.pixel_deg / time_s**2:.2g}") for bend in bends_px]
 
-    def pair(
-        self, experiment: str, name: str, level: float, change: Settings
-    ) -> Iterator[DatasheetCell]:
+    def pair(self, experiment: str, name: str, level: float, change: Settings) -> Cells:
         """Two frames of each attitude with a change, which differ only in their noise."""
         for frame in range(2):
             settings = self.settings(Draw()) | change
             yield DatasheetCell(experiment, {name: level, "frame": frame}, settings)
 
-    def rates(self) -> Iterator[DatasheetCell]:
+    def rates(self) -> Cells:
         """Pairs of frames at each rate, across the boresight and about it."""
         for experiment, streaks_px in (("rate", STREAKS_PX), ("boresight", BORESIGHT_PX)):
             usual = self.rates_deg_s(streaks_px, experiment)
             for rate in self.chosen_rates_deg_s or usual:
                 yield from self.at_rate(experiment, rate)
 
-    def at_rate(self, experiment: str, rate_deg_s: float) -> Iterator[DatasheetCell]:
+    def at_rate(self, experiment: str, rate_deg_s: float) -> Cells:
         """A pair of frames at a rate, of one of RATES."""
         change = {"trial.rate_deg_s": rate_deg_s} | RATES[experiment]
         return self.pair(experiment, "rate_deg_s", rate_deg_s, change)
@@ -314,7 +313,7 @@ class Designer:
             rates = [one.levels["rate_deg_s"] for one in cells if one.experiment == name]
             cells += self.at_rate(name, 2 * max(rates))
 
-    def sequences(self) -> Iterator[DatasheetCell]:
+    def sequences(self) -> Cells:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
@@ -322,13 +321,13 @@ class Designer:
                 settings["trial.rate_deg_s"] = rate
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
-    def accelerations(self) -> Iterator[DatasheetCell]:
+    def accelerations(self) -> Cells:
         """Pairs of frames at accelerations, with a rate of zero at mid-exposure."""
         key = "acceleration_deg_s2"
         for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
             yield from self.pair("acceleration", key, bend, {f"trial.{key}": bend})
 
-    def tracked(self) -> Iterator[DatasheetCell]:
+    def tracked(self) -> Cells:
         """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
 
         The prediction extrapolates the mean rate between the last two frames, so an acceleration a displaces the next
@@ -346,7 +345,7 @@ class Designer:
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
                 yield from self.pair(f"tracked {key}", key, value, change)
 
-    def magnitudes(self) -> Iterator[DatasheetCell]:
+    def magnitudes(self) -> Cells:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
         if not self.under_stars:
             return
@@ -365,8 +364,7 @@ STUDY = "datasheet.yaml"
 AXES = ("x_arcsec", "y_arcsec", "roll_arcsec")
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredFrames:
+class MeasuredFrames(NamedTuple):
     """The measured frames of a datasheet.
 
     Attributes
@@ -383,7 +381,7 @@ class MeasuredFrames:
 
     scene: Scene
     scene_name: str
-    overrides: Mapping[str, str]
+    overrides: OverrideTexts
     size: Size
     designer: Designer
     cells: list[DatasheetCell]
@@ -446,7 +444,7 @@ def attitudes(scene: Scene) -> Record:
 def measure(
     scene_name: str,
     scene: Scene,
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
     folder: Path,
     *,
     quick: bool = False,
@@ -477,7 +475,7 @@ def measure(
     """
     check_scene(scene)
     usual = QUICK if quick else FULL
-    size = replace(usual, fields=usual.fields if fields is None else fields)
+    size = usual if fields is None else usual._replace(fields=fields)
     purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
     require_fields(size.fields, size.fields, least, f"too few {purpose}")
     designer = Designer(scene, size, rates_deg_s)
@@ -507,7 +505,7 @@ def planned(
     path: Path,
     scene_name: str,
     designer: Designer,
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
     cells: list[DatasheetCell],
 ) -> Plan:
     """Write the study file of the cells and plan its trials. Raises InputError for settings that are not allowed."""

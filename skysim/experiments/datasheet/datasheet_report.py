@@ -131,7 +131,7 @@ def draw_by(name: str, key: str, label: str, statement: Statement, fig: Any) -> 
         axes.set_xlabel(label)
 
 
-def draw_right(axes: Any, x: list[float], rows: list[dict[str, Any]], **options: Any) -> None:
+def draw_right(axes: Any, x: list[float], rows: list[Record], **options: Any) -> None:
     """Percentages of right attitudes with their exact bounds."""
     found = 100 * np.array([row["counts"].share("right")[:3] for row in rows])
     draw_bars(axes, x, found[:, 0], found[:, 1:].T, "o-", **{"color": INK[2]} | options)

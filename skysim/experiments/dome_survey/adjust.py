@@ -103,7 +103,7 @@ def check_lens(
     if uncertainty.fit_distortion:
         return
     try:
-        fitted = replace(uncertainty, fit_distortion=True)
+        fitted = uncertainty._replace(fit_distortion=True)
         survey = survey_in_rounds(frames, prior, fitted).survey
     except InputError:
         return
@@ -230,7 +230,7 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     """
     survey = run.survey
     prior = run.prior
-    model = replace(prior, camera=survey.camera, leds=survey.leds, lever=survey.lever)
+    model = prior._replace(camera=survey.camera, leds=survey.leds, lever=survey.lever)
     # The attitudes are adjusted, so only the errors of the map and of the residuals remain in the predictions.
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
@@ -250,7 +250,7 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
         rows.append(row)
         matches.append(match)
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, replace(model, leds=prior.leds)
+    return rows, matches, model._replace(leds=prior.leds)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -313,7 +313,7 @@ def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
     survey = run.survey
     return replace(
         run,
-        prior=replace(prior, leds=moved(prior.leds)),
+        prior=prior._replace(leds=moved(prior.leds)),
         survey=replace(survey, leds=moved(survey.leds)),
     )
 

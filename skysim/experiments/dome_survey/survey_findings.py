@@ -118,7 +118,7 @@ class SurveyRun:
         before = self.uncertainty
         lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
         focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
-        return replace(before, lever_sigma_m=lever_m, focal_error=focal)
+        return before._replace(lever_sigma_m=lever_m, focal_error=focal)
 
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Bools:

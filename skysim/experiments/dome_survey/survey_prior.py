@@ -1,7 +1,7 @@
 """The model that is assumed before a survey of the dome, and its uncertainty."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,8 +35,7 @@ UNCERTAINTY_RANGES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SurveyUncertainty:
+class SurveyUncertainty(NamedTuple):
     """Uncertainty before the survey: standard deviations along or about each axis, and of the focal length.
 
     Attributes
@@ -66,8 +65,7 @@ class SurveyUncertainty:
         return self.focal_error * camera.focal_px
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationPrior:
+class CalibrationPrior(NamedTuple):
     """Assumed model of dome and camera, before a survey or from it.
 
     Attributes

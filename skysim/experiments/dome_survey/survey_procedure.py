@@ -197,8 +197,8 @@ def survey_images(
     run = run_survey(frames, prior, uncertainty, watch)
     while len(frames) < len(pictures):
         found = run.survey
-        model = replace(
-            prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever
+        model = prior._replace(
+            camera=found.camera, leds=found.surveyed_leds, lever=found.lever
         )
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [
@@ -207,7 +207,7 @@ def survey_images(
         more = frames_with_attitude(
             named,
             model,
-            replace(run.uncertainty_after, led_sigma_m=run.accuracy.led_rms_m),
+            run.uncertainty_after._replace(led_sigma_m=run.accuracy.led_rms_m),
             settings,
         )
         if len(more) == len(frames):

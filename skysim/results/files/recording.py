@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from skysim.core.files import (
     write_table,
 )
 from skysim.core.images import TOP_DOWN_CARD, read_image
-from skysim.core.types import ATTITUDES, Floats, Frame, Truth
+from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
@@ -34,8 +34,7 @@ SKY_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 LAB_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTruth:
+class FrameTruth(NamedTuple):
     """The truth of one frame, as read from its file: attitudes (4,) as xyzw, rate (3,), and the table of sources."""
 
     frame: int
@@ -58,7 +57,7 @@ class Recording:
     stems: list[Path] = field(repr=False)
 
     @cached_property
-    def meta(self) -> dict[str, Any]:
+    def meta(self) -> Record:
         """Scene, seed and definition of the lab axes, from the truth of the first frame. Raises InputError."""
         header = read_table(self.stems[0].with_suffix(".ecsv")).meta
         missing = [key for key in ("scene", "seed", "lab") if key not in header]
