@@ -247,7 +247,7 @@ def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
 def turn_rates(t_s: Floats, lab_from_body: Rotation) -> Floats:
     """(N - 1, 3) mean rates about the body axes between N attitudes."""
     turned = lab_from_body[:-1].inv() * lab_from_body[1:]
-    return np.asarray(turned.as_rotvec() / np.diff(t_s)[:, None])
+    return turned.as_rotvec() / np.diff(t_s)[:, None]
 
 
 def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:

@@ -173,7 +173,7 @@ class Level:
     @property
     def mean_dn(self) -> Floats:
         """(H, W) mean of all frames."""
-        return np.asarray(self.halves_dn.mean(axis=0, dtype=np.float64))
+        return self.halves_dn.mean(axis=0, dtype=np.float64)
 
     def moments(self, used: Bools) -> Moments:
         """Mean and variance over the used pixels.

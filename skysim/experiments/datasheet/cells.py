@@ -109,6 +109,7 @@ class DatasheetCell(NamedTuple):
 
 
 Cells = Iterator[DatasheetCell]
+CellRows = list[int]  # numbers of cells
 
 
 class Draw(NamedTuple):
@@ -388,7 +389,7 @@ class MeasuredFrames(NamedTuple):
     columns: dict[str, NDArray[Any]]
     spec: TrialSpec
 
-    def rows(self, experiment: str, **levels: Any) -> list[int]:
+    def rows(self, experiment: str, **levels: Any) -> CellRows:
         """Rows of the cells of an experiment that have these levels."""
         return [
             row
@@ -402,15 +403,15 @@ class MeasuredFrames(NamedTuple):
             dict.fromkeys(self.cells[row].levels[name] for row in self.rows(experiment))
         )
 
-    def column(self, name: str, rows: list[int]) -> NDArray[Any]:
+    def column(self, name: str, rows: CellRows) -> NDArray[Any]:
         """(cells, fields) values of a column in some cells."""
         return self.columns[name][rows]
 
-    def right(self, rows: list[int]) -> Bools:
+    def right(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame was solved and is not false."""
         return (self.columns["solved"][rows] > 0) & ~self.false(rows)
 
-    def false(self, rows: list[int]) -> Bools:
+    def false(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame has a false attitude."""
         return self.columns["wrong"][rows] > 0
 
@@ -427,7 +428,7 @@ class MeasuredFrames(NamedTuple):
                 found.append(experiment)
         return found
 
-    def errors(self, rows: list[int]) -> Floats:
+    def errors(self, rows: CellRows) -> Floats:
         """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false attitudes."""
         errors = np.stack([self.columns[name][rows] for name in AXES])
         return np.where(self.right(rows), errors, np.nan)

@@ -69,7 +69,7 @@ def rms_of_term(shares: Floats) -> Floats:
 
 def unit_mean(sheet: MeasuredFrames) -> Floats:
     """(3,) mean error of the first unit in the first thermal state, which the frames at rates have."""
-    return np.asarray(term_errors(sheet)[0][:, :, 0, 0].mean(axis=(1, 2, 3)))
+    return term_errors(sheet)[0][:, :, 0, 0].mean(axis=(1, 2, 3))
 
 
 def unit_scatter(errors: Floats) -> Floats:

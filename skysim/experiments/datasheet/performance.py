@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from skysim.core.types import Floats, Record
-from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.cells import CellRows, MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     Bounded,
@@ -49,12 +49,12 @@ class Counts(NamedTuple):
         )
 
 
-def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:
+def counts(sheet: MeasuredFrames, rows: CellRows) -> Counts:
     """The outcomes of some cells."""
     return tally(sheet.right(rows), sheet.false(rows))
 
 
-def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
+def counts_of_fields(sheet: MeasuredFrames, rows: CellRows) -> Counts:
     """The outcomes of fields with a frame in each of some cells; the frames of a field count as one."""
     return tally(sheet.right(rows).all(axis=0), sheet.false(rows).any(axis=0))
 
@@ -122,7 +122,7 @@ def noise_equivalent_angle(apart: Floats) -> float:
     return math.sqrt(mean_known(apart**2) / 2)
 
 
-def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
+def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     found: Record = {"counts": counts_of_fields(sheet, rows), **rms_by_group(sheet, rows)}
@@ -141,14 +141,14 @@ def root_interval(squares: Floats) -> list[float]:
     return np.sqrt(np.maximum(bounded(squares[np.isfinite(squares)])[1:], 0.0)).tolist()
 
 
-def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
+def mean_nees(sheet: MeasuredFrames, rows: CellRows) -> Bounded:
     """The mean normalized error squared of right attitudes: 3 if their covariances are right."""
     nees = np.where(sheet.right(rows), sheet.column("nees", rows), np.nan)
     solved = np.isfinite(nees).sum(axis=0)
     return Bounded(*metrics.mean_nees({"nees": mean_known(nees, 0), "solved": solved})[:3])
 
 
-def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
+def rms_by_group(sheet: MeasuredFrames, rows: CellRows) -> dict[str, float]:
     """The rms error of right attitudes about one axis, by `rms_` and the name of the group of axes."""
     squares = sheet.errors(rows) ** 2
     return {
@@ -289,7 +289,7 @@ def disturbances(sheet: MeasuredFrames) -> Rows:
     return [{"disturbance": name} | outcome(sheet, rows) for name, rows in cases.items()]
 
 
-def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
+def outcome(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Counts and rms errors of some cells, each frame on its own."""
     return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
 

@@ -22,6 +22,7 @@ NAMES = {
     "temporal": "temporal noise",
     "total": "sum",
 }
+Texts = list[str]
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
@@ -105,7 +106,7 @@ def state(sheet: MeasuredFrames) -> Statement:
 # As sections.
 
 
-def sizes(table: variance_components.TermTable, name: str) -> list[str]:
+def sizes(table: variance_components.TermTable, name: str) -> Texts:
     """A term's root mean square and its percentage of the sum; its upper bounds if it is not shown to be above 0."""
     low, high = (max(end, 0.0) for end in table.squares[name][1:])
     total = table.squares["total"].value
@@ -322,18 +323,18 @@ def quantile_text(found: Summary) -> str:
     return bounded(found)
 
 
-def outcome_cells(row: Record) -> list[str]:
+def outcome_cells(row: Record) -> Texts:
     """Cells of a row's outcomes."""
     counts = row["counts"]
     return [percent(counts.share("right")), str(counts.refused), str(counts.false)]
 
 
-def outcome_row(row: Record) -> list[str]:
+def outcome_row(row: Record) -> Texts:
     """Cells of a row's outcomes, and of the rms errors of its right attitudes, as OUTCOME_HEADERS."""
     return [*outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
 
 
-def pair_cells(row: Record) -> list[str]:
+def pair_cells(row: Record) -> Texts:
     """Cells of a pair of frames: noise-equivalent angle and error, the normalized error squared, and outcomes."""
     errors = [
         arcsec(row[f"{kind}_{name}"])
@@ -374,7 +375,7 @@ def rate_section(statement: Statement) -> StatementSection:
 RATE_HEADERS = ["rate °/s", "streak px", *PAIR_HEADERS]
 
 
-def rate_rows(rows: Rows) -> list[list[str]]:
+def rate_rows(rows: Rows) -> list[Texts]:
     """The cells of rows by rate."""
     return [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.3g}", *pair_cells(row)]

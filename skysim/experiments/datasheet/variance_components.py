@@ -80,7 +80,7 @@ def common_square(means: Floats) -> Floats:
     total = means.sum(axis=-2, keepdims=True)
     products = means * (total - means) / (fields - 1)
     square = products.mean(axis=-2, keepdims=True)
-    return np.asarray(square + 2 * (fields - 1) / (fields - 2) * (products - square))
+    return square + 2 * (fields - 1) / (fields - 2) * (products - square)
 
 
 def bounded(shares: Floats, verdicts: int = 1) -> Bounded:

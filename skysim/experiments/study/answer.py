@@ -42,13 +42,14 @@ from skysim.results.requirements import Judgment, percent
 # Claims that a study's numbers support, in words: whether the tracker's claimed errors are true, and rare events.
 
 
+Sentences = list[str]
 # Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
 TRUE_NEES = (2.5, 3.5)
 CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> list[str]:
+def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sentences:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES.
 
     Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES
@@ -137,7 +138,7 @@ def noticed(nees: Summary, points: int) -> float:
     return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
-def effect_of_wrong_matches(lines: PointRows, place: Place) -> list[str]:
+def effect_of_wrong_matches(lines: PointRows, place: Place) -> Sentences:
     """Sentences on wrong matches, and on whether they make the attitude err more than claimed; none without them."""
     known = [line.responses.get("mismatched", NO_VALUE) for line in lines]
     shares = [one for one in known if one.value > 0]
@@ -163,7 +164,7 @@ def everywhere(points: int) -> str:
     return f" at all {points} points" if points > 1 else ""
 
 
-def runs_needed(lines: PointRows, events: Sequence[str]) -> list[str]:
+def runs_needed(lines: PointRows, events: Sequence[str]) -> Sentences:
     """Sentences on how many trials a smaller claim about events that were never seen needs; none if all were seen.
 
     The next smaller claim is the next power of ten below the bound of the point with the fewest trials.
@@ -200,7 +201,7 @@ def headline(
     worst: str = "skysim study worst STUDY",
     judged: Sequence[Sequence[Judgment]] = (),
     survey_share: float = 0.0,
-) -> list[str]:
+) -> Sentences:
     """Thresholds, refusals, ambiguity and wrong answers, in one or two sentences each; none if all trials failed.
 
     Parameters
@@ -302,7 +303,7 @@ def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place
     return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
 
 
-def ranges(study: Study, lines: PointRows) -> list[str]:
+def ranges(study: Study, lines: PointRows) -> Sentences:
     """Smallest and largest value over the points of each response that the headline is not about."""
     done = [line for line in lines if line.trials]
     if not done:
@@ -412,7 +413,7 @@ def solved_everywhere(study: Study, lines: PointRows, place: Place, worst: str) 
     return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."
 
 
-def one_unit(fixed: Sequence[str]) -> list[str]:
+def one_unit(fixed: Sequence[str]) -> Sentences:
     """A sentence that the intervals are of one unit of hardware, and how to cover others; "" without a fixed seed."""
     if not fixed:
         return []
