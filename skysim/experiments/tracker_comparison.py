@@ -129,7 +129,7 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
         sum(row.wrong for row in rows),
         sum(unsolved.values()) - failed,
         failed,
-        **metrics.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in right]),
+        **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in right]),
         nees=float(np.mean(nees)),
         time_ms_median=float(np.median(ms)),
         time_ms_p95=float(np.percentile(ms, 95)),

@@ -10,7 +10,7 @@ where a claim must hold: that an event never occurs (or always), or that a propo
 import bisect
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from operator import itemgetter
 from typing import Any, NamedTuple
@@ -42,16 +42,6 @@ def cross_and_roll_rad(
     """
     x, y, z = (cam_from_ref_estimate * cam_from_ref_truth.inv()).as_rotvec()
     return float(np.hypot(x, y)), float(z)
-
-
-def error_statistics(errors_arcsec: Sequence[tuple[float, float]]) -> dict[str, float]:
-    """Median and worst magnitude of cross-boresight and roll errors in arcseconds; NaN without any."""
-    sizes = np.abs(errors_arcsec or [(math.nan, math.nan)]).T
-    return {
-        f"{name}_arcsec_{kind}": float(statistic(size))
-        for name, size in zip(("cross", "roll"), sizes, strict=True)
-        for kind, statistic in (("median", np.median), ("worst", np.max))
-    }
 
 
 def is_wrong(error_rad: float, nees: float = np.inf) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from estimator.trackers.star_tracker import NO_STARS
 from skysim.core.types import FrameRow, Record
-from skysim.results import metrics
+from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -138,7 +138,7 @@ def summary(rows: Rows) -> Record:
         "frames": len(rows),
         "solved": len(solved),
         "wrong": sum(row.wrong for row in solved),
-        **metrics.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
+        **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
         "scatter_arcsec": scatter_arcsec(solved),
         **claims(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),

@@ -2,6 +2,7 @@
 
 import html
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -111,6 +112,16 @@ def row(
         nees=nees,
         survey_share=survey_share,
     )
+
+
+def error_statistics(errors_arcsec: Sequence[tuple[float, float]]) -> dict[str, float]:
+    """Median and worst magnitude of cross-boresight and roll errors in arcseconds; NaN without any."""
+    sizes = np.abs(errors_arcsec or [(math.nan, math.nan)]).T
+    return {
+        f"{name}_arcsec_{kind}": float(statistic(size))
+        for name, size in zip(("cross", "roll"), sizes, strict=True)
+        for kind, statistic in (("median", np.median), ("worst", np.max))
+    }
 
 
 def magnitude_errors_mag(report: Report, exposure_s: float) -> tuple[float, float]:

@@ -28,7 +28,7 @@ from skysim.experiments.dome_survey.survey_findings import (
 )
 from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
-from skysim.results import metrics
+from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -289,7 +289,7 @@ def compare_trackers(
                 cross, roll = metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab)
                 errors[name].append((cross / ARCSEC_RAD, roll / ARCSEC_RAD))
     return {
-        name: {"stops": stops, "solved": len(found), **metrics.error_statistics(found)}
+        name: {"stops": stops, "solved": len(found), **scoring.error_statistics(found)}
         for name, found in errors.items()
     }
 
