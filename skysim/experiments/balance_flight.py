@@ -21,7 +21,7 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import BALANCE, random_stream
 from skysim.core.types import Floats
 from skysim.core.units import quantities_within
-from skysim.dynamics import guidance, imu, multibody
+from skysim.dynamics import imu, multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
@@ -247,7 +247,7 @@ def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
 def turn_rates(t_s: Floats, lab_from_body: Rotation) -> Floats:
     """(N - 1, 3) mean rates about the body axes between N attitudes."""
     turned = lab_from_body[:-1].inv() * lab_from_body[1:]
-    return np.asarray(turned.as_rotvec() / np.diff(t_s)[:, None])
+    return turned.as_rotvec() / np.diff(t_s)[:, None]
 
 
 def largest_tilt_deg(records: Sequence[BearingRecord]) -> float:
@@ -384,11 +384,6 @@ def with_frames(scene: Scene, duration_s: float) -> Scene:
     """The scene with as many frames, two at least, as its frame rate gives in a duration."""
     frames = max(int((duration_s - scene.exposure.first_s) * scene.exposure.rate_hz), 2)
     return with_config(scene, "exposure", frames=frames)
-
-
-def maneuver_s(scene: Scene) -> float:
-    """Duration of a scene's maneuver."""
-    return guidance.plan(scene.motion).duration_s
 
 
 def fly(

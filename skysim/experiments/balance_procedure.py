@@ -13,19 +13,24 @@ from typing import NamedTuple
 import numpy as np
 
 from estimator.calibration.mass_dynamics import MOMENT, BearingRecord, MassEstimate
-from estimator.calibration.mass_properties import estimate_with_noise, filter_mass
+from estimator.calibration.mass_properties import estimate_with_noise
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import quantity
-from skysim.dynamics import multibody
-from skysim.dynamics.multibody import VehicleModel
-from skysim.experiments import balance_flight
+from skysim.dynamics import guidance
+from skysim.dynamics.multibody import VehicleModel, build
 from skysim.experiments.balance_flight import (
+    SWING_S,
     Assumptions,
     BalanceFlight,
     Uncertainty,
+    check_scene,
     draw_assumptions,
+    excited_by_swing,
+    excited_by_wheels,
+    fly,
+    with_frames,
 )
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
@@ -150,8 +155,8 @@ def balance(
     InputError
         For a vehicle that cannot be balanced in this way.
     """
-    balance_flight.check_scene(scene)
-    vehicle = multibody.build(scene.vehicle)
+    check_scene(scene)
+    vehicle = build(scene.vehicle)
     if plan.moves and not len(vehicle.trims):
         raise InputError(
             "vehicle.trim",
@@ -162,11 +167,14 @@ def balance(
     records = list[BearingRecord]()
     position_m = vehicle.trims.position_m
     for number in range(plan.max_flights if plan.moves else 1):
-        flown = balance_flight.fly(
+        flown = fly(
             in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch
         )
         records.append(flown.record)
-        estimate = estimated(records, assumptions)
+        try:
+            estimate = estimate_with_noise(records, assumptions.lab, assumptions.prior)
+        except ImageError as error:  # it does not converge
+            raise InputError("balance", error) from error
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
@@ -179,7 +187,7 @@ def balance(
 def assumed(scene: Scene, uncertainty: Uncertainty) -> Assumptions:
     """The assumptions on the vehicle with its trim masses at zero."""
     at_zero = with_config(scene, "vehicle", trim=None) if scene.vehicle.trim else scene
-    return draw_assumptions(scene, multibody.build(at_zero.vehicle), uncertainty)
+    return draw_assumptions(scene, build(at_zero.vehicle), uncertainty)
 
 
 def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) -> Scene:
@@ -188,31 +196,12 @@ def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) 
     if scene.vehicle.trim:
         scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
     if plan.excite == "swing":
-        return balance_flight.with_frames(
-            balance_flight.excited_by_swing(scene, plan.tilt_deg, number),
-            plan.longer * balance_flight.SWING_S,
+        return with_frames(
+            excited_by_swing(scene, plan.tilt_deg, number),
+            plan.longer * SWING_S,
         )
-    scene = balance_flight.excited_by_wheels(
-        scene, multibody.build(scene.vehicle), plan.tilt_deg, plan.longer
-    )
-    return balance_flight.with_frames(scene, balance_flight.maneuver_s(scene))
-
-
-def estimated(records: list[BearingRecord], assumptions: Assumptions) -> MassEstimate:
-    """The batch estimate. Raises InputError if it does not converge."""
-    try:
-        return estimate_with_noise(records, assumptions.lab, assumptions.prior)
-    except ImageError as error:
-        raise InputError("balance", error) from error
-
-
-def filtered(record: BearingRecord, assumptions: Assumptions) -> MassEstimate:
-    """The last estimate of the filter in flight. Raises InputError for too few attitudes."""
-    try:
-        *_, last = filter_mass(record, assumptions.lab, assumptions.prior)
-    except ImageError as error:
-        raise InputError("balance", error) from error
-    return last
+    scene = excited_by_wheels(scene, build(scene.vehicle), plan.tilt_deg, plan.longer)
+    return with_frames(scene, guidance.plan(scene.motion).duration_s)
 
 
 def balanced_position_m(vehicle: VehicleModel, moment_kg_m: Floats, scene: Scene) -> Floats:

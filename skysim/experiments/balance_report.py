@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 
 from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
+from estimator.calibration.mass_properties import filter_mass
+from estimator.core.errors import ImageError
 from skysim.core import files
+from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
-from skysim.experiments.balance_procedure import BalancePlan, Iteration, filtered
-from skysim.results.plots import bgr_image
+from skysim.experiments.balance_procedure import BalancePlan, Iteration
+from skysim.results.plots import png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -133,8 +136,12 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
 
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
-    """As `estimate_rows`, for the filter in flight over the flight of one iteration."""
-    return estimate_rows(one.flight, filtered(one.flight.record, assumptions))
+    """As `estimate_rows`, for the filter in flight at the end of one iteration. Raises InputError for few attitudes."""
+    try:
+        *_, last = filter_mass(one.flight.record, assumptions.lab, assumptions.prior)
+    except ImageError as error:
+        raise InputError("balance", error) from error
+    return estimate_rows(one.flight, last)
 
 
 def balance_report(statistics: Record, picture: bytes, command: str) -> Report:
@@ -242,10 +249,10 @@ def write_all(
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
     bar_nm = statistics["torque_bar_nm"]
-    image = bgr_image(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
-    files.write_image(picture, image)
+    image = png(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
+    files.write_bytes(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))
-    report = balance_report(statistics, picture.read_bytes(), command)
+    report = balance_report(statistics, image, command)
     report.save(folder / "report.html")
     return report

@@ -19,13 +19,21 @@ from skysim.core.errors import OVERRIDES, InputError, unknown_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Record
 from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
-from skysim.experiments import dataset_shards
 from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.dataset_shards import (
     ZARR,
     ZARR_ARRAY,
     Storage,
+    add_frame,
+    coco_annotations,
+    coco_file,
+    coco_image,
+    create_zarr,
+    frame_labels,
+    index_table,
     shard_name,
+    sources_table,
+    write_zarr,
 )
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
@@ -74,7 +82,7 @@ class DatasetPlan:
     frames: int
     frames_per_shard: int
     formats: tuple[str, ...]
-    compress: bool = False
+    compress: bool
 
     @property
     def shards(self) -> int:
@@ -296,12 +304,10 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
         )
         for frame, levels, setup, one in labelled_frames(plan, shard):
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
-            row = dataset_shards.frame_labels(one, setup.lab.scene, numbers)
+            row = frame_labels(one, setup.lab.scene, numbers)
             row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
             row["position"] = (
-                dataset_shards.add_frame(
-                    tar, frame, one, row | {"levels": levels}, plan.compress
-                )
+                add_frame(tar, frame, one, row | {"levels": levels}, plan.compress)
                 if tar
                 else -1
             )
@@ -310,23 +316,21 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
             if "zarr" in plan.formats:
                 images.append(one.frame.image_dn)
             if "coco" in plan.formats:
-                coco.append(dataset_shards.coco_annotations(one, frame))
+                coco.append(coco_annotations(one, frame))
         if tar:
             tar.close()
     if images:
-        dataset_shards.write_zarr(storage, frames.start, images, shard)
+        write_zarr(storage, frames.start, images, shard)
     if "coco" in plan.formats:
         storage.write(
             shard_name(COCO, shard, "json"),
-            dataset_shards.coco_file(
-                [dataset_shards.coco_image(row, plan.compress) for row in rows], coco
-            ),
+            coco_file([coco_image(row, plan.compress) for row in rows], coco),
         )
     storage.write(
         shard_name(SOURCES, shard, "parquet"),
-        dataset_shards.sources_table(list(frames), sources),
+        sources_table(list(frames), sources),
     )
-    storage.write(shard_name(INDEX, shard, "parquet"), dataset_shards.index_table(rows))
+    storage.write(shard_name(INDEX, shard, "parquet"), index_table(rows))
     return ShardResult(shard, len(rows))
 
 
@@ -358,7 +362,7 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
     # The description of the array is written last.
     if "zarr" in plan.formats and "zarr.json" not in storage.names(f"{ZARR}/{ZARR_ARRAY}"):
         image = next(labelled_frames(plan, 0))[3].frame.image_dn
-        dataset_shards.create_zarr(storage, plan.frames, plan.frames_per_shard, image)
+        create_zarr(storage, plan.frames, plan.frames_per_shard, image)
 
 
 def folders_of(plan: DatasetPlan) -> tuple[str, ...]:

@@ -28,12 +28,13 @@ from scipy.spatial.transform import Rotation, Slerp
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.attitude.nearfield import thesis_points
 from estimator.attitude.solvers import quest
-from estimator.calibration import home_position
 from estimator.calibration.home_position import (
     HomeCatalog,
     Sighting,
     body_positions,
+    calibrate,
     instrument_brightness,
+    led_map,
     separation_rad,
 )
 from estimator.core.camera import Camera
@@ -261,7 +262,7 @@ def calibrated(
     common = complete(list(sightings(known, frames)))
     camera = scaled(known, common[0], clicks) if clicks else known.camera
     try:
-        catalog = home_position.calibrate(common, camera, known.leds, known.lever)
+        catalog = calibrate(common, camera, known.leds, known.lever)
     except ImageError as error:
         raise InputError("frames", str(error)) from None
     body_m = np.array(
@@ -331,7 +332,7 @@ def scaled(known: Assumed, first: Sighting, clicks: int) -> Camera:
 
 def pair_angles_rad(body_m: Floats) -> Floats:
     """(..., N (N - 1) / 2) angles of (..., N, 3) points about the bearing."""
-    directions = body_m / np.linalg.norm(body_m, axis=-1, keepdims=True)
+    directions = normalized(body_m)
     a, b = np.triu_indices(directions.shape[-2], 1)
     return separation_rad(directions[..., a, :], directions[..., b, :])
 
@@ -490,7 +491,7 @@ def write_results(
 
 def catalog_map(known: Assumed, found: Calibration) -> DomeMap:
     """The on-board catalog (section 3.6.4), with the camera as calibrated. Raises ImageError."""
-    leds = home_position.led_map(found.catalog, known.leds)
+    leds = led_map(found.catalog, known.leds)
     camera = found.camera
     return DomeMap(
         leds.id,

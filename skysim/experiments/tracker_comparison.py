@@ -2,15 +2,14 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Frame, FrameRow, Truth
+from skysim.core.types import Frame, FrameRow, Record, Truth
 from skysim.core.units import ConfigModel
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
@@ -33,8 +32,7 @@ def with_config(config: Config, section: str, **values: Any) -> Config:
     return config.model_copy(update={head: changed})
 
 
-@dataclass(frozen=True, slots=True)
-class TrackerScore:
+class TrackerScore(NamedTuple):
     """Statistics of one tracker.
 
     Attributes
@@ -119,8 +117,6 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
     right = [row for row in rows if row.status == SOLVED and not row.wrong]
     unsolved = Counter(row.status for row in rows if row.status != SOLVED)
     failed = sum(count for status, count in unsolved.items() if status.startswith(FAILED))
-    cross = np.array([row.cross_arcsec for row in right] or [np.nan])
-    roll = np.abs([row.roll_arcsec for row in right] or [np.nan])
     nees = np.array([row.nees for row in right if np.isfinite(row.nees)] or [np.nan])
     # Frames on which it failed are left out of the times: the time to a solution is unknown there.
     ms = np.array(
@@ -133,14 +129,11 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
         sum(row.wrong for row in rows),
         sum(unsolved.values()) - failed,
         failed,
-        float(np.median(cross)),
-        float(np.max(cross)),
-        float(np.median(roll)),
-        float(np.max(roll)),
-        float(np.mean(nees)),
-        float(np.median(ms)),
-        float(np.percentile(ms, 95)),
-        dict(unsolved.most_common()),
+        **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in right]),
+        nees=float(np.mean(nees)),
+        time_ms_median=float(np.median(ms)),
+        time_ms_p95=float(np.percentile(ms, 95)),
+        refusals=dict(unsolved.most_common()),
     )
 
 
@@ -165,10 +158,10 @@ def write_scores(
     return scores
 
 
-def as_dicts(scores: Sequence[TrackerScore]) -> list[dict[str, Any]]:
+def as_dicts(scores: Sequence[TrackerScore]) -> list[Record]:
     """The statistics as dictionaries for JSON; `right` becomes three numbers."""
     return [
-        asdict(score)
+        score._asdict()
         | {
             "right": score.right.value,
             "right_low": score.right.low,

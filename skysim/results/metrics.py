@@ -360,6 +360,17 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
     "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
 }
+# Quantities that only flights have.
+FLIGHT_QUANTITIES = (
+    "availability",
+    "filter_arcsec",
+    "filter_worst_arcsec",
+    "drift_arcsec",
+    "pointing_arcsec",
+    "pointing_worst_arcsec",
+    "saturated_s",
+    "exposure_ms",
+)
 # The beginning of a response name. Errors are taken as magnitudes.
 QUANTITIES: dict[str, Callable[[Columns], NDArray]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
@@ -378,15 +389,8 @@ QUANTITIES: dict[str, Callable[[Columns], NDArray]] = {
             "lights_detected",
             "false_detections",
             "streak_px",
-            "availability",
-            "filter_arcsec",
-            "filter_worst_arcsec",
-            "drift_arcsec",
-            "pointing_arcsec",
-            "pointing_worst_arcsec",
-            "saturated_s",
+            *FLIGHT_QUANTITIES,
             "angles_compared",
-            "exposure_ms",
             "time_ms",
             "detect_ms",
             "computer_ms",

@@ -13,6 +13,7 @@ from skysim.core.types import Floats, SourceTruth
 from skysim.sources.satellites import light_name
 
 Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
+Color = tuple[int, int, int]  # BGR
 DPI = 120
 # Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
 INK = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#882255"]
@@ -70,18 +71,6 @@ def figure_png(fig: Any, **options: Any) -> bytes:
     buffer = io.BytesIO()
     fig.savefig(buffer, format="png", **options)
     return buffer.getvalue()
-
-
-def bgr_image(draw: Callable[[Any], None], size_in: tuple[float, float]) -> Picture:
-    """(H, W, 3) BGR image of the figure that `draw` fills, in the default style of matplotlib."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    fig = Figure(figsize=size_in, layout="constrained")
-    canvas = FigureCanvasAgg(fig)
-    draw(fig)
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[:, :, 2::-1])
 
 
 def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
@@ -272,7 +261,7 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> Picture:
     )
 
 
-def with_legend(picture: Picture, meanings: dict[str, tuple[int, int, int]]) -> Picture:
+def with_legend(picture: Picture, meanings: dict[str, Color]) -> Picture:
     """The picture with a strip below it that names the colors of its markers; pixels keep their places."""
     strip = cv2.copyMakeBorder(
         picture, 0, LEGEND_PX, 0, 0, cv2.BORDER_CONSTANT, value=(0, 0, 0)
@@ -284,9 +273,7 @@ def with_legend(picture: Picture, meanings: dict[str, tuple[int, int, int]]) -> 
     return np.asarray(strip, np.uint8)
 
 
-def draw_ticks(
-    picture: Picture, x: int, y: int, size: int, color: tuple[int, int, int]
-) -> None:
+def draw_ticks(picture: Picture, x: int, y: int, size: int, color: Color) -> None:
     """Draw four strokes around (x, y), with an open center."""
     for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         begin = size - 4
@@ -296,9 +283,7 @@ def draw_ticks(
         )
 
 
-def draw_label(
-    picture: Picture, text: str, x: int, y: int, color: tuple[int, int, int]
-) -> None:
+def draw_label(picture: Picture, text: str, x: int, y: int, color: Color) -> None:
     """Draw a small label with its lower left corner at (x, y)."""
     cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, color, 1, cv2.LINE_AA)
 

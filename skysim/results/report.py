@@ -37,21 +37,6 @@ TAG = re.compile(r"<(?=[A-Za-z/!?])")
 FENCE = re.compile(r"^`{3,}", re.MULTILINE)
 
 
-def markdown_page(
-    title: str, command: str, blocks: Sequence[Block], pictures: str = ""
-) -> str:
-    """The page.
-
-    Parameters
-    ----------
-    pictures
-        What the paths of the figures begin with; they are left out without it
-    """
-    begin = [Code(command, "sh")] if command else []
-    names = iter([pictures + name for name, _ in figure_files(blocks)] if pictures else [])
-    return "\n\n".join(paragraphs(Section(title, [*begin, *blocks]), 1, names)) + "\n"
-
-
 def paragraphs(block: Block, level: int, names: Iterator[str]) -> Iterator[str]:
     """The paragraphs of a block.
 
@@ -115,22 +100,6 @@ def inline(text: str) -> str:
 
 # A report as one self-contained HTML page: images embedded, texts escaped, nothing loaded from
 # elsewhere.
-
-
-def html_page(title: str, command: str, version: str, blocks: Sequence[Block]) -> str:
-    """The page of a report (`page.html`)."""
-    from jinja2 import Environment, PackageLoader
-
-    loader = PackageLoader("skysim", "results")
-    environment = Environment(
-        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
-    environment.tests["cell"] = lambda one: isinstance(one, Cell)
-    environment.globals["kind"] = lambda block: type(block).__name__
-    return environment.get_template("page.html").render(
-        title=title, command=command, version=version, blocks=blocks
-    )
 
 
 def parts(text: str) -> Iterator[tuple[bool, str]]:
@@ -323,12 +292,25 @@ class Report:
         return next((one.text for one in self.blocks if isinstance(one, Verdict)), "")
 
     def html(self) -> str:
-        """One self-contained page, its images embedded."""
-        return html_page(self.title, self.command, self.version, self.blocks)
+        """One self-contained page (`page.html`), its images embedded."""
+        from jinja2 import Environment, PackageLoader
+
+        loader = PackageLoader("skysim", "results")
+        environment = Environment(
+            loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True
+        )
+        environment.filters |= {"parts": parts, "embed": embed, "sort_key": sort_key}
+        environment.tests["cell"] = lambda one: isinstance(one, Cell)
+        environment.globals["kind"] = lambda block: type(block).__name__
+        return environment.get_template("page.html").render(vars(self))
 
     def markdown(self, pictures: str = "") -> str:
         """A Markdown page; its figures are left out if no `pictures`, the beginning of their paths, is given."""
-        return markdown_page(self.title, self.command, self.blocks, pictures)
+        begin = [Code(self.command, "sh")] if self.command else []
+        files = figure_files(self.blocks) if pictures else []
+        names = (pictures + name for name, _ in files)
+        page = Section(self.title, [*begin, *self.blocks])
+        return "\n\n".join(paragraphs(page, 1, names)) + "\n"
 
     def json(self) -> dict[str, Any]:
         """Title, command, version and blocks as values for JSON; figures by their captions."""

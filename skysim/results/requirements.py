@@ -20,7 +20,6 @@ import numpy as np
 
 from skysim.core.types import FrameRow
 from skysim.results import metrics
-from skysim.results.metrics import Summary
 from skysim.simulation.checks.facts import REQUIREMENTS, Fact
 
 MORE = ("identified", "coverage", "right_within")  # proportions of which more is better
@@ -96,7 +95,7 @@ def percent(share: float) -> str:
 
 
 def judge(
-    one: Requirement, found: Summary, draws: float | None = None, points: int = 1
+    one: Requirement, found: metrics.Summary, draws: float | None = None, points: int = 1
 ) -> Judgment:
     """Judge a requirement by the proportion that decides on it.
 

@@ -6,12 +6,12 @@ import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from skysim.core.files import make_folder, write_image, write_table
-from skysim.core.types import Frame, FrameRow, Telemetry, Truth
+from skysim.core.types import Frame, FrameRow, Record, Telemetry, Truth
 from skysim.dynamics import imu
 from skysim.results import requirements, run_report, scoring, telemetry_report
 from skysim.results.files.recording import remove_results, write_frame
@@ -91,7 +91,7 @@ class Recorder:
         imu_samples: imu.Increments | None,
         plan: Check,
         pictures: Sequence[Path] = (),
-    ) -> tuple[dict[str, Any], Report]:
+    ) -> tuple[Record, Report]:
         """Write tables, annotated image and report, with pictures of the laboratory.
 
         Returns the report, and before it what `skysim run --json` prints.
@@ -272,7 +272,7 @@ class FlightRecorder:
         command: str,
         plan: Check,
         draw: Callable[[Lab, Telemetry, Path], Sequence[Path]] | None = None,
-    ) -> list[tuple[dict[str, Any], Report]]:
+    ) -> list[tuple[Record, Report]]:
         """Write tables, images and reports; return statistics and report of each camera.
 
         Parameters

@@ -5,14 +5,13 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from estimator.identification import refusals as reasons
-from skysim.core.types import FrameRow
-from skysim.results import metrics
+from skysim.core.types import FrameRow, Record
+from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -30,6 +29,7 @@ from skysim.results.report_blocks import (
 )
 from skysim.results.requirements import NOT_MET, Judgment
 
+Rows = Sequence[FrameRow]
 # Settings that help where the tracker's own refusal names none.
 BRIGHTER = (
     "lower tracker.threshold_sigma or tracker.min_area_px, or expose longer (exposure.time)"
@@ -64,16 +64,16 @@ def run_report(
     title: str,
     command: str,
     angles: tuple[str, str, str],
-    rows: Sequence[FrameRow],
+    rows: Rows,
     *,
     stages_ms: Mapping[str, float],
-    computer: str = "",
+    computer: str,
     annotated: Picture,
     motion: Section,
     views: Sequence[Path],
     facts: Sequence[tuple[str, Sequence[str]]],
     findings: Sequence[str],
-    judged: Sequence[Judgment] = (),
+    judged: Sequence[Judgment],
 ) -> Report:
     """The report of a run. A single frame has no plot against time.
 
@@ -137,23 +137,18 @@ ERROR_CAPTION = (
 MOTION_CAPTION = "Attitude, estimates and actuators against time."
 
 
-def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
+def summary(rows: Rows) -> Record:
     """Frame counts, median and worst errors in arcseconds, and median solve time of a run.
 
     Errors are over solved frames, wrong ones included; NaN if no frame was solved. Where stars were identified, also
     `magnitude_errors`; for `scatter_arcsec` see there. Where the tracker claims errors, also `claims`.
     """
     solved = [row for row in rows if row.status == "solved"]
-    cross = np.array([row.cross_arcsec for row in solved] or [np.nan])
-    roll = np.abs([row.roll_arcsec for row in solved] or [np.nan])
     return {
         "frames": len(rows),
         "solved": len(solved),
         "wrong": sum(row.wrong for row in solved),
-        "cross_arcsec_median": float(np.median(cross)),
-        "cross_arcsec_worst": float(np.max(cross)),
-        "roll_arcsec_median": float(np.median(roll)),
-        "roll_arcsec_worst": float(np.max(roll)),
+        **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
         "scatter_arcsec": scatter_arcsec(solved),
         **claims(solved),
         "time_ms_median": float(np.median([row.time_ms for row in rows])),
@@ -161,7 +156,7 @@ def summary(rows: Sequence[FrameRow]) -> dict[str, Any]:
     }
 
 
-def claims(solved: Sequence[FrameRow]) -> dict[str, float]:
+def claims(solved: Rows) -> dict[str, float]:
     """Rms errors and claimed ones in arcsec, mean NEES, and the mean share of the survey; empty without a claim."""
     known = [row for row in solved if math.isfinite(row.nees)]
     if not known:
@@ -177,7 +172,7 @@ def claims(solved: Sequence[FrameRow]) -> dict[str, float]:
     }
 
 
-def claims_text(rows: Sequence[FrameRow]) -> str:
+def claims_text(rows: Rows) -> str:
     """The claimed and the real errors in words; empty without a claim."""
     run = summary(rows)
     if "nees_mean" not in run:
@@ -191,7 +186,7 @@ def claims_text(rows: Sequence[FrameRow]) -> str:
     return CLAIMS.format(**run) + survey
 
 
-def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
+def magnitude_errors(rows: Rows) -> Record:
     """Mean and standard deviation of measured minus catalog magnitude over the stars of all frames; empty without any.
 
     The sum of squares about the common mean is that within the frames and that of the frames' means.
@@ -211,7 +206,7 @@ def magnitude_errors(rows: Sequence[FrameRow]) -> dict[str, Any]:
     }
 
 
-def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
+def scatter_arcsec(solved: Rows) -> list[float]:
     """Standard deviations of the three estimated angles about straight lines in time, fitted by least squares.
 
     A laboratory without a truth measures it at rest or at a constant rate. NaN for fewer than three frames.
@@ -228,13 +223,13 @@ def scatter_arcsec(solved: Sequence[FrameRow]) -> list[float]:
     return (3600 * np.sqrt(squares / (len(t_s) - 2))).tolist()
 
 
-def magnitude_text(rows: Sequence[FrameRow]) -> str:
+def magnitude_text(rows: Rows) -> str:
     """The magnitude errors in words; empty without any."""
     errors = magnitude_errors(rows)
     return MAGNITUDES.format(**errors) if errors else ""
 
 
-def verdict(rows: Sequence[FrameRow]) -> Verdict:
+def verdict(rows: Rows) -> Verdict:
     """How many frames were solved, how many of them wrongly, and the errors."""
     run = summary(rows)
     tone: Tone = "good" if run["solved"] == run["frames"] else "warning"
@@ -248,7 +243,7 @@ def verdict(rows: Sequence[FrameRow]) -> Verdict:
     return Verdict(text, "bad" if run["wrong"] or not run["solved"] else tone)
 
 
-def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
+def required(judged: Sequence[Judgment], rows: Rows) -> Items:
     """The judgments of requirements in words, and how many independent draws the frames are if they are fewer."""
     lines = [one.text() for one in judged]
     draws = max((one.draws for one in judged), default=math.inf)
@@ -261,7 +256,7 @@ def required(judged: Sequence[Judgment], rows: Sequence[FrameRow]) -> Items:
     return Items(lines, "Requirements" if lines else "", "bad" if unmet else "")
 
 
-def refusals(rows: Sequence[FrameRow], findings: Sequence[str]) -> list[str]:
+def refusals(rows: Rows, findings: Sequence[str]) -> list[str]:
     """Each reason why frames were not solved, their number, and the settings that would help.
 
     Whether stars are too few in too long or too short an exposure is known to the check, by its `findings`.
@@ -291,7 +286,7 @@ def motion_section(
     return Section("Motion", [*plot, Items(lines), Items(findings, tone="warning")])
 
 
-def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table:
+def frame_table(angles: tuple[str, str, str], rows: Rows) -> Table:
     """One row per frame: truth, estimate, errors, lights and time; `angles` names the three angles."""
     columns = [
         Column("frame"),
@@ -320,7 +315,7 @@ def frame_table(angles: tuple[str, str, str], rows: Sequence[FrameRow]) -> Table
     return Table(columns, lines, optional=((7, 8, 9), (2,), (14,), (3,), (12,), (4, 5, 6)))
 
 
-def error_figure(rows: Sequence[FrameRow]) -> bytes:
+def error_figure(rows: Rows) -> bytes:
     """Errors, detected and matched sources, and rate against time, as PNG. Red lines mark unsolved frames."""
     fig, (errors, stars, rate) = stacked_axes([2.9, 1.45, 1.45])
     solved = [row for row in rows if row.status == "solved"]

@@ -2,6 +2,7 @@
 
 import html
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, FrameRow, Mount, Truth
+from skysim.core.types import Frame, FrameRow, Mount, Record, Truth
 from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
@@ -113,6 +114,16 @@ def row(
     )
 
 
+def error_statistics(errors_arcsec: Sequence[tuple[float, float]]) -> dict[str, float]:
+    """Median and worst magnitude of cross-boresight and roll errors in arcseconds; NaN without any."""
+    sizes = np.abs(errors_arcsec or [(math.nan, math.nan)]).T
+    return {
+        f"{name}_arcsec_{kind}": float(statistic(size))
+        for name, size in zip(("cross", "roll"), sizes, strict=True)
+        for kind, statistic in (("median", np.median), ("worst", np.max))
+    }
+
+
 def magnitude_errors_mag(report: Report, exposure_s: float) -> tuple[float, float]:
     """Mean and standard deviation of measured minus catalog magnitude of a frame's identified stars; NaN without any.
 
@@ -149,7 +160,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
     from astropy.table import Table
 
     missing = (math.nan,) * 3
-    columns: dict[str, Any] = {
+    columns: Record = {
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")
     }

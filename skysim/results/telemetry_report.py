@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_DEG, ARCSEC_RAD, RPM_RAD_S
-from skysim.core.types import Floats, Telemetry
+from skysim.core.types import Floats, Record, Telemetry
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.simulation.motion import at_limit, saturation_text
@@ -44,7 +44,7 @@ def summary(log: Telemetry) -> dict[str, float]:
         attitude_error_deg(one, log.lab_from_body)
         for one in (log.lab_from_ref, log.lab_from_imu, log.lab_from_filter)
     )
-    statistics: dict[str, Any] = {}
+    statistics: Record = {}
     if pointing is not None:
         statistics |= {"pointing_deg_worst": pointing.max(), "pointing_deg_end": pointing[-1]}
         statistics["torque_nm_worst"] = np.abs(log.torque_nm).max()
@@ -97,7 +97,7 @@ def table(log: Telemetry) -> Any:
     """Telemetry as an astropy table, one row per control tick; angles in degrees."""
     from astropy.table import Table
 
-    columns: dict[str, Any] = {"t_s": log.t_s}
+    columns: Record = {"t_s": log.t_s}
 
     def add(name: str, values: Floats, components: Sequence[str], unit: str) -> None:
         for component, column in zip(components, values.T, strict=True):
@@ -155,7 +155,7 @@ def imu_table(record: Increments) -> Any:
     """
     from astropy.table import Table
 
-    columns: dict[str, Any] = {"t_s": record.t_s}
+    columns: Record = {"t_s": record.t_s}
     for n, end in enumerate(AXES):
         columns[f"angle_{end}_rad"] = record.angle_rad[:, n]
     for n, end in enumerate(AXES):

@@ -13,7 +13,6 @@ from skysim.core.errors import InputError, printable
 from skysim.core.types import Record
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
-from skysim.experiments.characterize.frame_files import read_stack
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -220,28 +219,6 @@ DIGITS = 6
 Stated = dict[str, tuple[Any, str]]  # value and comment by key
 
 
-def preset_text(
-    camera: Record,
-    config: CameraConfig,
-    sensor: MeasuredSensor,
-    night: Night | None,
-    name: str,
-) -> str:
-    """The text of the preset: YAML with the source of each value.
-
-    Parameters
-    ----------
-    camera
-        The raw section of the camera that was measured
-    """
-    head = [
-        f"# {printable(name)}, measured. Written by `skysim characterize`.",
-        "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
-    ]
-    found = measured(sensor) | (measured_lens(config, night) if night else {})
-    return "\n".join([*head, *yaml_lines(list(lines(camera, found)))]) + "\n"
-
-
 def measured(sensor: MeasuredSensor) -> Stated:
     """Value and comment by key of the section camera; an estimate below 0 becomes 0."""
     found = {
@@ -351,9 +328,9 @@ def measure_sensor(
     """The sensor from folders of darks and flats. Raises InputError for frames that cannot be used."""
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
-    darks = read_stack(darks_folder, shape, bits)
+    darks = frame_files.read_stack(darks_folder, shape, bits)
     frame_files.check_darks(darks)
-    flats = read_stack(flats_folder, shape, bits)
+    flats = frame_files.read_stack(flats_folder, shape, bits)
     usable = sensor_fit.usable_pixels(darks.levels)
     shortest = min(darks.levels, key=lambda one: one.exposure_s)
     frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
@@ -389,7 +366,12 @@ def write_results(
         If the preset is not a valid camera.
     """
     path = files.make_folder(folder) / "camera.yaml"
-    files.write_text(path, preset_text(raw, config, found, night, name))
+    head = [
+        f"# {printable(name)}, measured. Written by `skysim characterize`.",
+        "# [M] measured, with its 95 % interval. Other values are those of the camera's file.",
+    ]
+    values = measured(found) | (measured_lens(config, night) if night else {})
+    files.write_text(path, "\n".join([*head, *yaml_lines(list(lines(raw, values))), ""]))
     loader.load_camera(path, PLACEHOLDER_LENS)  # as a scene reads it
     statistics = {
         "camera": name,

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from skysim.camera import detector
-from skysim.camera.detector import Detector
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
@@ -33,6 +32,7 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
+Numbers = NDArray[np.uint16]  # (H, W) digital numbers of a frame
 TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
@@ -66,7 +66,7 @@ def image_files(folder: Path) -> list[Path]:
     return list(found.values())
 
 
-def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16]]]:
+def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, Numbers]]:
     """The frames of a folder. Raises InputError for a frame that cannot be used."""
     tables: dict[Path, dict[str, Setting]] = {}
     for path in image_files(folder):
@@ -78,7 +78,7 @@ def read_frames(folder: Path) -> Iterator[tuple[Path, Setting, NDArray[np.uint16
         yield path, setting, raw_numbers(path, picture)
 
 
-def raw_numbers(path: Path, picture: images.ViewedImage) -> NDArray[np.uint16]:
+def raw_numbers(path: Path, picture: images.ViewedImage) -> Numbers:
     """The digital numbers of a frame. Raises InputError unless they are a raw monochrome frame's."""
     pixels = picture.pixels
     if pixels.ndim != 2 or picture.mosaic:
@@ -168,7 +168,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     return stack
 
 
-def padding_bits(frame: NDArray[np.uint16], bits: int) -> int:
+def padding_bits(frame: Numbers, bits: int) -> int:
     """Number of bits by which the numbers are shifted to the left; 0 if they are within the camera's range."""
     if frame.max() < 2**bits:
         return 0
@@ -193,10 +193,10 @@ def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
         )
 
 
-def describe(setting: Setting) -> str:
+def describe(one: Setting | Level) -> str:
     """An exposure and temperature for a message."""
-    at = "" if setting.temperature_c is None else f" at {setting.temperature_c:g} °C"
-    return f"{setting.exposure_s:g} s{at}"
+    at = "" if one.temperature_c is None else f" at {one.temperature_c:g} °C"
+    return f"{one.exposure_s:g} s{at}"
 
 
 # Simulated darks and flats of a scene's camera, written as files to try and to test the command.
@@ -249,12 +249,10 @@ def capacity_e(config: DetectorConfig) -> float:
     return min(config.full_well_e, (2**config.bits - 1 - config.offset_dn) * config.gain_e_dn)
 
 
-def frames_of(
-    camera: CameraConfig, shot: PlannedFrame, seed: int
-) -> Iterator[NDArray[np.uint16]]:
+def frames_of(camera: CameraConfig, shot: PlannedFrame, seed: int) -> Iterator[Numbers]:
     """The frames of a shot by the simulated detector in uniform light."""
     at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
-    made = Detector.from_camera(camera.model_copy(update={"detector": at_it}))
+    made = detector.Detector.from_camera(camera.model_copy(update={"detector": at_it}))
     key = (
         int(shot.kind == "flats"),
         round(1e6 * shot.exposure_s),
@@ -312,14 +310,14 @@ POLYPLETS = 110
 def check_darks(darks: Stack) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
     for level in darks.levels:
-        medians = darks.medians[setting_of(level)]
+        medians = darks.medians[Setting(level.exposure_s, level.temperature_c)]
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
         middle = float(np.median([median for median, _ in medians]))
         worst, path = max(medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
                 path,
-                f"not dark: median {worst:g} DN, the other frames of {describe(setting_of(level))} {middle:g} DN",
+                f"not dark: median {worst:g} DN, the other frames of {describe(level)} {middle:g} DN",
                 "darks with the lens capped",
             )
     for level in darks.levels:
@@ -334,17 +332,12 @@ def check_darks(darks: Stack) -> None:
         )
 
 
-def setting_of(level: Level) -> Setting:
-    """The setting of a level."""
-    return Setting(level.exposure_s, level.temperature_c)
-
-
 def check_dark(darks: Stack, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
     folder = darks.folder
-    which = f"the darks of {describe(setting_of(level))}"
+    which = f"the darks of {describe(level)}"
     mean = level.mean_dn
-    noise_dn = math.sqrt(float(np.median(level.variance_dn2)))
+    noise_dn = max(math.sqrt(np.median(level.variance_dn2)), 0.3)
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:
         raise InputError(
@@ -356,7 +349,6 @@ def check_dark(darks: Stack, level: Level) -> None:
         raise InputError(
             folder, f"{which} are equal in every pixel", "frames of their own, no copies"
         )
-    noise_dn = max(noise_dn, 0.3)
     medians = block_medians(mean)
     allowed_dn = MAX_DARK_RANGE * noise_dn + chance_range(mean, medians)
     if (extent := float(np.ptp(medians))) > allowed_dn:
@@ -406,7 +398,7 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
             f" {0.6 * longest:.2g} s",
         )
     for one, signal in zip(flats.levels, signals, strict=True):
-        which = f"the flats of {describe(setting_of(one))}"
+        which = f"the flats of {describe(one)}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
                 flats.folder,
@@ -421,18 +413,14 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
                 f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
             )
         if BRIGHT * top < signal < FIT_RANGE * top:
-            check_flat(flats.folder, which, block_medians(one.mean_dn) - black_dn)
-
-
-def check_flat(folder: Path, which: str, medians: Floats) -> None:
-    """Raise InputError for a flat whose blocks' medians differ too much."""
-    extent = float(np.ptp(medians) / medians.mean())
-    if extent > MAX_FLAT_RANGE:
-        raise InputError(
-            folder,
-            f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
-            f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
-        )
+            medians = block_medians(one.mean_dn) - black_dn
+            extent = float(np.ptp(medians) / medians.mean())
+            if extent > MAX_FLAT_RANGE:
+                raise InputError(
+                    flats.folder,
+                    f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
+                    f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
+                )
 
 
 def block_side(image: Floats) -> int:

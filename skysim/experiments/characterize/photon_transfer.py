@@ -33,6 +33,8 @@ from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.types import Bools, Floats
 from skysim.results.metrics import SIGMAS, TAILS
 
+Floats32 = NDArray[np.float32]
+
 # A measured number with its interval.
 
 
@@ -51,13 +53,13 @@ class Estimate(NamedTuple):
     def normal(cls, value: float, sigma: float) -> Estimate:
         """A normal estimate: value ± 1.96 sigma."""
         half = SIGMAS * sigma
-        return cls(float(value), float(sigma), float(value - half), float(value + half))
+        return cls(*map(float, (value, sigma, value - half, value + half)))
 
     @classmethod
     def lognormal(cls, value: float, sigma: float) -> Estimate:
         """An estimate of a positive number whose logarithm is normal, such as a standard deviation."""
         factor = math.exp(min(SIGMAS * sigma / value, 50.0)) if value > 0 else 1.0
-        return cls(float(value), float(sigma), float(value / factor), float(value * factor))
+        return cls(*map(float, (value, sigma, value / factor, value * factor)))
 
     @classmethod
     def logistic(cls, logit: float, sigma: float) -> Estimate:
@@ -156,22 +158,22 @@ class Level:
     exposure_s: float
     temperature_c: float | None
     count: int
-    first_dn: NDArray[np.float32]
-    second_dn: NDArray[np.float32]
-    variance_dn2: NDArray[np.float32]
+    first_dn: Floats32
+    second_dn: Floats32
+    variance_dn2: Floats32
     difference_dn2: float
     least_dn: int
     greatest_dn: int
 
     @property
-    def halves_dn(self) -> NDArray[np.float32]:
+    def halves_dn(self) -> Floats32:
         """(2, H, W) means of the first and of the second frames of the pairs."""
         return np.stack([self.first_dn, self.second_dn])
 
     @property
     def mean_dn(self) -> Floats:
         """(H, W) mean of all frames."""
-        return np.asarray(self.halves_dn.mean(axis=0, dtype=np.float64))
+        return self.halves_dn.mean(axis=0, dtype=np.float64)
 
     def moments(self, used: Bools) -> Moments:
         """Mean and variance over the used pixels.
@@ -193,7 +195,7 @@ class LevelBuilder:
     def __init__(self) -> None:
         self.frames = 0
         self.first: NDArray | None = None
-        self.sums: list[NDArray[np.float32]] = []
+        self.sums: list[Floats32] = []
         self.difference_dn2 = 0.0
         self.least_dn = np.iinfo(np.int64).max
         self.greatest_dn = 0
@@ -236,7 +238,7 @@ class LevelBuilder:
         )
 
 
-def trimmed_mean(difference: NDArray[np.float32]) -> float:
+def trimmed_mean(difference: Floats32) -> float:
     """Mean of the pixels within TRIM interquartile ranges of the median, which excludes those that a particle hit."""
     low, middle, high = np.quantile(
         difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)
@@ -270,12 +272,15 @@ class TransferPoint(NamedTuple):
     moments: Moments
 
 
+Points = Sequence[TransferPoint]
+
+
 def exposures_s(levels: Sequence[Level | TransferPoint]) -> Floats:
     """(L,) exposure times."""
     return np.array([one.exposure_s for one in levels])
 
 
-def by_level(points: Sequence[TransferPoint], name: str) -> Floats:
+def by_level(points: Points, name: str) -> Floats:
     """(L,) one of the moments of each level."""
     return np.array([getattr(one.moments, name) for one in points])
 
@@ -333,7 +338,7 @@ def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
 
 
 def model(
-    points: Sequence[TransferPoint], values: Floats, light: Floats | float = 1.0
+    points: Points, values: Floats, light: Floats | float = 1.0
 ) -> tuple[Floats, Floats]:
     """Means and variances of the levels. `light`: that of each level, relative to the lamp's mean."""
     t_s = exposures_s(points)
@@ -348,7 +353,7 @@ def model(
     return mean, slope**2 * (values[GAIN] * x + values[READ]) + ROUNDING_DN2
 
 
-def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
+def fit(points: Points, flicker: float) -> Transfer:
     """Fit levels of darks and flats with the relative flicker of the lamp from `lamp_flicker`.
 
     If the flats' means scatter about the law by more than noise and flicker, by SIGNIFICANT sigmas of chi-square, the
@@ -374,9 +379,7 @@ def fit(points: Sequence[TransferPoint], flicker: float) -> Transfer:
     return fit_levels(points, flicker, drift)[0]._replace(drift=drift)
 
 
-def fit_levels(
-    points: Sequence[TransferPoint], flicker: float, scatter: float
-) -> tuple[Transfer, float]:
+def fit_levels(points: Points, flicker: float, scatter: float) -> tuple[Transfer, float]:
     """The fit with a relative standard deviation of the light of the levels, and chi-square of the flats' means."""
     kept = list(points)
     mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
@@ -414,7 +417,7 @@ def fit_levels(
     return transfer, float(np.sum(light**2) + np.sum(means[lit > 0] ** 2))
 
 
-def start_values(points: Sequence[TransferPoint]) -> Floats:
+def start_values(points: Points) -> Floats:
     """Start values: slope of the variance against the mean over all levels, and rates from the longest exposures."""
     mean, variance = (by_level(points, name) for name in ("mean_dn", "variance_dn2"))
     darkest = int(np.argmin(mean))
@@ -435,13 +438,7 @@ def start_values(points: Sequence[TransferPoint]) -> Floats:
     )
 
 
-def unsaturated(points: Sequence[TransferPoint], black_dn: float) -> Bools:
-    """(L,) whether the signal of each flat is at most FIT_RANGE of the greatest."""
-    signal = by_level(points, "mean_dn") - black_dn
-    return signal <= FIT_RANGE * signal.max()
-
-
-def saturated(points: Sequence[TransferPoint]) -> Bools:
+def saturated(points: Points) -> Bools:
     """(L,) whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
     variance = by_level(points, "variance_dn2")
     brighter = exposures_s(points) > points[int(np.argmax(variance))].exposure_s
@@ -449,7 +446,7 @@ def saturated(points: Sequence[TransferPoint]) -> Bools:
 
 
 def lamp_flicker(
-    points: Sequence[TransferPoint],
+    points: Points,
     difference_dn2: Sequence[float],
     black_dn: float,
     pixels: int,

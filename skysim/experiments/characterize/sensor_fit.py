@@ -9,7 +9,6 @@ import numpy as np
 
 from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
-from skysim.experiments.characterize.fixed_pattern import DarkCurrent, Planes, RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     CURVATURE,
@@ -27,6 +26,8 @@ from skysim.experiments.characterize.photon_transfer import (
     propagate,
 )
 
+Levels = Sequence[Level]
+Temperatures = Sequence[float | None]  # None: unknown
 # Standard deviations above the median dark, beyond which pixels are left out of the photon transfer.
 HOT_SIGMAS = 20.0
 HIT_SIGMAS = 8.0  # difference between the halves of a pixel's frames beyond which a particle has hit it
@@ -52,7 +53,7 @@ class MeasuredSensor(NamedTuple):
     estimates: dict[str, Estimate]
     remarks: list[str]
     transfer: Transfer
-    dark: DarkCurrent | None
+    dark: fixed_pattern.DarkCurrent | None
     dark_temperature_c: float | None
     flats: list[TransferPoint]
     linearity_error: float
@@ -67,7 +68,7 @@ class Findings(NamedTuple):
     remarks: list[str]
 
 
-def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSensor:
+def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
     """Every parameter from levels of darks and flats that have passed the checks of `frame_files`.
 
     The dark current is stated at the darks' temperature that is nearest to that of the flats.
@@ -118,9 +119,9 @@ def characterize(darks: Sequence[Level], flats: Sequence[Level]) -> MeasuredSens
 
 
 def fitted_transfer(
-    darks: Sequence[Level],
-    flats: Sequence[Level],
-    temperatures: Sequence[float | None],
+    darks: Levels,
+    flats: Levels,
+    temperatures: Temperatures,
     flat_points: Sequence[TransferPoint],
     usable: Bools,
 ) -> tuple[Transfer, list[Level]]:
@@ -132,7 +133,8 @@ def fitted_transfer(
         for one in darks
     ]
     black_dn = min(point.moments.mean_dn for point in dark_points)
-    below = photon_transfer.unsaturated(flat_points, black_dn)
+    signal = by_level(flat_points, "mean_dn") - black_dn
+    below = signal <= photon_transfer.FIT_RANGE * signal.max()
     fitted = list(compress(flats, below))
     lit = list(compress(flat_points, below))
     changes = [one.difference_dn2 for one in fitted]
@@ -140,7 +142,7 @@ def fitted_transfer(
     return photon_transfer.fit([*dark_points, *lit], flicker), fitted
 
 
-def usable_pixels(darks: Sequence[Level]) -> Bools:
+def usable_pixels(darks: Levels) -> Bools:
     """Pixels that no particle has hit, and that are not hot in any dark.
 
     Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
@@ -165,7 +167,7 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Bools:
     )
 
 
-def nearest_index(temperatures: Sequence[float | None], temperature_c: float | None) -> int:
+def nearest_index(temperatures: Temperatures, temperature_c: float | None) -> int:
     """Index of the darks' temperature that is nearest to a temperature; 0 if one of them is unknown."""
     if temperature_c is None or temperatures[0] is None:
         return 0
@@ -175,7 +177,7 @@ def nearest_index(temperatures: Sequence[float | None], temperature_c: float | N
 
 
 def best_temperature(
-    temperatures: Sequence[float | None], darks: Sequence[Level], transfer: Transfer, own: int
+    temperatures: Temperatures, darks: Levels, transfer: Transfer, own: int
 ) -> int:
     """Index of the temperature at which the dark charge grows most from the shortest to the longest dark frame.
 
@@ -227,11 +229,11 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 
 def dark_parameters(
     found: Findings,
-    darks: Sequence[Level],
-    planes: Planes,
+    darks: Levels,
+    planes: fixed_pattern.Planes,
     own: int,
     ratio: float,
-) -> DarkCurrent | None:
+) -> fixed_pattern.DarkCurrent | None:
     """Add dark current, DSNU and hot pixels to the findings, from the rates of the pixels in darks of one temperature.
 
     Parameters
@@ -253,7 +255,7 @@ def dark_parameters(
     rates = pixel_rates.mean(axis=0)[steady]
     counts = np.array([one.count for one in darks])
     times = exposures_s(darks)
-    noise = RateNoise(
+    noise = fixed_pattern.RateNoise(
         float(np.sum(weights**2 * read / counts)),
         float(np.sum(weights**2 * gain * times / counts)),
     )
@@ -269,20 +271,19 @@ def dark_parameters(
         value = ratio * one.value / gain
         return Estimate.lognormal(value, value * math.hypot(one.sigma / one.value, relative))
 
-    if not fixed_pattern.is_resolved(rates, noise):
+    dark = None
+    if fixed_pattern.is_resolved(rates, noise):
+        dark = fixed_pattern.fit(rates, noise, greatest)
+        found.estimates.update(dark_e_s=in_electrons(dark.mean), dsnu=dark.dsnu)
+        fraction = dark.hot_pixels
+        hot = dark.hot
+    else:
         unresolved(found, own, rates, noise, float(times.max()))
         # A few hot pixels change no median.
         fraction, hot = fixed_pattern.hot_tail(rates, noise, greatest)
-        found.estimates["hot_pixels"] = fraction
-        if hot is not None:
-            found.estimates["hot_e_s"] = in_electrons(hot)
-        return None
-    dark = fixed_pattern.fit(rates, noise, greatest)
-    found.estimates["dark_e_s"] = in_electrons(dark.mean)
-    found.estimates["dsnu"] = dark.dsnu
-    found.estimates["hot_pixels"] = dark.hot_pixels
-    if dark.hot is not None:
-        found.estimates["hot_e_s"] = in_electrons(dark.hot)
+    found.estimates["hot_pixels"] = fraction
+    if hot is not None:
+        found.estimates["hot_e_s"] = in_electrons(hot)
     return dark
 
 
@@ -290,7 +291,7 @@ def unresolved(
     found: Findings,
     own: int,
     rates: Floats,
-    noise: RateNoise,
+    noise: fixed_pattern.RateNoise,
     longest_s: float,
 ) -> None:
     """Add the mean dark current alone, if its scatter over the pixels is below the noise; remark what it needs."""
@@ -314,7 +315,7 @@ def unresolved(
     )
 
 
-def doubling(found: Findings, temperatures: Sequence[float | None]) -> None:
+def doubling(found: Findings, temperatures: Temperatures) -> None:
     """Add the temperature step that doubles the dark current: ln 2 over the slope of ln D, by a weighted line.
 
     The same pixels are compared at all temperatures, so their scatter does not matter.

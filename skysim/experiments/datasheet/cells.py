@@ -6,9 +6,8 @@ thermal state, attitude and noise by number, so that terms can be separated and 
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,15 +20,8 @@ from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.types import Bools, Floats, Record
-from skysim.core.yaml_reader import parse_yaml
+from skysim.core.yaml_reader import OverrideTexts, parse_yaml
 from skysim.experiments.datasheet import scene_changes
-from skysim.experiments.datasheet.scene_changes import (
-    FIXED_PATTERN,
-    OFF_DEG,
-    beside,
-    excluding_bodies,
-    side_px,
-)
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.plan import Plan, Study, TrialSpec, resolve_point
@@ -73,8 +65,7 @@ TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # lengths of the streaks in trackin
 MISSED_PX = (3.0, 6.0, 12.0, 24.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Size:
+class Size(NamedTuple):
     """Numbers of fields, units, thermal states, attitudes in a field, frames at an attitude, and other cells.
 
     Attributes
@@ -117,6 +108,10 @@ class DatasheetCell(NamedTuple):
         )
 
 
+Cells = Iterator[DatasheetCell]
+CellRows = list[int]  # numbers of cells
+
+
 class Draw(NamedTuple):
     """Numbers of the unit, the thermal state and the attitude in the field. Every cell has other noise."""
 
@@ -157,7 +152,7 @@ def require_fields(fields: int, solved: int, least: int, problem: str) -> None:
 def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that differ from unit to unit: chip, survey, LEDs."""
     chip = scene.camera.detector
-    has_pattern = any(getattr(chip, key) for key in FIXED_PATTERN)
+    has_pattern = any(getattr(chip, key) for key in scene_changes.FIXED_PATTERN)
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
     return seeds + dome_seeds(scene)
 
@@ -234,7 +229,7 @@ class Designer:
         turns, state = divmod(number, self.states)
         return Draw((turns + state) % self.units, state, 10 + number)
 
-    def cells(self) -> Iterator[DatasheetCell]:
+    def cells(self) -> Cells:
         """All cells, in the order in which they are run."""
         yield from self.terms()
         combinations = self.units * self.states
@@ -255,11 +250,13 @@ class Designer:
             yield from self.draws("cause", pairs, change, cause=name)
         for name, change in scene_changes.disturbances(self.scene).items():
             yield from self.draws("disturbance", 1, change, disturbance=name)
-        for body, off_deg in itertools.product(excluding_bodies(self.scene), OFF_DEG):
-            change = beside(body, off_deg, off_deg)
+        for body, off_deg in itertools.product(
+            scene_changes.excluding_bodies(self.scene), scene_changes.OFF_DEG
+        ):
+            change = scene_changes.beside(body, off_deg, off_deg)
             yield from self.draws("exclusion", 1, change, body=body, off_deg=off_deg)
 
-    def terms(self) -> Iterator[DatasheetCell]:
+    def terms(self) -> Cells:
         """The crossed and nested design of `components`."""
         counts = (self.units, self.states, self.size.attitudes, self.size.frames)
         for numbers in itertools.product(*map(range, counts)):
@@ -268,7 +265,7 @@ class Designer:
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: Any
-    ) -> Iterator[DatasheetCell]:
+    ) -> Cells:
         """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
         for number in range(count):
             settings = self.settings(self.in_turn(number)) | {
@@ -285,7 +282,7 @@ class Designer:
         """Rates with streaks of these lengths, to two digits; about the boresight those at the edge of the field."""
         pixel_deg = self.pixel_deg
         if experiment == "boresight":
-            pixel_deg = math.degrees(2 / side_px(self.scene))
+            pixel_deg = math.degrees(2 / scene_changes.side_px(self.scene))
         per_px = pixel_deg / self.scene.exposure.time_s
         return [float(f"{streak * per_px:.2g}") for streak in streaks_px]
 
@@ -293,22 +290,20 @@ class Designer:
         """Accelerations that bend a path by these lengths in a time, to two digits."""
         return [float(f"{bend * self.pixel_deg / time_s**2:.2g}") for bend in bends_px]
 
-    def pair(
-        self, experiment: str, name: str, level: float, change: Settings
-    ) -> Iterator[DatasheetCell]:
+    def pair(self, experiment: str, name: str, level: float, change: Settings) -> Cells:
         """Two frames of each attitude with a change, which differ only in their noise."""
         for frame in range(2):
             settings = self.settings(Draw()) | change
             yield DatasheetCell(experiment, {name: level, "frame": frame}, settings)
 
-    def rates(self) -> Iterator[DatasheetCell]:
+    def rates(self) -> Cells:
         """Pairs of frames at each rate, across the boresight and about it."""
         for experiment, streaks_px in (("rate", STREAKS_PX), ("boresight", BORESIGHT_PX)):
             usual = self.rates_deg_s(streaks_px, experiment)
             for rate in self.chosen_rates_deg_s or usual:
                 yield from self.at_rate(experiment, rate)
 
-    def at_rate(self, experiment: str, rate_deg_s: float) -> Iterator[DatasheetCell]:
+    def at_rate(self, experiment: str, rate_deg_s: float) -> Cells:
         """A pair of frames at a rate, of one of RATES."""
         change = {"trial.rate_deg_s": rate_deg_s} | RATES[experiment]
         return self.pair(experiment, "rate_deg_s", rate_deg_s, change)
@@ -319,7 +314,7 @@ class Designer:
             rates = [one.levels["rate_deg_s"] for one in cells if one.experiment == name]
             cells += self.at_rate(name, 2 * max(rates))
 
-    def sequences(self) -> Iterator[DatasheetCell]:
+    def sequences(self) -> Cells:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
@@ -327,13 +322,13 @@ class Designer:
                 settings["trial.rate_deg_s"] = rate
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
-    def accelerations(self) -> Iterator[DatasheetCell]:
+    def accelerations(self) -> Cells:
         """Pairs of frames at accelerations, with a rate of zero at mid-exposure."""
         key = "acceleration_deg_s2"
         for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
             yield from self.pair("acceleration", key, bend, {f"trial.{key}": bend})
 
-    def tracked(self) -> Iterator[DatasheetCell]:
+    def tracked(self) -> Cells:
         """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
 
         The prediction extrapolates the mean rate between the last two frames, so an acceleration a displaces the next
@@ -351,7 +346,7 @@ class Designer:
                 change = {f"trial.{key}": value, "trial.tracked": TRACKED}
                 yield from self.pair(f"tracked {key}", key, value, change)
 
-    def magnitudes(self) -> Iterator[DatasheetCell]:
+    def magnitudes(self) -> Cells:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
         if not self.under_stars:
             return
@@ -370,8 +365,7 @@ STUDY = "datasheet.yaml"
 AXES = ("x_arcsec", "y_arcsec", "roll_arcsec")
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredFrames:
+class MeasuredFrames(NamedTuple):
     """The measured frames of a datasheet.
 
     Attributes
@@ -388,14 +382,14 @@ class MeasuredFrames:
 
     scene: Scene
     scene_name: str
-    overrides: Mapping[str, str]
+    overrides: OverrideTexts
     size: Size
     designer: Designer
     cells: list[DatasheetCell]
     columns: dict[str, NDArray[Any]]
     spec: TrialSpec
 
-    def rows(self, experiment: str, **levels: Any) -> list[int]:
+    def rows(self, experiment: str, **levels: Any) -> CellRows:
         """Rows of the cells of an experiment that have these levels."""
         return [
             row
@@ -409,15 +403,15 @@ class MeasuredFrames:
             dict.fromkeys(self.cells[row].levels[name] for row in self.rows(experiment))
         )
 
-    def column(self, name: str, rows: list[int]) -> NDArray[Any]:
+    def column(self, name: str, rows: CellRows) -> NDArray[Any]:
         """(cells, fields) values of a column in some cells."""
         return self.columns[name][rows]
 
-    def right(self, rows: list[int]) -> Bools:
+    def right(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame was solved and is not false."""
         return (self.columns["solved"][rows] > 0) & ~self.false(rows)
 
-    def false(self, rows: list[int]) -> Bools:
+    def false(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame has a false attitude."""
         return self.columns["wrong"][rows] > 0
 
@@ -427,12 +421,14 @@ class MeasuredFrames:
         for experiment in RATES:
             rate = max(self.levels(experiment, "rate_deg_s"))
             right = self.right(self.rows(experiment, rate_deg_s=rate)).all(axis=0)
-            longest = self.designer.rates_deg_s([side_px(self.scene)], experiment)[0]
+            longest = self.designer.rates_deg_s(
+                [scene_changes.side_px(self.scene)], experiment
+            )[0]
             if right.mean() >= MOST_FAIL and 2 * rate <= longest:
                 found.append(experiment)
         return found
 
-    def errors(self, rows: list[int]) -> Floats:
+    def errors(self, rows: CellRows) -> Floats:
         """(3, cells, fields) errors about the camera's axes, arcseconds; NaN for refused and false attitudes."""
         errors = np.stack([self.columns[name][rows] for name in AXES])
         return np.where(self.right(rows), errors, np.nan)
@@ -449,7 +445,7 @@ def attitudes(scene: Scene) -> Record:
 def measure(
     scene_name: str,
     scene: Scene,
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
     folder: Path,
     *,
     quick: bool = False,
@@ -480,7 +476,7 @@ def measure(
     """
     check_scene(scene)
     usual = QUICK if quick else FULL
-    size = replace(usual, fields=usual.fields if fields is None else fields)
+    size = usual if fields is None else usual._replace(fields=fields)
     purpose = "to fit and test a model" if least > MIN_FIELDS else "for the error terms"
     require_fields(size.fields, size.fields, least, f"too few {purpose}")
     designer = Designer(scene, size, rates_deg_s)
@@ -510,7 +506,7 @@ def planned(
     path: Path,
     scene_name: str,
     designer: Designer,
-    overrides: Mapping[str, str],
+    overrides: OverrideTexts,
     cells: list[DatasheetCell],
 ) -> Plan:
     """Write the study file of the cells and plan its trials. Raises InputError for settings that are not allowed."""

@@ -15,7 +15,6 @@ from skysim.core.paths import DATA
 from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import MeasuredFrames
-from skysim.experiments.datasheet.performance import UNITS, Counts
 from skysim.experiments.datasheet.statement import (
     NAMES,
     Statement,
@@ -25,7 +24,6 @@ from skysim.experiments.datasheet.statement import (
     sections,
     sizes,
 )
-from skysim.experiments.datasheet.variance_components import GROUPS, Components
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
@@ -52,7 +50,7 @@ def draw_terms(statement: Statement, fig: Any) -> None:
     """Terms as bars with their intervals, across and about the boresight."""
     shown = [
         name
-        for name in Components._fields
+        for name in variance_components.Components._fields
         if name != "thermal" or statement.sheet.designer.states > 1
     ]
     for axes, (group, table) in zip(fig.subplots(1, 2), statement.terms.items(), strict=True):
@@ -71,7 +69,7 @@ def draw_causes(statement: Statement, fig: Any) -> None:
     """Ratio of the mean square after each change to that before it."""
     axes = fig.subplots()
     places = np.arange(len(statement.causes))
-    for n, group in enumerate(GROUPS):
+    for n, group in enumerate(variance_components.GROUPS):
         value, *ends = 100 * np.array([one[group] for one in statement.causes]).T
         bars = np.abs(ends - value)
         label = f"{group} the boresight"
@@ -114,7 +112,7 @@ def draw_by(name: str, key: str, label: str, statement: Statement, fig: Any) -> 
     rows = getattr(statement, name)
     errors, share = fig.subplots(1, 2)
     x = [row[key] for row in rows]
-    for n, group in enumerate(GROUPS):
+    for n, group in enumerate(variance_components.GROUPS):
         for kind, style in (("NEA", "o-"), ("rms", "s--")):
             what = f"{kind.lower()}_{group}"
             ends = np.array([row["intervals"][what] for row in rows]).T
@@ -133,7 +131,7 @@ def draw_by(name: str, key: str, label: str, statement: Statement, fig: Any) -> 
         axes.set_xlabel(label)
 
 
-def draw_right(axes: Any, x: list[float], rows: list[dict[str, Any]], **options: Any) -> None:
+def draw_right(axes: Any, x: list[float], rows: list[Record], **options: Any) -> None:
     """Percentages of right attitudes with their exact bounds."""
     found = 100 * np.array([row["counts"].share("right")[:3] for row in rows])
     draw_bars(axes, x, found[:, 0], found[:, 1:].T, "o-", **{"color": INK[2]} | options)
@@ -250,7 +248,7 @@ def left_out(statement: Statement) -> list[str]:
 
 def as_numbers(value: Any) -> Any:
     """A value for JSON: named tuples as mappings."""
-    if isinstance(value, Counts):
+    if isinstance(value, performance.Counts):
         shares = {kind: value.share(kind)._asdict() for kind in ("right", "refused", "false")}
         return value._asdict() | {"shares": shares}
     if hasattr(value, "_asdict"):
@@ -295,7 +293,7 @@ def limits(statement: Statement) -> Record:
     found = {
         mode: {
             key: performance.bracket(rows, key)
-            for key, rows in zip(UNITS, tables, strict=False)
+            for key, rows in zip(performance.UNITS, tables, strict=False)
         }
         for mode, tables in measured.items()
         if tables[0]

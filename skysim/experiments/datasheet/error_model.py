@@ -169,13 +169,11 @@ class ErrorModel:
         """The state one step later, and its (3,) errors in arcseconds."""
         rate = self.measured_rates(rate_deg_s)
         turned = float(rate[0]) * step_s
-        new = []
+        later = state
         for name in ("field", "pixel", "scale"):
-            left = math.exp(-turned / self.constants[f"{name}_deg"])
-            old = getattr(state, name)
-            fresh = rng.standard_normal(np.shape(old))
-            new.append(left * old + math.sqrt(1 - left * left) * fresh)
-        later = state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
+            steps = [0.0, turned / self.constants[f"{name}_deg"]]
+            _, new = correlated(steps, getattr(state, name), rng)
+            later = later._replace(**{name: new})
         noise = self.drawn_noise(rate, state.axis_rad, rng)[0]
         slow = self.field * later.field + self.pixel * later.pixel
         return later, later.bias + self.scales(later.scale) * (slow + noise)

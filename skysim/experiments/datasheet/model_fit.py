@@ -1,7 +1,6 @@
 """Fit the constants of the error model (`error_model`) to the frames of a datasheet, test the fit, and write it."""
 
 import math
-from dataclasses import replace
 from importlib.util import find_spec
 from itertools import combinations, takewhile
 from pathlib import Path
@@ -70,7 +69,7 @@ def rms_of_term(shares: Floats) -> Floats:
 
 def unit_mean(sheet: MeasuredFrames) -> Floats:
     """(3,) mean error of the first unit in the first thermal state, which the frames at rates have."""
-    return np.asarray(term_errors(sheet)[0][:, :, 0, 0].mean(axis=(1, 2, 3)))
+    return term_errors(sheet)[0][:, :, 0, 0].mean(axis=(1, 2, 3))
 
 
 def unit_scatter(errors: Floats) -> Floats:
@@ -246,7 +245,7 @@ class Agreement(NamedTuple):
 def some_fields(sheet: MeasuredFrames, fields: Any) -> MeasuredFrames:
     """The part of a sheet with the fields of these numbers."""
     columns = {name: values[:, fields] for name, values in sheet.columns.items()}
-    return replace(sheet, columns=columns, size=replace(sheet.size, fields=len(fields)))
+    return sheet._replace(columns=columns, size=sheet.size._replace(fields=len(fields)))
 
 
 def agreements(sheet: MeasuredFrames) -> list[Agreement]:

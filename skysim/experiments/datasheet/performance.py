@@ -8,14 +8,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from skysim.core.types import Floats, Record
-from skysim.experiments.datasheet.cells import MeasuredFrames
+from skysim.experiments.datasheet.cells import CellRows, MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
     Bounded,
     bounded,
     mean_known,
     mean_square_ratio,
-    rms,
     squares_by_field,
 )
 from skysim.experiments.study import answer
@@ -24,6 +23,7 @@ from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.tracking import factory
 
+Rows = list[Record]
 CLAIMS = (0.95, 0.99, 0.997)  # probabilities of a right attitude that a datasheet may claim
 LEVELS = (0.683, 0.954, 0.997)  # probabilities of the quantiles
 LIMITS = (0.95, 0.9)  # probabilities of a right attitude that bound a rate or an acceleration
@@ -49,12 +49,12 @@ class Counts(NamedTuple):
         )
 
 
-def counts(sheet: MeasuredFrames, rows: list[int]) -> Counts:
+def counts(sheet: MeasuredFrames, rows: CellRows) -> Counts:
     """The outcomes of some cells."""
     return tally(sheet.right(rows), sheet.false(rows))
 
 
-def counts_of_fields(sheet: MeasuredFrames, rows: list[int]) -> Counts:
+def counts_of_fields(sheet: MeasuredFrames, rows: CellRows) -> Counts:
     """The outcomes of fields with a frame in each of some cells; the frames of a field count as one."""
     return tally(sheet.right(rows).all(axis=0), sheet.false(rows).any(axis=0))
 
@@ -66,7 +66,7 @@ def tally(right: Any, false: Any) -> Counts:
     )
 
 
-def claims(found: Counts) -> list[Record]:
+def claims(found: Counts) -> Rows:
     """Which of CLAIMS the frames show, and how many more frames each needs if none of them fails."""
     failures = found.frames - found.right
     return [
@@ -82,7 +82,7 @@ def claims(found: Counts) -> list[Record]:
     ]
 
 
-def quantiles(sheet: MeasuredFrames) -> list[Record]:
+def quantiles(sheet: MeasuredFrames) -> Rows:
     """Quantiles of the errors' magnitude over independent frames, with intervals between order statistics."""
     errors = sheet.errors(sheet.rows("sky")).reshape(3, -1)
     errors = errors[:, np.isfinite(errors).all(axis=0)]
@@ -122,7 +122,7 @@ def noise_equivalent_angle(apart: Floats) -> float:
     return math.sqrt(mean_known(apart**2) / 2)
 
 
-def pair_row(sheet: MeasuredFrames, rows: list[int]) -> Record:
+def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     found: Record = {"counts": counts_of_fields(sheet, rows), **rms_by_group(sheet, rows)}
@@ -141,19 +141,22 @@ def root_interval(squares: Floats) -> list[float]:
     return np.sqrt(np.maximum(bounded(squares[np.isfinite(squares)])[1:], 0.0)).tolist()
 
 
-def mean_nees(sheet: MeasuredFrames, rows: list[int]) -> Bounded:
+def mean_nees(sheet: MeasuredFrames, rows: CellRows) -> Bounded:
     """The mean normalized error squared of right attitudes: 3 if their covariances are right."""
     nees = np.where(sheet.right(rows), sheet.column("nees", rows), np.nan)
     solved = np.isfinite(nees).sum(axis=0)
     return Bounded(*metrics.mean_nees({"nees": mean_known(nees, 0), "solved": solved})[:3])
 
 
-def rms_by_group(sheet: MeasuredFrames, rows: list[int]) -> dict[str, float]:
-    """The rms error about one axis across and about the boresight, by `rms_` and the name of the group."""
-    return {f"rms_{name}": rms(sheet, rows, axes) for name, axes in GROUPS.items()}
+def rms_by_group(sheet: MeasuredFrames, rows: CellRows) -> dict[str, float]:
+    """The rms error of right attitudes about one axis, by `rms_` and the name of the group of axes."""
+    squares = sheet.errors(rows) ** 2
+    return {
+        f"rms_{name}": math.sqrt(mean_known(squares[axes])) for name, axes in GROUPS.items()
+    }
 
 
-def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
+def by_rate(sheet: MeasuredFrames, experiment: str) -> Rows:
     """Noise-equivalent angle, error and outcomes by rate; at rest from the terms' first attitude.
 
     Parameters
@@ -170,7 +173,7 @@ def by_rate(sheet: MeasuredFrames, experiment: str) -> list[Record]:
     return found
 
 
-def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> list[Record]:
+def by_level(sheet: MeasuredFrames, experiment: str, key: str) -> Rows:
     """Noise-equivalent angle, error and outcomes by the levels of a key, ascending; empty without the experiment."""
     return [
         {key: level, **pair_row(sheet, sheet.rows(experiment, **{key: level}))}
@@ -199,7 +202,7 @@ class Limit(NamedTuple):
     fields: int
 
 
-def bracket(rows: list[Record], key: str) -> Limit:
+def bracket(rows: Rows, key: str) -> Limit:
     """The limit in a rate or an acceleration, from rows in ascending order of it."""
     fewest = min(row["counts"].frames for row in rows)
     share = next(
@@ -221,7 +224,7 @@ def bracket(rows: list[Record], key: str) -> Limit:
 UNITS = {"rate_deg_s": "°/s", "acceleration_deg_s2": "°/s²", "off_deg": "°"}
 
 
-def bracket_text(what: str, rows: list[Record], key: str) -> str:
+def bracket_text(what: str, rows: Rows, key: str) -> str:
     """A sentence on a limit, for fields that are right in both of their frames."""
     limit = bracket(rows, key)
     unit = UNITS[key]
@@ -239,7 +242,7 @@ def bracket_text(what: str, rows: list[Record], key: str) -> str:
     return f"{text}{false_claims_text(rows, key)}" if "nees" in rows[0] else text
 
 
-def false_claims_text(rows: list[Record], key: str) -> str:
+def false_claims_text(rows: Rows, key: str) -> str:
     """A sentence on the levels at which the errors are not as the tracker claims; empty without any.
 
     All levels together at CONFIDENCE, as a study judges its points (`answer.jointly`).
@@ -275,7 +278,7 @@ def solution_times_s(sheet: MeasuredFrames) -> Floats:
     return np.array(found[TIMED:])
 
 
-def disturbances(sheet: MeasuredFrames) -> list[Record]:
+def disturbances(sheet: MeasuredFrames) -> Rows:
     """Outcomes and errors under each disturbance, the undisturbed frames first."""
     undisturbed = [row for row in sheet.rows("total") if sheet.cells[row].levels["draw"] == 0]
     cases = {"none": undisturbed}
@@ -286,12 +289,12 @@ def disturbances(sheet: MeasuredFrames) -> list[Record]:
     return [{"disturbance": name} | outcome(sheet, rows) for name, rows in cases.items()]
 
 
-def outcome(sheet: MeasuredFrames, rows: list[int]) -> Record:
+def outcome(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Counts and rms errors of some cells, each frame on its own."""
     return {"counts": counts(sheet, rows)} | rms_by_group(sheet, rows)
 
 
-def exclusions(sheet: MeasuredFrames) -> list[Record]:
+def exclusions(sheet: MeasuredFrames) -> Rows:
     """Outcomes and errors by the angle of the boresight from bright bodies, the farthest first."""
     angles = sorted(sheet.levels("exclusion", "off_deg"), reverse=True)
     return [

@@ -8,6 +8,7 @@ from skysim.scene.scene import BODIES_YEARS, Scene
 from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
 from skysim.tracking.onboard_model import onboard_catalog
 
+Changes = dict[str, Settings]  # by name
 FIXED_PATTERN = ("prnu", "dsnu", "hot_pixels", "column_offset_e")  # keys of `camera.detector`
 # Error and number of the true centroids in trials with false ones.
 FALSE_STARS_PX = 0.05
@@ -26,13 +27,13 @@ def catalog_end_mag(scene: Scene) -> float:
     return float(stars.v_mag.max()) + CATALOG_MARGIN_MAG
 
 
-def causes(scene: Scene) -> dict[str, Settings]:
+def causes(scene: Scene) -> Changes:
     """Changes of the scene that would lower the error; those without effect on it are left out."""
     camera = scene.camera
     chip = camera.detector
     survey = scene.tracker.survey
     exposure = scene.exposure
-    changes: dict[str, Settings] = {
+    changes: Changes = {
         "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
     }
     if 2 * exposure.time_s + exposure.trigger_jitter_s <= 1 / exposure.rate_hz:
@@ -67,13 +68,13 @@ def causes(scene: Scene) -> dict[str, Settings]:
     return changes
 
 
-def disturbances(scene: Scene) -> dict[str, Settings]:
+def disturbances(scene: Scene) -> Changes:
     """Disturbances that the scene supports, beyond its own."""
     chip = scene.camera.detector
     exposure_s = scene.exposure.time_s
     hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
     own = scene.model_dump(mode="json", by_alias=True)["background"]
-    found: dict[str, Settings] = {
+    found: Changes = {
         "protons, 1e3 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e3}]},
         "protons, 1e4 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e4}]},
         "hot pixels, 0.1 %": {"camera.detector.hot_pixels": 1e-3} | hot,

@@ -10,10 +10,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Record
 from skysim.experiments.datasheet import performance, variance_components
 from skysim.experiments.datasheet.cells import TRACKED, MeasuredFrames
-from skysim.experiments.datasheet.performance import Counts, bracket_text
+from skysim.experiments.datasheet.performance import Counts, Rows, bracket_text
 from skysim.experiments.datasheet.variance_components import Bounded, Components
-from skysim.results import metrics
-from skysim.results.metrics import Summary
+from skysim.results.metrics import TAILS, Summary
 
 NAMES = {
     "bias": "bias",
@@ -23,7 +22,7 @@ NAMES = {
     "temporal": "temporal noise",
     "total": "sum",
 }
-Rows = list[Record]
+Texts = list[str]
 ENSEMBLE = "ensemble: over fields, units and noise, each frame on its own"
 ONE_UNIT = "ensemble: over fields and noise, for the first unit in its first thermal state"
 TEMPORAL = "temporal: over frames of one attitude that differ in their noise"
@@ -107,7 +106,7 @@ def state(sheet: MeasuredFrames) -> Statement:
 # As sections.
 
 
-def sizes(table: variance_components.TermTable, name: str) -> list[str]:
+def sizes(table: variance_components.TermTable, name: str) -> Texts:
     """A term's root mean square and its percentage of the sum; its upper bounds if it is not shown to be above 0."""
     low, high = (max(end, 0.0) for end in table.squares[name][1:])
     total = table.squares["total"].value
@@ -205,7 +204,7 @@ def unit_text(units: int) -> str:
     from scipy.special import chdtri
 
     freedom = units - 1
-    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in metrics.TAILS)
+    low, high = (math.sqrt(freedom / chdtri(freedom, tail)) for tail in TAILS)
     return (
         f"These intervals are over the fields, for the {units} units that were measured, which both sides of the"
         f" comparison have. Where the bias scatters among units, {units} of them bound its size for all units to a"
@@ -224,7 +223,10 @@ def lowering_section(statement: Statement) -> StatementSection:
         "Each change alone, at rest, on the same fields, units and noise as before: what is left of the error's mean"
         " square, in percent, with 95 % intervals. Below 100 the change lowers the error."
     )
-    rows = [[one["cause"], *ratio_cells(one)] for one in statement.causes]
+    rows = []
+    for one in statement.causes:
+        percents = (np.array(one[name]) * 100 for name in variance_components.GROUPS)
+        rows.append([one["cause"], *(bounded(Bounded(*ratio)) for ratio in percents)])
     return StatementSection(
         "What dominates, and what would lower it",
         texts,
@@ -232,14 +234,6 @@ def lowering_section(statement: Statement) -> StatementSection:
         rows,
         ["causes"],
     )
-
-
-def ratio_cells(row: Record) -> list[str]:
-    """Cells of the ratios of mean squares, in percent."""
-    return [
-        bounded(Bounded(*(100 * part for part in row[name])))
-        for name in variance_components.GROUPS
-    ]
 
 
 def probability_section(statement: Statement) -> StatementSection:
@@ -329,18 +323,18 @@ def quantile_text(found: Summary) -> str:
     return bounded(found)
 
 
-def outcome_cells(row: Record) -> list[str]:
+def outcome_cells(row: Record) -> Texts:
     """Cells of a row's outcomes."""
     counts = row["counts"]
     return [percent(counts.share("right")), str(counts.refused), str(counts.false)]
 
 
-def outcome_row(row: Record) -> list[str]:
+def outcome_row(row: Record) -> Texts:
     """Cells of a row's outcomes, and of the rms errors of its right attitudes, as OUTCOME_HEADERS."""
     return [*outcome_cells(row), arcsec(row["rms_across"]), arcsec(row["rms_about"])]
 
 
-def pair_cells(row: Record) -> list[str]:
+def pair_cells(row: Record) -> Texts:
     """Cells of a pair of frames: noise-equivalent angle and error, the normalized error squared, and outcomes."""
     errors = [
         arcsec(row[f"{kind}_{name}"])
@@ -381,7 +375,7 @@ def rate_section(statement: Statement) -> StatementSection:
 RATE_HEADERS = ["rate °/s", "streak px", *PAIR_HEADERS]
 
 
-def rate_rows(rows: list[Record]) -> list[list[str]]:
+def rate_rows(rows: Rows) -> list[Texts]:
     """The cells of rows by rate."""
     return [
         [f"{row['rate_deg_s']:g}", f"{row['streak_px']:.3g}", *pair_cells(row)]

@@ -80,7 +80,7 @@ def common_square(means: Floats) -> Floats:
     total = means.sum(axis=-2, keepdims=True)
     products = means * (total - means) / (fields - 1)
     square = products.mean(axis=-2, keepdims=True)
-    return np.asarray(square + 2 * (fields - 1) / (fields - 2) * (products - square))
+    return square + 2 * (fields - 1) / (fields - 2) * (products - square)
 
 
 def bounded(shares: Floats, verdicts: int = 1) -> Bounded:
@@ -252,8 +252,3 @@ def causes(sheet: MeasuredFrames) -> list[Record]:
             row[group] = mean_square_ratio(squares, squares_by_field(sheet, before, axes))
         found.append(row)
     return sorted(found, key=lambda one: one["across"].value + one["about"].value)
-
-
-def rms(sheet: MeasuredFrames, rows: list[int], axes: slice) -> float:
-    """Root mean square of the errors about one axis, arcseconds, over all frames with a right attitude."""
-    return math.sqrt(mean_known(sheet.errors(rows)[axes] ** 2))

@@ -18,7 +18,6 @@ from estimator.attitude.dome_map import LedMap
 from estimator.calibration import dome_survey, survey_faults, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
-from estimator.calibration.survey_subset import Unconnected
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats
 from skysim.experiments.dome_survey.survey_findings import (
@@ -104,7 +103,7 @@ def check_lens(
     if uncertainty.fit_distortion:
         return
     try:
-        fitted = replace(uncertainty, fit_distortion=True)
+        fitted = uncertainty._replace(fit_distortion=True)
         survey = survey_in_rounds(frames, prior, fitted).survey
     except InputError:
         return
@@ -231,7 +230,7 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     """
     survey = run.survey
     prior = run.prior
-    model = replace(prior, camera=survey.camera, leds=survey.leds, lever=survey.lever)
+    model = prior._replace(camera=survey.camera, leds=survey.leds, lever=survey.lever)
     # The attitudes are adjusted, so only the errors of the map and of the residuals remain in the predictions.
     map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
@@ -251,7 +250,7 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
         rows.append(row)
         matches.append(match)
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, replace(model, leds=prior.leds)
+    return rows, matches, model._replace(leds=prior.leds)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -314,7 +313,7 @@ def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
     survey = run.survey
     return replace(
         run,
-        prior=replace(prior, leds=moved(prior.leds)),
+        prior=prior._replace(leds=moved(prior.leds)),
         survey=replace(survey, leds=moved(survey.leds)),
     )
 
@@ -336,7 +335,15 @@ def adjust_connected(
         try:
             # The loss is robust, and the values assumed before the survey are measurements.
             survey = dome_survey.survey(
-                [dome_frame(*pairs[k]) for k in selected],
+                [
+                    DomeFrame(
+                        match.led,
+                        frame.lights.xy_px[match.light],
+                        frame.lights.sigma_px[match.light],
+                        frame.body_from_lab,
+                    )
+                    for frame, match in map(pairs.__getitem__, selected)
+                ],
                 prior.leds,
                 prior.lever,
                 prior.camera,
@@ -345,7 +352,7 @@ def adjust_connected(
                 fit_noise=True,
                 assumed=before,
             )
-        except Unconnected as error:
+        except survey_subset.Unconnected as error:
             if len(error.frames) > MAX_UNCONNECTED * len(selected):
                 raise InputError("", error) from None
             selected = np.delete(selected, error.frames).tolist()
@@ -435,15 +442,4 @@ def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
         own_m2=leds.covariance_m2,
         common_m=leds.common_m,
         common_camera=leds.common_camera,
-    )
-
-
-def dome_frame(frame: SurveyFrame, match: Correspondences) -> DomeFrame:
-    """Input frame of the adjustment: matched detections with their LEDs, and the start attitude."""
-    lights = frame.lights
-    return DomeFrame(
-        match.led,
-        lights.xy_px[match.light],
-        lights.sigma_px[match.light],
-        frame.body_from_lab,
     )

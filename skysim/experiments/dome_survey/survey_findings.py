@@ -15,12 +15,12 @@ from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from skysim.core.types import Bools, Floats, Record
-from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.survey_frames import (
     GATE_SIGMAS,
     Correspondences,
     SurveyFrame,
     match_by_imu,
+    planned_stops,
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
@@ -29,6 +29,7 @@ from skysim.experiments.dome_survey.survey_prior import (
 )
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
+from skysim.sources.dome.layouts.placing import tilts_rad
 
 # A survey after its last round: frames, correspondences, light of each LED, stray lights.
 
@@ -117,7 +118,7 @@ class SurveyRun:
         before = self.uncertainty
         lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
         focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
-        return replace(before, lever_sigma_m=lever_m, focal_error=focal)
+        return before._replace(lever_sigma_m=lever_m, focal_error=focal)
 
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
@@ -167,19 +168,14 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
 def light_table(run: SurveyRun) -> LightTable:
     """The light of each LED in the frames, measured and expected."""
     index = np.array([frame.index for frame in run.frames])
-    return LightTable(
-        light_at_unit_distance(run),
-        run.held.shown(*margins(run)),
-        run.prior.expected_light(index),
-    )
-
-
-def margins(run: SurveyRun) -> tuple[Floats, float]:
-    """Margin of the chip for each LED, and least distance between LEDs, including the errors of their places."""
+    # The margin of the chip includes the errors of the places. Two images do not merge at twice the reach of one.
     margin_px = run.prior.margin_px
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
-    # Two images do not merge at twice the reach of one.
-    return margin_px + GATE_SIGMAS * place_px, 2 * margin_px
+    return LightTable(
+        light_at_unit_distance(run),
+        run.held.shown(margin_px + GATE_SIGMAS * place_px, 2 * margin_px),
+        run.prior.expected_light(index),
+    )
 
 
 def light_at_unit_distance(run: SurveyRun) -> Floats:
@@ -258,7 +254,7 @@ def next_stops(
 ) -> NextStops:
     """Up to `count` attitudes after those held so far."""
     model = so_far.model
-    further = survey_frames.planned_stops(
+    further = planned_stops(
         scene, model, margin_px, count, tilt_deg, so_far.held, so_far.seen
     )
     attitudes = Rotation.concatenate([so_far.held, further.inv()])
@@ -470,8 +466,7 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
 
 def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
-    up = lab_from_body.apply([0.0, 0.0, 1.0])
-    tilt_deg = np.degrees(np.arctan2(np.hypot(up[:, 0], up[:, 1]), up[:, 2]))
+    tilt_deg = np.degrees(tilts_rad(lab_from_body.apply([0.0, 0.0, 1.0])))
     roll, pitch, yaw = euler_deg(lab_from_body).T
     return rows_of_columns(
         roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, tilt_deg=tilt_deg, leds=shown.sum(axis=1)

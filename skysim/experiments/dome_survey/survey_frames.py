@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import survey_plan
-from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
@@ -72,7 +71,7 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
 
 def planned_stops(
     scene: Scene,
-    model: SurveyModel,
+    model: survey_plan.SurveyModel,
     margin_px: float,
     count: int,
     tilt_deg: float,
@@ -135,7 +134,7 @@ class SurveyFrame:
 
     lights: Centroids
     body_from_lab: Rotation
-    index: int = 0
+    index: int
 
 
 def render_stops(

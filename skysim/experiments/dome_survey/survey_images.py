@@ -26,8 +26,12 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
 from skysim.core.text import excerpt, read_named_rows
 from skysim.core.types import Record
-from skysim.experiments.dome_survey import survey_frames
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame, detect_lights
+from skysim.experiments.dome_survey.survey_frames import (
+    SurveyFrame,
+    detect_lights,
+    from_angles,
+    from_rows,
+)
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.results.telemetry_report import euler_deg
 
@@ -106,7 +110,7 @@ def read_attitudes(path: Path) -> dict[str, Rotation]:
         path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used"
     )
     files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
-    return dict(zip(files, survey_frames.from_angles(numbers), strict=True))
+    return dict(zip(files, from_angles(numbers), strict=True))
 
 
 def write_attitudes(
@@ -134,7 +138,7 @@ def write_solved(path: Path, rows: Sequence[Record]) -> None:
         name = f"covariance_{'xyz'[i]}{'xyz'[j]}_rad2"
         more[name] = [row["covariance_rad2"][i][j] for row in solved]
     names = [row["file"] for row in solved]
-    write_attitudes(path, names, survey_frames.from_rows(solved), more)
+    write_attitudes(path, names, from_rows(solved), more)
 
 
 def frames_with_attitude(

@@ -1,7 +1,7 @@
 """The model that is assumed before a survey of the dome, and its uncertainty."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,8 +36,7 @@ UNCERTAINTY_RANGES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SurveyUncertainty:
+class SurveyUncertainty(NamedTuple):
     """Uncertainty before the survey: standard deviations along or about each axis, and of the focal length.
 
     Attributes
@@ -60,15 +59,14 @@ class SurveyUncertainty:
     led_sigma_m: float
     lever_sigma_m: float
     focal_error: float
-    fit_distortion: bool = False
+    fit_distortion: bool
 
     def focal_sigma_px(self, camera: Camera) -> float:
         """Standard deviation of the assumed focal length of a camera."""
         return self.focal_error * camera.focal_px
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrationPrior:
+class CalibrationPrior(NamedTuple):
     """Assumed model of dome and camera, before a survey or from it.
 
     Attributes
@@ -236,8 +234,7 @@ def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
 
 def as_listed(scene: Scene) -> Scene:
     """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without simulated errors."""
-    tracker = scene.tracker.model_copy(update={"survey": SurveyErrorsConfig(), "map": None})
-    return scene.model_copy(update={"tracker": tracker})
+    return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
 
 
 def with_map(scene: Scene, path: str) -> Scene:

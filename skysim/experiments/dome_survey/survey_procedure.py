@@ -9,14 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.calibration import survey_plan
-from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
+from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel, measurable
 from estimator.trackers.pipeline import Settings
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Record
-from skysim.experiments.dome_survey import survey_frames
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
@@ -26,9 +24,12 @@ from skysim.experiments.dome_survey.survey_findings import (
 )
 from skysim.experiments.dome_survey.survey_frames import (
     CANDIDATES,
+    STREAM_KEYS,
     SurveyFrame,
     centroid_noise_px,
     imu_attitudes,
+    planned_stops,
+    stop_attitudes,
     take_frames,
 )
 from skysim.experiments.dome_survey.survey_images import (
@@ -89,7 +90,7 @@ class HeldAttitudes(NamedTuple):
         """
         model = self.model
         held = self.lab_from_body[:count].inv()
-        rng = random_stream(0, survey_frames.STREAM_KEYS["domes"])
+        rng = random_stream(0, STREAM_KEYS["domes"])
         found = []
         for _ in range(DRAWS):
             focal, *lever = rng.standard_normal(4)
@@ -104,7 +105,7 @@ class HeldAttitudes(NamedTuple):
                 lever=replace(model.lever, camera_body_m=lever_m),
             )
             shown = other.visible(held, self.margin_px)
-            found.append(int(survey_plan.measurable(other, held, shown).sum()))
+            found.append(int(measurable(other, held, shown).sum()))
         return {
             "measured": round(np.mean(found)),
             "measured_range": [round(end) for end in np.quantile(found, [0.025, 0.975])],
@@ -133,16 +134,16 @@ def plan_survey(
     """
     lab = build_lab(with_survey_errors(scene, uncertainty))
     prior = calibration_prior(lab)
-    random = survey_frames.stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
+    random = stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
     model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
     margin_px = prior.margin_px
     held = (
         random
         if kind == RANDOM
-        else survey_frames.planned_stops(lab.scene, model, margin_px, count, tilt_deg)
+        else planned_stops(lab.scene, model, margin_px, count, tilt_deg)
     )
     shown = model.visible(held.inv(), margin_px)
-    anywhere = survey_frames.stop_attitudes(lab.scene, "candidates", CANDIDATES, tilt_deg)
+    anywhere = stop_attitudes(lab.scene, "candidates", CANDIDATES, tilt_deg)
     in_reach = np.asarray(model.visible(anywhere.inv(), margin_px).any(axis=0))
     return lab, prior, HeldAttitudes(held, shown, model, margin_px, in_reach)
 
@@ -178,7 +179,7 @@ def survey_images(
     prior: CalibrationPrior,
     uncertainty: SurveyUncertainty,
     settings: Settings,
-    watch: Progress | None = None,
+    watch: Progress | None,
 ) -> SurveyRun:
     """Survey from images. `frames` are those with an attitude; the others are identified with the LEDs so far.
 
@@ -196,8 +197,8 @@ def survey_images(
     run = run_survey(frames, prior, uncertainty, watch)
     while len(frames) < len(pictures):
         found = run.survey
-        model = replace(
-            prior, camera=found.camera, leds=found.surveyed_leds, lever=found.lever
+        model = prior._replace(
+            camera=found.camera, leds=found.surveyed_leds, lever=found.lever
         )
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [
@@ -206,7 +207,7 @@ def survey_images(
         more = frames_with_attitude(
             named,
             model,
-            replace(run.uncertainty_after, led_sigma_m=run.accuracy.led_rms_m),
+            run.uncertainty_after._replace(led_sigma_m=run.accuracy.led_rms_m),
             settings,
         )
         if len(more) == len(frames):

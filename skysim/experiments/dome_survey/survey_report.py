@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -27,8 +28,8 @@ from skysim.experiments.dome_survey.survey_findings import (
 )
 from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
-from skysim.results import metrics
-from skysim.results.plots import INK, bgr_image, png
+from skysim.results import metrics, scoring
+from skysim.results.plots import INK, png
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -274,23 +275,10 @@ PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
 VALUE_KEYS = ("what", "believed", "found", "sigma")
 
 
-def error_statistics(stops: int, errors_rad: list[tuple[float, float]]) -> Record:
-    """Median and worst cross-boresight and roll errors of a tracker in arcseconds; None if nothing was solved."""
-    statistics: Record = {"stops": stops, "solved": len(errors_rad)}
-    errors_arcsec = np.abs(errors_rad).reshape(-1, 2) / ARCSEC_RAD
-    for name, error_arcsec in zip(("cross", "roll"), errors_arcsec.T, strict=True):
-        median = worst = None
-        if len(error_arcsec):
-            median = float(np.median(error_arcsec))
-            worst = float(error_arcsec.max())
-        statistics |= {f"{name}_arcsec_median": median, f"{name}_arcsec_worst": worst}
-    return statistics
-
-
 def compare_trackers(
     trackers: Mapping[str, factory.Estimator], frames: Iterable[tuple[Frame, Truth]]
 ) -> dict[str, Record]:
-    """Statistics of each tracker on the same frames, by name."""
+    """Numbers of stops and of solved ones, and the errors, of each tracker on the same frames, by name."""
     errors: dict[str, list[tuple[float, float]]] = {name: [] for name in trackers}
     stops = 0
     for frame, truth in frames:
@@ -298,10 +286,12 @@ def compare_trackers(
         for name, tracker in trackers.items():
             cam_from_ref = factory.solve_frame(tracker, frame).attitude.cam_from_ref
             if cam_from_ref is not None:
-                errors[name].append(
-                    metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab)
-                )
-    return {name: error_statistics(stops, errors_rad) for name, errors_rad in errors.items()}
+                cross, roll = metrics.cross_and_roll_rad(cam_from_ref, truth.cam_from_lab)
+                errors[name].append((cross / ARCSEC_RAD, roll / ARCSEC_RAD))
+    return {
+        name: {"stops": stops, "solved": len(found), **scoring.error_statistics(found)}
+        for name, found in errors.items()
+    }
 
 
 class LedErrors(NamedTuple):
@@ -394,7 +384,8 @@ def survey_figure(
         for axes, panel in zip(rest, panels, strict=True):
             draw_errors(axes, *panel)
 
-    return bgr_image(draw, (7 * (1 + len(panels)), 6.5))
+    drawn = np.frombuffer(png(draw, (7 * (1 + len(panels)), 6.5)), np.uint8)
+    return np.asarray(cv2.imdecode(drawn, cv2.IMREAD_COLOR), np.uint8)
 
 
 def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:

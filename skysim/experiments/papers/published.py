@@ -4,12 +4,10 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.types import Floats
 from skysim.core.units import ConfigModel, NotNegative, Number, PositiveInt
 from skysim.core.yaml_reader import explain, read_yaml
 
@@ -124,12 +122,6 @@ def experiments() -> dict[str, Experiment]:
                 raise InputError(path, f"experiments.{id} is defined in two files")
             by_id[id] = experiment.model_copy(update={"paper": paper.paper})
     return by_id
-
-
-def published_values(id: str, *keys: str) -> Floats:
-    """(N,) published numbers of an experiment's rows; NaN for a row with bounds only."""
-    rows = experiments()[id].rows
-    return np.array([rows[key].published for key in keys], dtype=float)
 
 
 def read(path: Path) -> Paper:

@@ -33,10 +33,9 @@ from skysim.core.errors import InputError
 from skysim.core.types import Record
 from skysim.experiments import home_calibration
 from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
-from skysim.experiments.study import table as study_table
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution.store import open_store
-from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.table import PointRow, format_level, table
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.metrics import SIGMAS
 from skysim.scene import loader
@@ -209,7 +208,7 @@ def study_numbers(experiment: Experiment, options: Options) -> tuple[list[str], 
     with tempfile.TemporaryDirectory() as folder:
         result = run_study(experiment.file, overrides, out=Path(folder))
         with open_store(result.path) as store:
-            rows = study_table.table(store, result.plan.study.responses)
+            rows = table(store, result.plan.study.responses)
 
     def number(path: str, levels: str) -> Ours:
         summary = point_at(rows, levels).responses[path]
@@ -229,7 +228,7 @@ def point_at(rows: Sequence[PointRow], levels: str) -> PointRow:
         row
         for row in rows
         if all(
-            study_table.format_level(row.levels[name.strip()]) == level.strip()
+            format_level(row.levels[name.strip()]) == level.strip()
             for name, level in wanted.items()
         )
     ]

@@ -23,26 +23,39 @@ from skysim.experiments.study.table import (
     has_few_values,
     varied_factors,
 )
-from skysim.results import metrics
-from skysim.results.metrics import Summary
+from skysim.results.metrics import (
+    CONFIDENCE,
+    FEWEST,
+    NO_VALUE,
+    ONE_SURVEY,
+    OVERCONFIDENCE_PROBABILITY,
+    OVERCONFIDENT_NEES,
+    SIGMAS,
+    Summary,
+    exact_bounds,
+    joint_sigmas,
+    proportion,
+    trials_needed,
+)
 from skysim.results.requirements import Judgment, percent
 
 # Claims that a study's numbers support, in words: whether the tracker's claimed errors are true, and rare events.
 
 
+Sentences = list[str]
 # Range of the mean NEES (3 if true) in which claimed errors are true to a tenth.
 TRUE_NEES = (2.5, 3.5)
 CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) -> list[str]:
+def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sentences:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES.
 
     Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES
     is beyond what one draw of three angles can have (probability OVERCONFIDENCE_PROBABILITY).
     """
-    known = [(line.responses.get("nees", metrics.NO_VALUE), line) for line in lines]
+    known = [(line.responses.get("nees", NO_VALUE), line) for line in lines]
     known = [(one, line) for one, line in known if one.trials]
     if not known:
         return []
@@ -50,8 +63,8 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
     found = [(one, line) for one, line in found if np.isfinite(one.low)]
     low, high = TRUE_NEES
     means = [one.value for one, _ in known]
-    shared = survey_share > metrics.ONE_SURVEY
-    if shared and max(means) < metrics.OVERCONFIDENT_NEES:
+    shared = survey_share > ONE_SURVEY
+    if shared and max(means) < OVERCONFIDENT_NEES:
         spread = (
             f"{min(means):.3g} to {max(means):.3g}" if len(means) > 1 else f"{means[0]:.3g}"
         )
@@ -63,7 +76,7 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
     if not found:
         most = max(one.trials for one, _ in known)
         return [
-            f"{CLAIMED} Too few to say: {most} trials{everywhere(len(known))}, {metrics.FEWEST} are needed."
+            f"{CLAIMED} Too few to say: {most} trials{everywhere(len(known))}, {FEWEST} are needed."
         ]
     together = f", 95 % for all {len(known)} points together" if len(known) > 1 else ""
     false = [(one, line) for one, line in found if one.low > high or one.high < low]
@@ -90,7 +103,7 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float = 0.0) ->
     factor = max(factor, 1 / factor)
     at = f" at {place(line)}" if len(known) > 1 else ""
     count = f", at {len(false)} of {len(known)} points" if len(known) > 1 else ""
-    wrong = line.responses.get("wrong", metrics.NO_VALUE).value
+    wrong = line.responses.get("wrong", NO_VALUE).value
     cause = ", wrong attitudes included" if wrong > 0 else ""
     interval = f"{worst.low:.3g} to {worst.high:.3g}{together}"
     return [
@@ -106,13 +119,13 @@ def jointly(nees: Summary, points: int) -> Summary:
     mean of few trials counts as it is if a true covariance hardly has it (probability OVERCONFIDENCE_PROBABILITY).
     """
     count = nees.trials
-    if count < metrics.FEWEST:
+    if count < FEWEST:
         chance = scipy.special.chdtrc(3 * count, count * nees.value)
-        end = nees.value if chance < metrics.OVERCONFIDENCE_PROBABILITY else math.nan
+        end = nees.value if chance < OVERCONFIDENCE_PROBABILITY else math.nan
         return nees._replace(low=end, high=end)
     low, high = nees.low ** (-1 / 3), nees.high ** (-1 / 3)
     middle = (low + high) / 2
-    half = metrics.joint_sigmas(points) / metrics.SIGMAS * (low - high) / 2
+    half = joint_sigmas(points) / SIGMAS * (low - high) / 2
     return nees._replace(low=(middle + half) ** -3, high=max(middle - half, 1e-9) ** -3)
 
 
@@ -121,13 +134,13 @@ def noticed(nees: Summary, points: int) -> float:
 
     The lower end must exceed TRUE_NEES; POWER takes so many sigmas more, of which value / low has `joint_sigmas`.
     """
-    ratio = 1 + scipy.special.ndtri(POWER) / metrics.joint_sigmas(points)
+    ratio = 1 + scipy.special.ndtri(POWER) / joint_sigmas(points)
     return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
-def effect_of_wrong_matches(lines: PointRows, place: Place) -> list[str]:
+def effect_of_wrong_matches(lines: PointRows, place: Place) -> Sentences:
     """Sentences on wrong matches, and on whether they make the attitude err more than claimed; none without them."""
-    known = [line.responses.get("mismatched", metrics.NO_VALUE) for line in lines]
+    known = [line.responses.get("mismatched", NO_VALUE) for line in lines]
     shares = [one for one in known if one.value > 0]
     if not shares:
         return []
@@ -151,7 +164,7 @@ def everywhere(points: int) -> str:
     return f" at all {points} points" if points > 1 else ""
 
 
-def runs_needed(lines: PointRows, events: Sequence[str]) -> list[str]:
+def runs_needed(lines: PointRows, events: Sequence[str]) -> Sentences:
     """Sentences on how many trials a smaller claim about events that were never seen needs; none if all were seen.
 
     The next smaller claim is the next power of ten below the bound of the point with the fewest trials.
@@ -161,12 +174,12 @@ def runs_needed(lines: PointRows, events: Sequence[str]) -> list[str]:
     if not never:
         return []
     fewest = min(never)
-    bound = metrics.exact_bounds(0, fewest)[1]
+    bound = exact_bounds(0, fewest)[1]
     claim = 10.0 ** (math.ceil(math.log10(bound) - 1e-9) - 1)
-    needed = metrics.trials_needed(claim)
+    needed = trials_needed(claim)
     each = " at each point" if len(lines) > 1 else ""
     return [
-        f"None in {fewest:,} is less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence; a claim of"
+        f"None in {fewest:,} is less than {100 * bound:.2g} % at {100 * CONFIDENCE:g} % confidence; a claim of"
         f" less than {100 * claim:.6g} % needs {needed:,} in all{each} without any."
     ]
 
@@ -188,7 +201,7 @@ def headline(
     worst: str = "skysim study worst STUDY",
     judged: Sequence[Sequence[Judgment]] = (),
     survey_share: float = 0.0,
-) -> list[str]:
+) -> Sentences:
     """Thresholds, refusals, ambiguity and wrong answers, in one or two sentences each; none if all trials failed.
 
     Parameters
@@ -290,7 +303,7 @@ def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place
     return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
 
 
-def ranges(study: Study, lines: PointRows) -> list[str]:
+def ranges(study: Study, lines: PointRows) -> Sentences:
     """Smallest and largest value over the points of each response that the headline is not about."""
     done = [line for line in lines if line.trials]
     if not done:
@@ -382,7 +395,7 @@ def ambiguity(study: Study, lines: PointRows, place: Place) -> str:
         refused = line.responses["ambiguous"]
         wrong = line.responses["misled"]
         either = refused.value + np.nan_to_num(wrong.value)
-        share = metrics.proportion(round(either * refused.trials), refused.trials)
+        share = proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
     unit = ", each with hardware of its own" if study.hardware else ""
     text = event("Ambiguous or misled", shares, lines, place)
@@ -400,7 +413,7 @@ def solved_everywhere(study: Study, lines: PointRows, place: Place, worst: str) 
     return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."
 
 
-def one_unit(fixed: Sequence[str]) -> list[str]:
+def one_unit(fixed: Sequence[str]) -> Sentences:
     """A sentence that the intervals are of one unit of hardware, and how to cover others; "" without a fixed seed."""
     if not fixed:
         return []
@@ -418,8 +431,8 @@ def none_of(shares: Sequence[Summary]) -> str:
     """A sentence that an event was never seen, with the exact upper bound of its frequency (Clopper & Pearson 1934)."""
     fewest = min(share.trials for share in shares)
     each = " a point" if len(shares) > 1 else ""
-    bound = metrics.exact_bounds(0, fewest)[1] if fewest else 1.0
-    return f"none in {fewest:,}{each} (less than {100 * bound:.2g} % at {100 * metrics.CONFIDENCE:g} % confidence)"
+    bound = exact_bounds(0, fewest)[1] if fewest else 1.0
+    return f"none in {fewest:,}{each} (less than {100 * bound:.2g} % at {100 * CONFIDENCE:g} % confidence)"
 
 
 def interval(share: Summary) -> str:

@@ -135,7 +135,7 @@ def run_study(
     texts = study_texts(changes, tree)
     is_plain = path.name != MAPPING and not given
     if is_plain:
-        folder = Path(out) if out is not None else Path("out") / path.stem
+        folder = Path(out or f"out/{path.stem}")
         plan = study_file.load(path, texts, made)
     else:
         tree, _ = as_tree(tree)
@@ -144,7 +144,7 @@ def run_study(
         beside = path.resolve().parent / str(tree.get("scene", ""))
         if is_file(beside):
             tree["scene"] = str(beside)
-        folder = Path(out) if out is not None else Path("out") / slug(tree)
+        folder = Path(out or f"out/{slug(tree)}")
         # 3. Parts.
         for name, part in given.items():
             with_part(tree, name, part, folder, made)

@@ -269,6 +269,7 @@ class Design(ConfigModel):
 
 
 Factors = Mapping[str, Factor]
+Points = Iterator[Point]
 
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
@@ -304,13 +305,13 @@ def make_point(chosen: Mapping[str, Option]) -> Point:
     return Point({name: level for name, (level, _) in chosen.items()}, settings)
 
 
-def factorial(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+def factorial(design: Design, factors: Factors, seed: int) -> Points:
     """Every combination; the last factor changes fastest."""
     for levels in itertools.product(*(factor.options() for factor in factors.values())):
         yield make_point(dict(zip(factors, levels, strict=True)))
 
 
-def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+def one_at_a_time(design: Design, factors: Factors, seed: int) -> Points:
     """The first level of every factor; then each other level of each factor alone."""
     first = {name: factor.options()[0] for name, factor in factors.items()}
     yield make_point(first)
@@ -319,7 +320,7 @@ def one_at_a_time(design: Design, factors: Factors, seed: int) -> Iterator[Point
             yield make_point(first | {name: level})
 
 
-def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
+def points_at(factors: Factors, coordinates: Floats) -> Points:
     """The points at (P, D) coordinates in the unit cube."""
     for row in coordinates.tolist():
         yield make_point(
@@ -327,7 +328,7 @@ def points_at(factors: Factors, coordinates: Floats) -> Iterator[Point]:
         )
 
 
-def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+def sample(design: Design, factors: Factors, seed: int) -> Points:
     """A Latin hypercube or a Sobol sequence, scrambled by the seed.
 
     In a Latin hypercube each factor's range is divided into as many strips as points, with one point in each.
@@ -339,7 +340,7 @@ def sample(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
     yield from points_at(factors, sampler.random(design.points or 0))
 
 
-def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
+def saltelli(design: Design, factors: Factors, seed: int) -> Points:
     """A, B, then for each factor A with its column replaced by B's. `table.response_indices` relies on this order.
 
     A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
@@ -355,7 +356,7 @@ def saltelli(design: Design, factors: Factors, seed: int) -> Iterator[Point]:
         yield from points_at(factors, np.where(np.arange(width) == n, b, a))
 
 
-DESIGNS: dict[str, Callable[[Design, Factors, int], Iterator[Point]]] = {
+DESIGNS: dict[str, Callable[[Design, Factors, int], Points]] = {
     "factorial": factorial,
     "one_at_a_time": one_at_a_time,
     "lhs": sample,

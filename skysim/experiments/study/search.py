@@ -35,7 +35,6 @@ from skysim.experiments.study.plan import Constraint, Cost, Plan, Search, Study,
 from skysim.experiments.study.table import format_level, format_summary
 from skysim.results import metrics
 from skysim.results.files.parts import parts_list
-from skysim.results.metrics import Columns, Summary
 
 # Cost of a candidate of a search: prices of its factors, and the parts list of its scene's dome.
 
@@ -107,9 +106,8 @@ def factors_cost(config: Cost, levels: Mapping[str, Value]) -> float:
 
 STARTUP_CANDIDATES = 10  # random candidates before the sampler uses earlier results
 MAX_REPEATS = 50  # repeated proposals in succession after which all points count as evaluated
-MISSING_VIOLATION = (
-    1e3  # violation of a candidate without a value; larger than usual relative violations
-)
+# Violation of a candidate without a value; larger than usual relative violations.
+MISSING_VIOLATION = 1e3
 MIN_SCALE = 1e-9  # scale of the relative violation of a bound of zero
 
 
@@ -131,7 +129,7 @@ class Candidate(NamedTuple):
     number: int
     levels: dict[str, Value]
     objectives: tuple[float, ...]
-    figures: dict[str, Summary]
+    figures: dict[str, metrics.Summary]
     cost: float
     feasible: bool
     refused: bool
@@ -164,9 +162,7 @@ class InvalidScene(Exception):
 
 def check(study: Study) -> None:
     """Validate section `optimize` of a study. Raises InputError with the key at fault."""
-    config = study.optimize
-    if config is None:
-        return
+    config = study.search
     if not study.factors:
         raise InputError("factors", "missing: the search chooses their levels", "one or more")
     for n, objective in enumerate(config.objectives):
@@ -190,12 +186,6 @@ def check(study: Study) -> None:
                 "levels, values, from and to",
             )
     check_cost(study.factors, config.cost)
-    trials = config.candidates * study.replicates
-    budget = study.budget.trials
-    if budget is not None and trials > budget:
-        raise InputError(
-            "budget.trials", budget, f"at least {trials}, the trials of the search"
-        )
 
 
 def check_response(response: str, where: str) -> None:
@@ -214,7 +204,9 @@ def check_response(response: str, where: str) -> None:
 # Evaluation of a candidate.
 
 
-def evaluate_candidate(plan: Plan, number: int, point: Point, columns: Columns) -> Candidate:
+def evaluate_candidate(
+    plan: Plan, number: int, point: Point, columns: metrics.Columns
+) -> Candidate:
     """The candidate computed from the columns of all its trials, and its cost."""
     config = plan.study.search
     figures = {
@@ -248,7 +240,7 @@ def violation(limit: Constraint, value: float) -> float:
     return max(excess)
 
 
-def scene_error(columns: Columns) -> str:
+def scene_error(columns: metrics.Columns) -> str:
     """Why a candidate's scene was rejected; empty if the scene is valid."""
     errors = zip(columns["scene"], columns["error"], strict=True)
     return next((str(error) for scene, error in errors if scene == REFUSED), "")

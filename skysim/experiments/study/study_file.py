@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -58,19 +57,9 @@ from skysim.tracking.tracker_interface import OWN, TRACKERS
 
 SURVEY_SEED = "tracker.survey.seed"
 HARDWARE_SEED = re.compile(r"(hardware_seed|survey\.(surface_)?seed)$")
-FLIGHT_QUANTITIES = (
-    "availability",
-    "filter_arcsec",
-    "filter_worst_arcsec",
-    "drift_arcsec",
-    "pointing_arcsec",
-    "pointing_worst_arcsec",
-    "saturated_s",
-    "exposure_ms",
-)
 # Kinds of trial that measure a quantity; quantities that are not listed are measured by all.
 MEASURED_BY: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys(FLIGHT_QUANTITIES, ("flight",)),
+    **dict.fromkeys(metrics.FLIGHT_QUANTITIES, ("flight",)),
     **dict.fromkeys(("streak_px", "detect_ms", "computer_ms"), ("frames", "flight")),
 }
 
@@ -143,9 +132,7 @@ def plan_of(
     return plan
 
 
-def make_plan(
-    path: Path, study: Study, trial: Tree, programs: Programs, text: str = ""
-) -> Plan:
+def make_plan(path: Path, study: Study, trial: Tree, programs: Programs, text: str) -> Plan:
     """The plan of a study; `trial` is the section as written in the file, with units. Raises InputError for prices."""
     folder = path.resolve().parent
     spec = TrialSpec(
@@ -189,11 +176,13 @@ def check(plan: Plan, to_run: bool) -> None:
         if study.require:
             raise InputError("require", "has no effect in a search", "optimize.constraints")
         search.check(study)
-    if study.budget.trials is not None and plan.trials > study.budget.trials:
+    trials = study.trial_count(len(plan.points))
+    if study.budget.trials is not None and trials > study.budget.trials:
+        whole = "search" if study.optimize else "study"
         raise InputError(
             "budget.trials",
             study.budget.trials,
-            f"at least {plan.trials}, the trials of the study",
+            f"at least {trials}, the trials of the {whole}",
         )
     for name in study.factors:
         if name in COLUMNS or name in study.responses:
@@ -217,7 +206,7 @@ def check(plan: Plan, to_run: bool) -> None:
     check_measured(
         study, {point.trial.kind for point in points}, [point.scene for point in points]
     )
-    unused_options.check(plan, points, partial(resolve_point, plan.spec))
+    unused_options.check(plan, points)
 
 
 def check_figures(plan: Plan) -> None:

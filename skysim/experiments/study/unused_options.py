@@ -5,7 +5,7 @@ A key is refused if it has no effect at any level of any factor, each factor var
 bounds the exposure time.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from skysim.core.yaml_reader import OverrideTexts
@@ -18,6 +18,7 @@ from skysim.experiments.study.plan import (
     Plan,
     Trial,
     TrialSection,
+    resolve_point,
 )
 from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
@@ -80,11 +81,6 @@ def tracks(scene: Scene) -> bool:
         and not unused_rules.external(scene)
         and not isinstance(scene.camera.shutter, RollingShutterConfig)
     )
-
-
-def merges_stars(scene: Scene) -> bool:
-    """Whether the size of an LED decides which stars share an LED."""
-    return scene.dome is not None and isinstance(scene.dome.points, CelestialConfig)
 
 
 RULES = (
@@ -202,7 +198,11 @@ RULES = (
     ),
     Rule(
         ("light.led.disk_diameter",),
-        lambda scene, trial: isinstance(trial, CentroidTrial) and not merges_stars(scene),
+        # On a celestial dome the size of an LED decides which stars share one.
+        lambda scene, trial: (
+            isinstance(trial, CentroidTrial)
+            and not (scene.dome and isinstance(scene.dome.points, CelestialConfig))
+        ),
         "a trial of kind centroids has no image: trial.noise_px is the centroids' error",
         "trial.kind: frames",
     ),
@@ -240,10 +240,7 @@ class Fault(NamedTuple):
     point: CheckedPoint
 
 
-Resolve = Callable[[Settings], tuple[Scene, Trial]]
-
-
-def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
+def check(plan: Plan, points: Iterable[CheckedPoint]) -> None:
     """Raise InputError for an option that has no effect; its key is one of the study.
 
     1. Find the keys that have no effect at any point: of `set` and `trial`, and of each factor's levels.
@@ -256,8 +253,6 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
         The study
     points
         Every level of every factor, with the other factors at their middle
-    resolve
-        Function from the settings of all factors to the scene and the trial
     """
     # 1. Faults by factor and level ("" for `set` and `trial`), and key; None for a key with an effect.
     written = [
@@ -278,7 +273,7 @@ def check(plan: Plan, points: Iterable[CheckedPoint], resolve: Resolve) -> None:
         error = unused.no_effect(fault.key, fault.rule)
         if not name:
             raise error if key.startswith(TRIAL) else error.within("set")
-        if not has_effect_elsewhere(plan, fault.point, key, resolve):
+        if not has_effect_elsewhere(plan, fault.point, key):
             raise error.within(level).within(f"factors.{name}")
 
 
@@ -308,7 +303,7 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
     return Fault(*found, point) if found else None
 
 
-def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Resolve) -> bool:
+def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str) -> bool:
     """Whether a key of one factor's level has an effect at some level of another factor, varied alone."""
     others = {
         name: factor for name, factor in plan.study.factors.items() if name != point.factor
@@ -317,7 +312,7 @@ def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str, resolve: Res
     for name, factor in others.items():
         for option in factor.options():
             settings = make_point(middle | {name: option}).settings | point.own
-            scene, trial = resolve(settings)
+            scene, trial = resolve_point(plan.spec, settings)
             varied = point._replace(settings=settings, scene=scene, trial=trial)
             if find(key, plan, varied) is None:
                 return True

@@ -11,9 +11,18 @@ from skysim.core.types import Floats, Ints
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import PointRow, points_at
-from skysim.results import metrics
 from skysim.results.files.row_parts import Array, row_of, subset
-from skysim.results.metrics import Columns
+from skysim.results.metrics import (
+    COVERAGE,
+    MORE_IS_BETTER,
+    OVERCONFIDENT_NEES,
+    QUANTITIES,
+    WITHIN,
+    Columns,
+    right_within,
+    split_name,
+)
+from skysim.sources.dome.surface import directions
 
 COUNT = 3  # number of worst trials that a report lists
 DIRECTION = (
@@ -30,7 +39,7 @@ NEAR = math.cos(math.radians(APART_DEG))
 FLAGS: dict[str, Callable[[Columns], Array]] = {
     "identified": lambda c: c["frames"] - c["solved"] + c["wrong"],
     "refused": lambda c: c["frames"] - c["solved"],
-    "overconfident": lambda c: np.nan_to_num(c["nees"]) > metrics.OVERCONFIDENT_NEES,
+    "overconfident": lambda c: np.nan_to_num(c["nees"]) > OVERCONFIDENT_NEES,
     "failed": lambda c: c["frames"] == 0,
 }
 ColumnsOf = Callable[..., Columns]  # the columns of the trials of some points
@@ -116,15 +125,15 @@ def worst_trials(
     axis = np.empty((0, 3))
     chosen = list[WorstTrial]()
     for rows in worst_first(keys, np.flatnonzero(counted)):
-        directions = unit_directions(subset(columns, rows))
-        left = np.all(~(directions @ axis.T > near), axis=1)
+        unit = unit_directions(subset(columns, rows))
+        left = np.all(~(unit @ axis.T > near), axis=1)
         while len(chosen) < count and left.any():
             nearest = int(np.argmax(left))
             row = int(rows[nearest])
             chosen.append(worst_trial(row_of(columns, row), float(values[row]), flights))
             left[nearest] = False
-            left &= ~(directions @ directions[nearest] > near)
-            axis = np.concatenate([axis, directions[nearest : nearest + 1]])
+            left &= ~(unit @ unit[nearest] > near)
+            axis = np.concatenate([axis, unit[nearest : nearest + 1]])
         if len(chosen) == count:
             break
     return chosen
@@ -152,10 +161,7 @@ def worst_trial(columns: Columns, value: float, flight: bool) -> WorstTrial:
         int(columns["point"][0]),
         value,
         "misidentified" if columns["misidentified"][0] > 0 else str(columns["status"][0]),
-        *(
-            float(metrics.QUANTITIES[name](columns)[0])
-            for name in ("cross_arcsec", "roll_arcsec")
-        ),
+        *(float(QUANTITIES[name](columns)[0]) for name in ("cross_arcsec", "roll_arcsec")),
         *(float(columns[name][0]) for name in DIRECTION),
         *([] if flight else body_angles_deg(columns)),
     )
@@ -175,33 +181,30 @@ def unit_directions(columns: Columns) -> Floats:
     body = columns["body_tilt_deg"], columns["body_azimuth_deg"]
     boresight = 90 - columns["boresight_dec_deg"], columns["boresight_ra_deg"]
     zenith, azimuth = np.radians(np.where(in_dome, body, boresight))
-    across = np.sin(zenith)
-    return np.stack(
-        [across * np.cos(azimuth), across * np.sin(azimuth), np.cos(zenith)], axis=1
-    )
+    return directions(zenith, azimuth)
 
 
 def ranked(response: str) -> str:
     """What ranks the trials by a response: its quantity, or the proportion itself."""
-    quantity = response if response in metrics.QUANTITIES else metrics.split_name(response)[0]
-    return quantity if quantity in metrics.QUANTITIES else response
+    quantity = response if response in QUANTITIES else split_name(response)[0]
+    return quantity if quantity in QUANTITIES else response
 
 
 def ranking(columns: Columns, response: str) -> tuple[list[Floats], Floats]:
     """(N,) sort keys, the most important first, smaller is worse; and (N,) values, NaN if a trial does not qualify."""
-    angle = metrics.QUANTITIES["angle_arcsec"](columns)
+    angle = QUANTITIES["angle_arcsec"](columns)
     unsolved_first = np.where(np.isnan(angle), -np.inf, -angle)
     fewest_first = np.nan_to_num(columns["stars"], nan=0.0)
     quantity = ranked(response)
-    if metrics.COVERAGE.match(response):
+    if COVERAGE.match(response):
         return [fewest_first], np.where(columns["frames"] > 0, columns["stars"], np.nan)
-    if quantity in metrics.QUANTITIES:
-        values = metrics.QUANTITIES[quantity](columns)
-        key = values if quantity in metrics.MORE_IS_BETTER else -values
+    if quantity in QUANTITIES:
+        values = QUANTITIES[quantity](columns)
+        key = values if quantity in MORE_IS_BETTER else -values
         return [key, fewest_first], values
     flags = (
-        (columns["frames"] > 0) & ~metrics.right_within(response, columns)
-        if metrics.WITHIN.match(response)
+        (columns["frames"] > 0) & ~right_within(response, columns)
+        if WITHIN.match(response)
         else FLAGS.get(response, lambda c: c[response])(columns)
     )
     flagged = np.nan_to_num(np.asarray(flags, dtype=float))

@@ -102,16 +102,13 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
     shapes = list(one.shapes)
     for top_mm in tops_mm[1:]:
         for x_mm in (-half_mm + 2 * MARK_MM, half_mm - 2 * MARK_MM):
-            shapes += registration_mark(x_mm, top_mm + OVERLAP_MM / 2)
+            # A registration mark: a circle with a cross.
+            at_mm = x_mm, top_mm + OVERLAP_MM / 2
+            shapes.append(Circle(*at_mm, MARK_MM, "MARKS"))
+            shapes += cross(*at_mm, 1.5 * MARK_MM, "MARKS")
     for sheet, top_mm in enumerate(tops_mm, 1):
         name = f"{title}; sheet {sheet} of {count}"
         yield Page(width_mm, height_mm, name, (-half_mm, top_mm), shapes)
-
-
-def registration_mark(x_mm: float, y_mm: float) -> list[Shape]:
-    """A circle with a cross."""
-    circle = Circle(x_mm, y_mm, MARK_MM, "MARKS")
-    return [circle, *cross(x_mm, y_mm, 1.5 * MARK_MM, "MARKS")]
 
 
 def write_pdf(path: Path, dome: Dome, paper: str) -> int:

@@ -19,14 +19,14 @@ import numpy as np
 from skysim.core.errors import InputError, Where
 from skysim.core.paths import DATA
 from skysim.core.text import excerpt, read_lines
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Ints, Sources
 from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
 from skysim.scene.sections.leds import PwmConfig, SequentialConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
-from skysim.sources.dome.layouts.placing import Ints
+from skysim.sources.dome.layouts.placing import tilts_rad
 from skysim.sources.dome.layouts.string import mean_meridian, wind
 from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
 from skysim.sources.photometry import Band
@@ -243,7 +243,7 @@ class DomeDesign(NamedTuple):
     def to_rim_m(self, place_m: Floats) -> Floats:
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
         meridian = mean_meridian(self.surface, math.radians(self.cap_deg))
-        tilt_rad = np.arctan2(np.hypot(place_m[:, 0], place_m[:, 1]), place_m[:, 2])
+        tilt_rad = tilts_rad(place_m)
         return meridian.arc_m[-1] - np.interp(tilt_rad, meridian.tilt_rad, meridian.arc_m)
 
 

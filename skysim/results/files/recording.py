@@ -8,18 +8,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import wcs
-from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.files import atomic_file, write_png16, write_table
+from skysim.core.files import (
+    atomic_file,
+    header_numbers,
+    read_table,
+    write_png16,
+    write_table,
+)
 from skysim.core.images import TOP_DOWN_CARD, read_image
-from skysim.core.types import ATTITUDES, Floats, Frame, Truth
+from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
@@ -29,8 +34,7 @@ SKY_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
 LAB_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
-@dataclass(frozen=True, slots=True)
-class FrameTruth:
+class FrameTruth(NamedTuple):
     """The truth of one frame, as read from its file: attitudes (4,) as xyzw, rate (3,), and the table of sources."""
 
     frame: int
@@ -53,9 +57,9 @@ class Recording:
     stems: list[Path] = field(repr=False)
 
     @cached_property
-    def meta(self) -> dict[str, Any]:
+    def meta(self) -> Record:
         """Scene, seed and definition of the lab axes, from the truth of the first frame. Raises InputError."""
-        header = files.read_table(self.stems[0].with_suffix(".ecsv")).meta
+        header = read_table(self.stems[0].with_suffix(".ecsv")).meta
         missing = [key for key in ("scene", "seed", "lab") if key not in header]
         if missing:
             raise InputError(
@@ -86,7 +90,7 @@ class Recording:
     def table(self, name: str) -> Any:
         """The table `solutions`, `telemetry` or `imu` as an astropy table; None if the run wrote none."""
         path = self.folder / f"{name}.ecsv"
-        return files.read_table(path) if path.is_file() else None
+        return read_table(path) if path.is_file() else None
 
     def _require(self, name: str, table: Any, columns: Sequence[str]) -> None:
         """Raise InputError for a table of the run that lacks a column."""
@@ -170,12 +174,12 @@ def read_truth(path: Path) -> FrameTruth:
     InputError
         (one line) for a file that is not a truth file or that an older skysim wrote.
     """
-    sources = files.read_table(path)
+    sources = read_table(path)
     counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
     quaternions = [f"{name}_xyzw" for name in ATTITUDES]
     counts |= {**dict.fromkeys(quaternions, 4), "rate_cam_rad_s": 3}
     numbers = {
-        key: np.array(files.header_numbers(path, sources.meta, key, count))
+        key: np.array(header_numbers(path, sources.meta, key, count))
         for key, count in counts.items()
     }
     for key in quaternions:

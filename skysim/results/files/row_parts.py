@@ -7,6 +7,7 @@ NaN or None in arrays. Trials are in the order of point and replicate, from whic
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ EXTRA = "needs optional packages: pip install 'skysim[export]'"
 KEPT_BYTES = 250_000_000  # size of the columns kept in memory for further use; the oldest are dropped first
 
 Array = NDArray[Any]
+Columns = Mapping[str, Array]
 Source = Callable[[str], Array]  # the column of some rows by its name
 
 
@@ -58,16 +60,12 @@ class Rows(Mapping[str, Array]):
             columns = [source(name) for source in self.sources]
             column = columns[0] if len(columns) == 1 else np.concatenate(columns)
             del columns
-            self._keep(name, column if self.order is None else column[self.order])
+            column = column if self.order is None else column[self.order]
+            left = KEPT_BYTES - column.nbytes
+            while self._kept and sum(one.nbytes for one in self._kept.values()) > left:
+                del self._kept[next(iter(self._kept))]
+            self._kept[name] = column
         return self._kept[name]
-
-    def _keep(self, name: str, column: Array) -> None:
-        while (
-            self._kept
-            and sum(one.nbytes for one in self._kept.values()) + column.nbytes > KEPT_BYTES
-        ):
-            del self._kept[next(iter(self._kept))]
-        self._kept[name] = column
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
@@ -83,7 +81,7 @@ class Rows(Mapping[str, Array]):
         return {name: self.sources[source](name)[here : here + 1] for name in self.names}
 
 
-def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
+def row_of(columns: Columns, number: int) -> Columns:
     """The columns of one row."""
     one = slice(number, number + 1)
     return (
@@ -93,7 +91,7 @@ def row_of(columns: Mapping[str, Array], number: int) -> Mapping[str, Array]:
     )
 
 
-def subset(columns: Mapping[str, Array], rows: Array | slice) -> Rows:
+def subset(columns: Columns, rows: Array | slice) -> Rows:
     """Some rows of a table, by their numbers or from one to another."""
     count = rows.stop - rows.start if isinstance(rows, slice) else len(rows)
     return Rows(tuple(columns), [lambda name: columns[name][rows]], [count])
@@ -107,7 +105,7 @@ def can_write_parts() -> bool:
     return importlib.util.find_spec("pyarrow") is not None
 
 
-def to_arrow(columns: Mapping[str, Array]) -> Any:
+def to_arrow(columns: Columns) -> Any:
     """An Arrow table; missing values (NaN, None) are null."""
     import pyarrow
 
@@ -121,7 +119,7 @@ def to_arrow(columns: Mapping[str, Array]) -> Any:
     )
 
 
-def write_part(path: Path, columns: Mapping[str, Array]) -> None:
+def write_part(path: Path, columns: Columns) -> None:
     """Write a part. It appears whole and on the disk, or not at all."""
     import pyarrow.parquet
 
@@ -156,16 +154,16 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+@dataclass(eq=False)
 class Part:
     """A part: its file, its numbers of rows and of wrong attitudes, and the points of its first and its last row."""
 
-    def __init__(self, path: Path, rows: int, wrong: int, first: int, last: int) -> None:
-        self.path = path
-        self.rows = rows
-        self.wrong = wrong
-        self.first = first
-        self.last = last
-        self._trials: tuple[int, Array] = (0, np.empty(0, np.int64))
+    path: Path
+    rows: int
+    wrong: int
+    first: int
+    last: int
+    _trials: tuple[int, Array] = (0, np.empty(0, np.int64))
 
     def trials(self, replicates: int) -> Array:
         """(N,) numbers of its trials, where a point has so many. Raises InputError for a part that is not as listed."""

@@ -5,7 +5,6 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.time import in_utc
-from skysim.core.types import ATTITUDES, Floats
+from skysim.core.types import ATTITUDES, Floats, Record
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -48,7 +47,7 @@ def message(
 
     The standard's quaternion "from A to B" rotates the basis vectors of A into those of B (annex F2). That is the
     quaternion of a_from_b, whose matrix has the axes of B in coordinates of A as columns; coordinates transform by
-    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError as `check_epochs`.
+    X_B = a_from_b^-1 X_A. Scalar last. Raises InputError if there is no epoch, or the epochs do not ascend.
 
     Parameters
     ----------
@@ -63,7 +62,11 @@ def message(
     a_from_b
         K rotations
     """
-    check_epochs(name, utc)
+    if not utc:
+        raise InputError(name, "no attitude to write")
+    for before, after in itertools.pairwise(utc):
+        if after <= before:
+            raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
     head = {
         "CCSDS_AEM_VERS": "2.0",
         "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
@@ -97,15 +100,6 @@ def message(
     return "".join(f"{ascii_line(line)}\n" for line in lines)
 
 
-def check_epochs(name: str, utc: Sequence[datetime.datetime]) -> None:
-    """Raise InputError if there is no epoch, or the epochs do not ascend."""
-    if not utc:
-        raise InputError(name, "no attitude to write")
-    for before, after in itertools.pairwise(utc):
-        if after <= before:
-            raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
-
-
 def continuous_quaternions(xyzw: Floats) -> Floats:
     """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
 
@@ -134,6 +128,7 @@ SAMPLED_FRAMES = 9  # about this many frames determine the black and white level
 FOURCC = "mp4v"  # MPEG-4 part 2, which every wheel of OpenCV can write
 PROBE_BYTES = 1 << 20
 
+Paths = list[Path]
 # Progress bar over items: items, count, label.
 Bar = Callable[[Iterable[Any], int, str], Iterator[Any]]
 
@@ -157,7 +152,7 @@ UNITS = {
 }
 
 
-def to_aem(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_aem(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write truth.aem, solutions.aem if frames were solved, and motion.aem of a simulated motion. Returns the paths.
 
     Attitudes are means over the exposure, with the time of mid-exposure: those of the camera in the ICRF under the
@@ -218,8 +213,8 @@ def truth_table(run: Recording, bar: Bar) -> Any:
     return Table(rows=rows, meta=run.meta)
 
 
-def truth_row(truth: FrameTruth) -> dict[str, Any]:
-    row: dict[str, Any] = {
+def truth_row(truth: FrameTruth) -> Record:
+    row: Record = {
         "frame": truth.frame,
         "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
     }
@@ -236,13 +231,13 @@ def truth_row(truth: FrameTruth) -> dict[str, Any]:
     }
 
 
-def to_ecsv(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_ecsv(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write truth.ecsv, one row per frame; the run has already written solutions.ecsv."""
     files.write_table(out / "truth.ecsv", truth_table(run, bar))
     return [out / "truth.ecsv"]
 
 
-def to_parquet(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_parquet(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write truth (one row per frame), sources (one row per source and frame) and the run's own tables as Parquet.
 
     Units are in the field metadata. Raises InputError if pyarrow is not installed.
@@ -319,7 +314,7 @@ def unit_of(name: str) -> str:
     return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
-def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_tiff(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write frame_NNNN.tif with unchanged digital numbers: 16 bits (64-bit floats for a noise-free camera)."""
     written = []
     for stem in bar(run.stems, len(run.stems), "TIFF"):
@@ -328,7 +323,7 @@ def to_tiff(run: Recording, out: Path, bar: Bar) -> list[Path]:
     return written
 
 
-def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write frames.zarr (Zarr 3): frames in chunks of one, with times, exposures, attitudes and rates.
 
     Raises
@@ -342,7 +337,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> list[Path]:
         raise InputError("export.formats", f"zarr {EXTRA}") from None
     path = out / ZARR
     count = len(run.stems)
-    frame_truths = [replace(truth, sources=None) for truth in truths(run, bar)]
+    frame_truths = [truth._replace(sources=None) for truth in truths(run, bar)]
     first = run.image(run.stems[0])
     with files.atomic_folder(path) as temporary:
         group = zarr.create_group(
@@ -404,7 +399,7 @@ def check_same_format(image: Any, first: Any, stem: Path) -> Any:
     return image
 
 
-def to_video(run: Recording, out: Path, bar: Bar) -> list[Path]:
+def to_video(run: Recording, out: Path, bar: Bar) -> Paths:
     """Write frames.mp4 for display: 8 bits, square-root stretch, at the scene's frame rate.
 
     All frames share the same black and white levels. A side with an odd number of pixels is cropped by one pixel.
@@ -466,7 +461,7 @@ def check_disk_space(path: Path) -> None:
         os.fsync(file.fileno())
 
 
-EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
+EXPORTS: dict[str, Callable[[Recording, Path, Bar], Paths]] = {
     "aem": to_aem,
     "ecsv": to_ecsv,
     "parquet": to_parquet,
@@ -476,7 +471,7 @@ EXPORTS: dict[str, Callable[[Recording, Path, Bar], list[Path]]] = {
 }
 
 
-def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> list[Path]:
+def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> Paths:
     """Write a run in each of the formats and return the paths.
 
     Raises

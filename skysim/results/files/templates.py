@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, normalized
 from skysim.results.files.parts import build_design
 from skysim.simulation.lab import Lab
-from skysim.sources.dome.layouts.placing import project_from_bearing
+from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
 from skysim.sources.dome.layouts.string import directions
 from skysim.sources.dome.surface import Surface, perpendicular
 
@@ -201,7 +201,7 @@ def length_m(points_m: Floats) -> Floats:
 def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     """(N, 2) x and y on the gore of a meridian of points in these directions (N, 3) from the bearing."""
     azimuth_rad = np.arctan2(rays[:, 1], rays[:, 0]) - meridian_rad
-    tilt_rad = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    tilt_rad = tilts_rad(rays)
     aside_rad = np.arcsin(np.clip(np.sin(tilt_rad) * np.sin(azimuth_rad), -1, 1))
     foot_rad = np.arctan2(np.sin(tilt_rad) * np.cos(azimuth_rad), np.cos(tilt_rad))
     steps = np.linspace(0, 1, STEPS + 1)
@@ -240,7 +240,7 @@ class Gore(NamedTuple):
 
 def gore(dome: Dome, number: int, count: int) -> Gore:
     """Gore `number`, from 0, of `count`: outline, meridian, title, a circle and a number for each LED."""
-    rays = dome.led_m / np.linalg.norm(dome.led_m, axis=1, keepdims=True)
+    rays = normalized(dome.led_m)
     turns = np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)
     own = np.rint(turns).astype(int) % count == number
     meridian_rad = 2 * math.pi / count * number

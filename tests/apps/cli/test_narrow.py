@@ -70,7 +70,6 @@ def report(motion: dict[str, float]) -> Report:
     stages = dict.fromkeys(
         ["render", "detector", "detect", "centroid", "identify", "solve"], 12.34
     )
-    pictures = {"annotated": picture, "views": []}
     return run_report(
         "title",
         "skysim run x",
@@ -78,9 +77,12 @@ def report(motion: dict[str, float]) -> Report:
         [row(0), row(1)],
         stages_ms=stages,
         motion=motion_section(motion, (), b""),
+        computer="",
+        annotated=picture,
+        views=[],
         facts=[],
         findings=[],
-        **pictures,
+        judged=[],
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -237,7 +236,7 @@ def test_the_scatter_of_fields_is_computed_from_two_estimates_of_each():
 def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
     """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
     scene = load("shefex2", {})
-    size = replace(QUICK, fields=fields)
+    size = QUICK._replace(fields=fields)
     designer = Designer(scene, size)
     cells = list(designer.cells())
     rng = np.random.default_rng(12)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -138,8 +137,8 @@ def test_a_covariance_too_small_about_y_is_detected():
 def test_a_covariance_is_judged_at_each_rate():
     """Errors twice as large as claimed have four times the NEES; few fields know it less."""
     sheet = sky_sheet((2, 2, 2))
-    sheet = replace(
-        sheet, cells=[DatasheetCell("rate", {"rate_deg_s": n // 2}, {}) for n in range(10)]
+    sheet = sheet._replace(
+        cells=[DatasheetCell("rate", {"rate_deg_s": n // 2}, {}) for n in range(10)]
     )
     rows = performance.by_level(sheet, "rate", "rate_deg_s")
     assert len(rows) == 5

@@ -549,7 +549,7 @@ def test_a_lens_that_is_not_modeled_is_named() -> None:
         frames.append(SurveyFrame(lights, attitude, index))
     with pytest.raises(InputError, match=r"the lens has k1 = -0\.(1|09).* the model 0"):
         adjust.run_survey(frames, prior, UNCERTAINTY)
-    named = replace(prior, camera=bent)
+    named = prior._replace(camera=bent)
     assert adjust.run_survey(frames, named, UNCERTAINTY).survey.status == "converged"
 
 

@@ -530,7 +530,6 @@ LEVELS = {"levels": {"cheap": {"trial.missing": 0.1}, "precise": {"trial.missing
             {"constraints": [{"response": "identified"}]},
             r"constraints\.0: no bound; allowed: at_least, at_most",
         ),
-        ({"candidates": 300}, r"budget\.trials: 1000; allowed: at least 1200"),
     ],
 )
 def test_wrong_names_are_answered_with_the_allowed_ones(
@@ -542,6 +541,13 @@ def test_wrong_names_are_answered_with_the_allowed_ones(
     }
     with pytest.raises(InputError, match=says):
         search.check(plan.Study.model_validate(study))
+
+
+def test_a_search_must_fit_into_its_budget(tmp_path: Path) -> None:
+    keys = changed(candidates=300) | {"budget": {"trials": 1000}}
+    allowed = r"budget\.trials: 1000; allowed: at least 1200, the trials of the search"
+    with pytest.raises(InputError, match=allowed):
+        loaded(tmp_path, keys)
 
 
 def test_a_distribution_cannot_be_searched() -> None:

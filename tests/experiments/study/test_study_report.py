@@ -164,10 +164,12 @@ class Html(HTMLParser):
 
 def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
     with store.open_store(path) as kept:
-        about = Overview(
-            [("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")], [], False
-        )
-        found = Analysis(table(kept, study_report.responses(asked)), about, **more)
+        scene = [("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")]
+        about = Overview(scene, [], False, (), {}, 0.0)
+        lines = table(kept, study_report.responses(asked))
+        nothing: dict[str, Any] = dict.fromkeys(Analysis._fields[2:], ())
+        nothing |= {"verdict": "", "result": None}
+        found = Analysis(lines, about, **nothing | more)
         text = study_report.compose(
             asked, kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND
         ).html()

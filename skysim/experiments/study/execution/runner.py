@@ -39,15 +39,13 @@ from skysim.experiments.study.plan import (
 )
 from skysim.results import run_report, scoring, telemetry_report
 from skysim.results.files import recording
-from skysim.results.plots import annotate, visible
 from skysim.results.run import Recorder
 from skysim.simulation.checks import check
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 
-CHUNK_S = (
-    0.25  # run time of a chunk: long relative to its overhead, short in case a worker dies
-)
+# Run time of a chunk: long relative to its overhead, short in case a worker dies.
+CHUNK_S = 0.25
 # Beyond so many workers chunks are longer, so that MANY / CHUNK_S end per second: a Dask scheduler handles hundreds.
 MANY = 16
 MAX_CHUNK = 5000  # maximum number of trials in a chunk
@@ -68,7 +66,7 @@ class Progress:
     """
 
     trials: int
-    done: int = 0
+    done: int
     failed: int = 0
     wrong: int = 0
     now: int = 0
@@ -434,11 +432,7 @@ def replay(
 
 def write_annotated(folder: Path, frame: Frame, truth: Truth, report: Report) -> None:
     """Write a frame with the lights that the tracker found, those that it matched, and the true ones."""
-    match = report.attitude.match
-    xy_px = report.centroids.xy_px
-    matched_px = xy_px[match.observed] if match else np.empty((0, 2))
-    truth_px = truth.sources.xy_px[visible(truth.sources)]
-    picture = annotate(frame.image_dn, xy_px, matched_px, truth_px=truth_px)
+    picture = scoring.annotated(frame, truth, report)
     write_image(folder / f"frame_{frame.index:04d}.annotated.png", picture)
 
 

@@ -83,9 +83,8 @@ class Store:
         self.path = path
         self.db = connection
         self.parts_folder = path.with_suffix(".parts")
-        self._room = (
-            0  # further rows that SQLite takes before rows move; 0 before they are counted
-        )
+        # Further rows that SQLite takes before rows move; 0 before they are counted.
+        self._room = 0
         self._parts: dict[int, Part] = {}  # open parts by number
         self._near = NONE_NEAR  # points that were read together with the last one
 

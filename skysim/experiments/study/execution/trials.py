@@ -23,7 +23,6 @@ from estimator.trackers.star_tracker import StarTracker
 from estimator.trackers.tracking_mode import Health, TrackedReport, TrackingMode
 from skysim.camera.detector import AddedCharge
 from skysim.core import errors, quaternion
-from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
@@ -64,9 +63,8 @@ from skysim.sources.air import topocentric_axes
 from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
 
-GYRO_RAD_S = (
-    1e-5  # standard deviation that a frame trial's gyro claims: 2 arcseconds per second
-)
+# Standard deviation that a frame trial's gyro claims: 2 arcseconds per second.
+GYRO_RAD_S = 1e-5
 KNOTS = 9  # samples of a frame trial's trajectory in each exposure
 BLOCK = 64  # number of centroid trials that run together
 REFUSED = "refused"  # stands for the hash of a scene that cannot be built
@@ -187,7 +185,7 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
         errors.raise_wrapped(raised)
         if len(seeds) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
-        if isinstance(raised, InputError):
+        if isinstance(raised, errors.InputError):
             scene = scene or REFUSED
             error = str(raised)
         else:
@@ -311,14 +309,16 @@ def flight_outcomes(
         yield shot.truth.t_s, replace(one, exposure_ms=1e3 * shot.frame.exposure_s)
 
 
-def one_by_one(
-    run: Callable[[TrialSetup, int], Outcome],
-) -> Callable[[TrialSetup, Sequence[int]], list[Outcome]]:
+# From a setup and seeds to the outcomes of the trials.
+Trials = Callable[[TrialSetup, Sequence[int]], list[Outcome]]
+
+
+def one_by_one(run: Callable[[TrialSetup, int], Outcome]) -> Trials:
     """Outcomes of trials that are run one by one."""
     return lambda setup, seeds: [run(setup, seed) for seed in seeds]
 
 
-TRIALS: dict[str, Callable[[TrialSetup, Sequence[int]], list[Outcome]]] = {
+TRIALS: dict[str, Trials] = {
     "centroids": run_centroid_trials,
     "frames": one_by_one(run_frame_trial),
     "flight": one_by_one(run_flight_trial),
@@ -343,34 +343,29 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     lab = setup.lab
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
+    near = attitudes.near
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
     if lab.scene.dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
-        least = math.cos(math.radians(high))
-        most = math.cos(math.radians(low))
-        tilts = [math.acos(min(rng.uniform(least, most), 1.0)) for rng in rngs]
-        drawn = [
-            zyz(first, tilt, last - first)
-            for (first, last), tilt in zip(turns, tilts, strict=True)
-        ]
-        return Rotation.from_quat(drawn, scalar_first=True)
-    near = attitudes.near
-    low, high = (math.radians(dec) for dec in attitudes.dec_deg)
-    if near:  # a body is the pole
-        high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
-    least = math.sin(low)
-    most = math.sin(high)
-    zeniths = [math.acos(min(max(rng.uniform(least, most), -1.0), 1.0)) for rng in rngs]
-    lab_from_cam = [
-        zyz(first, zenith, last) for (first, last), zenith in zip(turns, zeniths, strict=True)
-    ]
-    if near:
-        lab_from_pole = lab_from_body_pole(near.body, lab.scene)
-        lab_from_cam = [quaternion.multiply(lab_from_pole, each) for each in lab_from_cam]
-    cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
-    drawn = [quaternion.multiply(each, cam_from_body) for each in lab_from_cam]
+        ends = math.cos(math.radians(high)), math.cos(math.radians(low))
+    else:
+        low, high = (math.radians(dec) for dec in attitudes.dec_deg)
+        if near:  # a body is the pole
+            high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
+        ends = math.sin(low), math.sin(high)
+    zeniths = [math.acos(min(max(rng.uniform(*ends), -1.0), 1.0)) for rng in rngs]
+    angles = [(*turn, zenith) for turn, zenith in zip(turns, zeniths, strict=True)]
+    if lab.scene.dome:
+        drawn = [zyz(first, tilt, last - first) for first, last, tilt in angles]
+    else:
+        drawn = [zyz(first, zenith, last) for first, last, zenith in angles]
+        if near:
+            lab_from_pole = lab_from_body_pole(near.body, lab.scene)
+            drawn = [quaternion.multiply(lab_from_pole, each) for each in drawn]
+        cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
+        drawn = [quaternion.multiply(each, cam_from_body) for each in drawn]
     return Rotation.from_quat(drawn, scalar_first=True)
 
 

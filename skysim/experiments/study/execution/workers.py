@@ -2,8 +2,8 @@
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 
@@ -24,16 +24,14 @@ def start_fork_server() -> ForkServerContext:
     return context
 
 
-def one_thread() -> AbstractContextManager[None]:
-    """Context in which started processes use one numerical thread each; there is already one worker per core."""
-    return environment(dict.fromkeys(ONE_THREAD, "1"))
-
-
 @contextmanager
-def environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Context with these environment variables set; processes started in it inherit them."""
-    previous = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
+def one_thread() -> Iterator[None]:
+    """Context in which started processes use one numerical thread each; there is already one worker per core.
+
+    They inherit the environment variables.
+    """
+    previous = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
         yield
     finally:

@@ -1,20 +1,29 @@
 """Draw a study's figures, each as a PNG. `layout` selects their contents."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from skysim.core.types import Floats, Record
 from skysim.experiments.study.plan import Curve, Heat, Map, Study
-from skysim.experiments.study.report import layout
-from skysim.experiments.study.report.layout import MAX_POINTS_WITH_BARS, Grid, Panel, Series
+from skysim.experiments.study.report.layout import (
+    MAX_POINTS_WITH_BARS,
+    MAX_X_WITH_BARS,
+    Grid,
+    Panel,
+    Series,
+    draws_medians,
+    expected_value,
+    grid,
+    limits,
+    series,
+)
 from skysim.experiments.study.table import (
     Axis,
+    Index,
     PointRows,
     axis,
     is_sampled,
@@ -24,10 +33,6 @@ from skysim.experiments.study.table import (
 from skysim.experiments.study.thresholds import crossings, thresholds_of
 from skysim.results.metrics import MORE_IS_BETTER, is_proportion, split_name
 from skysim.results.plots import INK, MARKS, png
-
-if TYPE_CHECKING:
-    from skysim.experiments.study.table import Index
-
 
 # Color scales of a study's figures, outlines of texts, and ticks of logarithmic axes.
 
@@ -106,13 +111,11 @@ def halo() -> Any:
 
 
 MAX_TICKS = 16  # maximum number of levels that have a tick each
-MAX_WRAPPED_LABELS = (
-    8  # maximum number of tick labels that are wrapped; with more, long ones are rotated
-)
+# Maximum number of tick labels that are wrapped; with more, long ones are rotated.
+MAX_WRAPPED_LABELS = 8
 LABEL_WIDTH = 88  # characters that fit below an axis
-MAX_CELLS_WITH_TEXT = (
-    12  # maximum rows and columns of a heat map with values written in its cells
-)
+# Maximum rows and columns of a heat map with values written in its cells.
+MAX_CELLS_WITH_TEXT = 12
 MAX_LABELED_POINTS = 12  # maximum number of Pareto points that are labeled
 GRAY = "#8fa1b3"
 ORANGE = "#d55e00"
@@ -124,7 +127,7 @@ def figure_png(lines: PointRows, figure: Curve | Heat, study: Study) -> bytes:
         return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
     if is_sampled(study):
         return png(lambda fig: draw_scatter(fig, lines, figure, study), (7.0, 4.4))
-    cells = layout.grid(lines, figure, study)
+    cells = grid(lines, figure, study)
     rows, columns = cells.value.shape
     width_in = min(max(2.6 + 0.6 * columns, 4.6), 9.6)
     height_in = min(max(1.2 + 0.42 * rows, 2.6), 7.0)
@@ -139,11 +142,11 @@ def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
     axes = fig.subplots()
     x_axis = axis(study, lines, figure.x)
     sampled = is_sampled(study)
-    shown = layout.series(lines, figure, study)
-    dots = layout.draws_medians(study, x_axis, sum(len(one.x) for one in shown))
+    shown = series(lines, figure, study)
+    dots = draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_x_axis(axes, x_axis)
-    if (expected := layout.expected_value(figure.y)) is not None:
+    if (expected := expected_value(figure.y)) is not None:
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
     inks = colors(len(shown), group_axis)
@@ -192,10 +195,10 @@ def set_up_y_axis(
 ) -> None:
     """Set up the y axis: limits that include all values and, if drawn, their error bars; label and scale."""
     bounds = [end for one in shown for end in (one.low, one.high)] if bars else []
-    expected = layout.expected_value(name)
+    expected = expected_value(name)
     marked = [np.array([expected])] if expected is not None else []
     values = [*(one.value for one in shown), *marked]
-    low, high = layout.limits(values, bounds, log, is_proportion(name))
+    low, high = limits(values, bounds, log, is_proportion(name))
     if log:
         logarithmic(axes, "y", low, high)
     axes.set_ylim(low, high)
@@ -213,7 +216,7 @@ def draw_line(
 
     offset = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
     low, high = drawn_interval(axes, one)
-    if x_axis.numeric and len(x_axis.levels) > layout.MAX_X_WITH_BARS:
+    if x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS:
         offset = axes.transData
         axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
     else:
@@ -310,11 +313,12 @@ def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
     places = np.array([x_axis.coordinate(one) for one in x_axis.levels])
     if x_axis.log:
         pad = max((places[-1] / places[0]) ** 0.04, 1.05)
-        logarithmic(axes, "x", places[0] / pad, places[-1] * pad)
-        axes.set_xlim(places[0] / pad, places[-1] * pad)
+        ends = places[0] / pad, places[-1] * pad
+        logarithmic(axes, "x", *ends)
     else:
         pad = (0.04 * np.ptp(places) or 0.5) if x_axis.numeric else 0.5
-        axes.set_xlim(places[0] - pad, places[-1] + pad)
+        ends = places[0] - pad, places[-1] + pad
+    axes.set_xlim(*ends)
     positions = np.log(places) if x_axis.log else places
     close = len(places) > 1 and np.diff(positions).min() < 0.055 * np.ptp(positions)
     if x_axis.numeric and (len(places) > MAX_TICKS or close):
@@ -361,11 +365,11 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         origin="lower" if cells.y.numeric else "upper",
     )
     rows, columns = cells.value.shape
-    for row, column in np.argwhere(~np.isfinite(cells.value)):
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **HATCHED))
-    for row, column in np.argwhere(cells.few & np.isfinite(cells.value)):
-        dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **dotted))
+    known = np.isfinite(cells.value)
+    dotted: Any = {"fill": False, "edgecolor": "white", "hatch": "...", "linewidth": 0}
+    for chosen, style in ((~known, HATCHED), (cells.few & known, dotted)):
+        for row, column in np.argwhere(chosen):
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, **style))
     if max(rows, columns) <= MAX_CELLS_WITH_TEXT:
         write_values(axes, cells, image)
     for which, one, most in (("x", cells.x, MAX_TICKS * 2 // 3), ("y", cells.y, MAX_TICKS)):
@@ -492,7 +496,7 @@ def pareto_png(
         y = other.value[marked]
         low = other.low[marked]
         high = other.high[marked]
-        axes.set_ylim(*layout.limits([other.value], [low, high], False, False))
+        axes.set_ylim(*limits([other.value], [low, high], False, False))
         axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(x, y, "D--", color=ORANGE, label="front")
         style: Any = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}

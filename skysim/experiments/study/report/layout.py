@@ -26,21 +26,16 @@ from skysim.experiments.study.table import (
 )
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
-from skysim.results.metrics import Summary
 
-MAX_X_WITH_BARS = (
-    12  # maximum number of x values for error bars; with more, intervals are drawn as a band
-)
-MAX_POINTS_WITH_BARS = (
-    60  # sampled points with error bars; with more, a running median is drawn
-)
-MOST_LINES = (
-    7  # maximum number of lines in an automatic curve; with more levels it becomes a heat map
-)
+# Maximum number of x values for error bars; with more, intervals are drawn as a band.
+MAX_X_WITH_BARS = 12
+# Sampled points with error bars; with more, a running median is drawn.
+MAX_POINTS_WITH_BARS = 60
+# Maximum number of lines in an automatic curve; with more levels it becomes a heat map.
+MOST_LINES = 7
 MOST_FIGURES = 24  # maximum number of automatic figures
-LOG_RESPONSE_RATIO = (
-    30  # minimum ratio of largest to smallest response for an automatic logarithmic axis
-)
+# Minimum ratio of largest to smallest response for an automatic logarithmic axis.
+LOG_RESPONSE_RATIO = 30
 FAR_RATIO = 30  # interval bounds below the smallest value / FAR_RATIO do not extend a logarithmic axis
 
 
@@ -219,12 +214,10 @@ def expected_value(name: str) -> float | None:
 # Candidates of an optimization.
 
 
-def panels(
-    lines: PointRows, search: Search, costs: Mapping[int, float] | None
-) -> dict[str, Panel]:
-    """One panel per objective, constrained response and, if costs are given, cost; by name."""
-    names = dict.fromkeys(search.responses + ["cost"] * (costs is not None))
-    return {name: panel(name, lines, search, costs or {}) for name in names}
+def panels(lines: PointRows, search: Search, costs: Mapping[int, float]) -> dict[str, Panel]:
+    """One panel per objective, constrained response and cost; by name."""
+    names = dict.fromkeys([*search.responses, "cost"])
+    return {name: panel(name, lines, search, costs) for name in names}
 
 
 def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
@@ -235,10 +228,13 @@ def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float
         ]
     else:
         summaries = [line.responses[name][:3] for line in lines]
-    bounds = []
-    for one in search.constraints:
-        if one.response == name:
-            bounds += [bound for bound in (one.at_least, one.at_most) if bound is not None]
+    bounds = [
+        bound
+        for one in search.constraints
+        if one.response == name
+        for bound in (one.at_least, one.at_most)
+        if bound is not None
+    ]
     title = label(name)
     for goal in search.objectives:
         if goal.response == name:
@@ -296,7 +292,7 @@ def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
 
 
 def curve_note(
-    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[Summary]
+    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[metrics.Summary]
 ) -> str:
     """The meaning of the lines and bars of a curve."""
     x_axis = axis(study, lines, figure.x)

@@ -23,16 +23,14 @@ from skysim.experiments.study.table import PointRows, group_points
 from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
-from skysim.results.metrics import Columns
 from skysim.results.plots import png
 
 CELL_TRIALS = 25  # mean number of trials in a cell
 MAX_CELLS = 240  # maximum number of cells of a panel
 MIN_VALUES = 5  # a cell with fewer values is hatched
 SPARE = 1.6  # mean number of trials in a cell over the least number that a quantile takes
-MAX_NUMBERED = (
-    70  # maximum number of cells of a panel with their numbers of trials written in them
-)
+# Maximum number of cells of a panel with their numbers of trials written in them.
+MAX_NUMBERED = 70
 SKY_RANGE_DEG = (-90.0, 90.0)
 MARK = "#111111"  # color of the marks of the worst trials
 EDGE_POINTS = 24  # points along each edge of a cell
@@ -87,7 +85,7 @@ def direction_maps(
     return panels
 
 
-def direction_map(label: str, columns: Columns, response: str) -> DirectionMap:
+def direction_map(label: str, columns: metrics.Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
     if not columns:
         return DirectionMap(label, False, [], [])

@@ -4,13 +4,13 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
+from skysim.core.yaml_reader import one_line
 from skysim.experiments.study.execution.trials import rate_axis
 from skysim.experiments.study.factors import (
     Distribution,
@@ -43,9 +43,8 @@ from skysim.simulation.lab import Lab, UserParts, build_lab
 
 Texts = list[tuple[str, str]]  # names with texts, or texts with the names of points
 NUMBER = re.compile(r"\d[\d.]*")
-MAX_CHECKED = (
-    16  # maximum number of scenes that are checked: building one takes up to a second
-)
+# Maximum number of scenes that are checked: building one takes up to a second.
+MAX_CHECKED = 16
 
 
 class Overview(NamedTuple):
@@ -71,9 +70,9 @@ class Overview(NamedTuple):
     rows: Texts
     findings: list[str]
     may_be_ambiguous: bool
-    fixed: tuple[str, ...] = ()
-    require: Mapping[str, float] = MappingProxyType({})
-    survey_share: float = 0.0
+    fixed: tuple[str, ...]
+    require: Mapping[str, float]
+    survey_share: float
 
 
 def overview(plan: Plan) -> Overview:
@@ -228,7 +227,9 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> Texts:
     """Rows on the scene of a lab, its tracker by the facts of the checks, and how the study varies and repeats it."""
     study = plan.study
     scene = lab.scene
-    changed = "; ".join(f"{key}: {format_setting(value)}" for key, value in study.set.items())
+    changed = "; ".join(
+        f"{key}: {one_line(value, sort_keys=False)}" for key, value in study.set.items()
+    )
     points = f"at each of {len(plan.points)} points" if plan.points else "a candidate"
     attitudes = f"{'the same' if study.paired else 'other'} attitudes at every point"
     name = study.scene if isinstance(study.scene, str) else scene.title
@@ -239,12 +240,7 @@ def scene_rows(plan: Plan, lab: Lab, facts: Sequence[Fact]) -> Texts:
         ("exposure", f"{1e3 * scene.exposure.time_s:.4g} ms"),
         ("tracker", tracker_text(scene)),
         *((fact.name, "; ".join(fact.lines)) for fact in facts if fact.name == TRACKER_KNOWS),
-        (
-            "trial",
-            ", ".join(
-                f"{key}: {format_setting(value)}" for key, value in plan.spec.trial.items()
-            ),
-        ),
+        ("trial", one_line(plan.spec.trial, sort_keys=False)[1:-1]),
         *((f"varied: {name}", factor_text(factor)) for name, factor in study.factors.items()),
         ("trials", f"{study.replicates} {points}, {attitudes}; seed {study.seed}"),
         *([("drawn in every trial", ", ".join(study.hardware))] if study.hardware else []),
@@ -298,19 +294,4 @@ def factor_text(factor: Factor) -> str:
         return f"{factor.distribution} ({keys})"
     return ", ".join(format_level(value) for value, _ in factor.options()) + (
         f" ({keys})" if keys else ""
-    )
-
-
-def format_setting(value: object) -> str:
-    """A value of a key on one line."""
-    if isinstance(value, dict):
-        return (
-            "{"
-            + ", ".join(f"{key}: {format_setting(inner)}" for key, inner in value.items())
-            + "}"
-        )
-    return (
-        f"[{', '.join(map(format_setting, value))}]"
-        if isinstance(value, list | tuple)
-        else str(value)
     )

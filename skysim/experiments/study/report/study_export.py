@@ -14,8 +14,10 @@ from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
 from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
 
+Names = tuple[str, ...]
 
-def to_csv(store: Store, responses: tuple[str, ...], path: Path) -> None:
+
+def to_csv(store: Store, responses: Names, path: Path) -> None:
     """Write one line per trial, with missing values empty and numbers in Python's shortest exact form.
 
     Columns without any value are left out, for example those of flights in a study of frames.
@@ -57,7 +59,7 @@ def texts(column: Array) -> list[Any]:
     return [value if value is not None and value == value else "" for value in values]
 
 
-def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
+def to_parquet(store: Store, responses: Names, path: Path) -> None:
     """Write one row per trial, missing values null; title, code version and study file are in the file's metadata.
 
     Raises
@@ -86,7 +88,7 @@ def to_parquet(store: Store, responses: tuple[str, ...], path: Path) -> None:
             writer.write_table(rows)
 
 
-def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
+def dataset(store: Store, responses: Names, path: Path) -> Any:
     """An xarray.Dataset of every response with its interval and count.
 
     The dimensions are the factors if the design is a full factorial, otherwise the points. Raises InputError if
@@ -112,21 +114,21 @@ def dataset(store: Store, responses: tuple[str, ...], path: Path) -> Any:
     return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
 
 
-def to_zarr(store: Store, responses: tuple[str, ...], path: Path) -> None:
+def to_zarr(store: Store, responses: Names, path: Path) -> None:
     """Write `dataset` as a Zarr folder."""
     tables = dataset(store, responses, path)
     with files.atomic_folder(path) as temporary:
         tables.to_zarr(temporary, mode="w", consolidated=False)
 
 
-EXPORTS: dict[str, Callable[[Store, tuple[str, ...], Path], None]] = {
+EXPORTS: dict[str, Callable[[Store, Names, Path], None]] = {
     ".csv": to_csv,
     ".parquet": to_parquet,
     ".zarr": to_zarr,
 }
 
 
-def export(store: Store, responses: tuple[str, ...], path: Path) -> None:
+def export(store: Store, responses: Names, path: Path) -> None:
     """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
     if path.suffix not in EXPORTS:
         raise InputError(path, *unknown_name("file format", path.suffix, EXPORTS))

@@ -14,9 +14,7 @@ from skysim.experiments.study import answer, search, thresholds
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Curve, Heat, Map, Plan, Study
 from skysim.experiments.study.report import figures, layout, maps
-from skysim.experiments.study.report.maps import DirectionMap
 from skysim.experiments.study.report.overview import Overview, overview
-from skysim.experiments.study.search import SearchResult
 from skysim.experiments.study.table import (
     Index,
     PointRows,
@@ -38,7 +36,6 @@ from skysim.experiments.study.table import (
 )
 from skysim.experiments.study.worst import ColumnsOf, ranked, worst_trials
 from skysim.results import metrics
-from skysim.results.metrics import Columns
 from skysim.results.report import Report
 from skysim.results.report_blocks import (
     Block,
@@ -48,7 +45,6 @@ from skysim.results.report_blocks import (
     Facts,
     Figure,
     Items,
-    Kind,
     Section,
     Table,
     Text,
@@ -58,6 +54,7 @@ from skysim.results.report_blocks import (
 )
 from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 
+Command = Callable[[str], str]  # from a verb to the shell command that applies it to a study
 POINTS = "Points"  # titles of sections
 POOLED = "All points together"
 STUDY_FILE = "The study file"
@@ -106,13 +103,13 @@ class Analysis(NamedTuple):
 
     lines: PointRows
     about: Overview
-    verdict: str = ""
-    headline: Sequence[str] = ()
-    ranges: Sequence[str] = ()
-    indices: Sequence[Index] = ()
-    result: SearchResult | None = None
-    pooled: Sequence[Block] = ()
-    judged: Sequence[Sequence[Judgment]] = ()
+    verdict: str
+    headline: Sequence[str]
+    ranges: Sequence[str]
+    indices: Sequence[Index]
+    result: search.SearchResult | None
+    pooled: Sequence[Block]
+    judged: Sequence[Sequence[Judgment]]
 
     @property
     def answers(self) -> list[str]:
@@ -132,9 +129,7 @@ def study_report(plan: Plan, store: Store) -> Report:
     return compose(plan.study, store, analyze(plan, store, command), command)
 
 
-def commands(
-    plan: Plan, store: Store, study: str = "", out: Path | None = None
-) -> Callable[[str], str]:
+def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Command:
     """The function from a verb to the shell command that applies it to a study, with overrides if the verb runs it.
 
     Parameters
@@ -160,7 +155,7 @@ def shell_command(study: str, out: Path | None, overrides: OverrideTexts, verb: 
     return shlex.join(words)
 
 
-def analyze(plan: Plan, store: Store, command: Callable[[str], str]) -> Analysis:
+def analyze(plan: Plan, store: Store, command: Command) -> Analysis:
     """The analysis of the trials in a store; `command` is the function of `commands`."""
     study = plan.study
     about = overview(plan)
@@ -199,17 +194,16 @@ def compose(
     study: Study,
     store: Store,
     found: Analysis,
-    command: Callable[[str], str],
+    command: Command,
 ) -> Report:
     """The report of an analyzed study: its question, its answer, one figure, and then the details.
 
     `command` is the function of `commands`.
     """
     lines = select_responses(found.lines, responses(study))
-    front = [one.number for one in found.result.front] if found.result else []
-    costs = (
-        {one.number: one.cost for one in found.result.candidates} if found.result else None
-    )
+    result = found.result or search.SearchResult([], [], finished=False)
+    front = [one.number for one in result.front]
+    costs = {one.number: one.cost for one in result.candidates}
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
         *search_figures(lines, study, front, costs),
@@ -316,28 +310,20 @@ def points_section(
     lines: PointRows,
     study: Study,
     front: Sequence[int],
-    costs: Mapping[int, float] | None,
+    costs: Mapping[int, float],
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
     heads, texts = cells(lines)
     axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
-    kinds: list[Kind] = [
-        "number",
-        *("number" if one.numeric else "text" for one in axes.values()),
-    ]
-    kinds += ["number"] * len(heads[len(kinds) :])
-    columns = [Column(head, kind=kind) for head, kind in zip(heads, kinds, strict=False)]
+    named = [name for name, one in axes.items() if not one.numeric]
+    columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, row_texts in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [
-            line.point,
-            *(one.at(line) for one in axes.values()),
-        ]
+    for line, (number, *row_texts) in zip(lines[:ROWS], texts[:ROWS], strict=True):
+        keys = [one.at(line) for one in axes.values()]
         keys += [one.value for one in line.responses.values()]
-        tone: Tone = "marked" if line.point in front else ""
         row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
-        rows.append([Cell(str(line.point), tone, line.point), *row[1:]])
-    if costs is not None:
+        rows.append([Cell(number, "marked" if line.point in front else "", line.point), *row])
+    if study.optimize:
         columns.append(Column("cost", format=".4g"))
         rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
     note = "In brackets intervals of 95 %."
@@ -351,7 +337,7 @@ def points_section(
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
 
-def pooled_blocks(plan: Plan, columns: Columns, replay: str) -> list[Block]:
+def pooled_blocks(plan: Plan, columns: metrics.Columns, replay: str) -> list[Block]:
     """A sampled design as a whole: each response with its spread, its dependence on the factors, the worst trials."""
     responses = list(plan.study.responses)
     for quantity in quantities(responses):
@@ -415,7 +401,7 @@ def with_key(summary: Any) -> Cell:
     return Cell(format_summary(summary), key=summary.value)
 
 
-def front_table(study: Study, result: SearchResult | None) -> list[Block]:
+def front_table(study: Study, result: search.SearchResult | None) -> list[Block]:
     """The front of a search."""
     if result is None:
         return []
@@ -480,7 +466,7 @@ def study_figures(
     return blocks
 
 
-def worst_table(panels: Sequence[DirectionMap], replay: str) -> Table:
+def worst_table(panels: Sequence[maps.DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
     columns = [
         text_column("worst"),
@@ -528,7 +514,7 @@ def search_figures(
     lines: PointRows,
     study: Study,
     front: Sequence[int],
-    costs: Mapping[int, float] | None,
+    costs: Mapping[int, float],
 ) -> list[Figure]:
     """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
     if study.optimize is None or not lines:

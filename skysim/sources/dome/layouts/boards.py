@@ -1,8 +1,9 @@
 """Patch boards: 3x3 LED boards glued to the surface, spread evenly, on a grid, or listed."""
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -27,8 +28,7 @@ from skysim.sources.photometry import Band
 GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged
 
 
-@dataclass(frozen=True, slots=True)
-class Boards:
+class Boards(NamedTuple):
     """B patch boards.
 
     Attributes
@@ -92,7 +92,7 @@ def patch_boards(
 
 
 def spread_boards(
-    config: PatchBoardsConfig, surface: Surface, rng: np.random.Generator
+    config: PatchBoardsConfig, surface: Surface, rng: Generator
 ) -> tuple[Boards, list[Ints]]:
     """Boards all over the cap as seen from the bearing, and the holes that each uses.
 
@@ -183,7 +183,7 @@ def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> 
     return Boards(center_m, normal, u, v)
 
 
-def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boards:
+def tilt_boards(boards: Boards, max_rad: float, rng: Generator) -> Boards:
     """Boards tilted by the glue: normals uniform over a cap of max_rad about the surface's, centers unchanged."""
     count = len(boards.normal)
     # A tilt uniform in solid angle, about a random axis in the board's plane.
@@ -191,8 +191,7 @@ def tilt_boards(boards: Boards, max_rad: float, rng: np.random.Generator) -> Boa
     azimuth = rng.uniform(0, 2 * np.pi, count)[:, None]
     axis = boards.u * np.cos(azimuth) + boards.v * np.sin(azimuth)
     rotation = Rotation.from_rotvec(angle[:, None] * axis)
-    return replace(
-        boards,
+    return boards._replace(
         normal=rotation.apply(boards.normal),
         u=rotation.apply(boards.u),
         v=rotation.apply(boards.v),

@@ -1,6 +1,5 @@
 """LEDs by list: places in the lab or directions from the bearing, from the scene or from a CSV file."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -49,8 +48,8 @@ class LedFile(NamedTuple):
     """
 
     coordinates: Floats
-    level: Floats | None = None
-    id: Ints | None = None
+    level: Floats | None
+    id: Ints | None
 
 
 def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
@@ -61,7 +60,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     Raises
     ------
     InputError
-        For a place more than 5 cm off the surface or beyond the cap.
+        For a place more than 5 cm off the surface or beyond the cap, and for two LEDs of a file at one place.
     """
     level: Floats | None = np.array(config.levels or relative_levels(config.magnitudes or ()))
     number: Ints | None = None
@@ -74,15 +73,16 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     # Places are used as they are; directions are projected from the bearing.
     are_places = coordinates.shape[1] == 3
     directions = coordinates if are_places else directions_from_angles(coordinates)
-    if config.file:
-        check_each_once(key, directions)
+    if config.file and (pairs := cKDTree(directions).query_pairs(SAME_PLACE)):
+        first, second = min(pairs)
+        raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
     check_cap(key, directions, config.cap_deg)
     place_m = coordinates if are_places else project_from_bearing(surface, directions)
     check_on_surface(key, surface, place_m)
     # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
-    placed = replace(on_surface(surface, place_m, level), types=config.types or ())
-    placed = placed if number is None else replace(placed, id=number)
+    placed = on_surface(surface, place_m, level)._replace(types=config.types or ())
+    placed = placed if number is None else placed._replace(id=number)
     return led_sources(placed, led, band, random_stream(config.hardware_seed))
 
 
@@ -98,14 +98,6 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
             f"{offset_m[far[0]]:.3g} m from the surface",
             f"{MAX_SURFACE_OFFSET_M:g} m; columns x_mm, y_mm, z_mm of a file are in millimeters",
         )
-
-
-def check_each_once(key: str, coordinates: Floats) -> None:
-    """Raise InputError for two rows of a file with one place or unit vector (N, 3)."""
-    pairs = cKDTree(coordinates).query_pairs(SAME_PLACE)
-    if pairs:
-        first, second = min(pairs)
-        raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
 
 
 def read_csv(path: Path) -> LedFile:

@@ -1,10 +1,11 @@
 """Parts that all layouts share: directions from the bearing, their places on the surface, LEDs as light sources."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
@@ -27,8 +28,7 @@ from skysim.sources.dome.surface import Surface, directions, unit_vectors
 from skysim.sources.photometry import Band
 
 
-@dataclass(frozen=True, slots=True)
-class PlacedLeds:
+class PlacedLeds(NamedTuple):
     """LED positions before drive and brightness are assigned.
 
     Attributes
@@ -55,9 +55,7 @@ class PlacedLeds:
     types: Sequence[str] = ()
 
 
-def led_sources(
-    placed: PlacedLeds, led: LedConfig, band: Band, rng: np.random.Generator
-) -> Sources:
+def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: Generator) -> Sources:
     """Sources of placed LEDs: strength with its scatter from LED to LED, and the drive's pulse timing.
 
     `rng` is the hardware's random stream.
@@ -108,7 +106,7 @@ def dimmed_sources(
     place_m: Floats,
     led: LedConfig,
     band: Band,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Sources:
     """Sources of LEDs at (N, 3) places on the surface, each with a random level of the layout's `dimming`."""
     if config.unique_neighbors:
@@ -144,7 +142,7 @@ def cap(count: int, half_angle_rad: float) -> Floats:
     return unit_vectors(z, n * GOLDEN_ANGLE_RAD)
 
 
-def scattered_cap(count: int, half_angle_rad: float, rng: np.random.Generator) -> Floats:
+def scattered_cap(count: int, half_angle_rad: float, rng: Generator) -> Floats:
     """(count, 3) independent unit vectors, uniform over a cap about +z: uniform in z and in azimuth."""
     z = 1 - rng.random(count) * (1 - np.cos(half_angle_rad))
     azimuth = rng.uniform(0, 2 * np.pi, count)

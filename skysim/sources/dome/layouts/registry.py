@@ -22,8 +22,12 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome import celestial as celestial_dome
-from skysim.sources.dome import display
-from skysim.sources.dome.display import projector_sources
+from skysim.sources.dome.display import (
+    ideal_led,
+    panel_sources,
+    panel_surface,
+    projector_sources,
+)
 from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
@@ -64,16 +68,16 @@ def fibers(config: FibersConfig, surface: Surface, led: LedConfig, band: Band) -
 def lcd(config: LcdConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
     """Another layout's LEDs drawn on the nearest pixels of a panel: `display.panel_sources`."""
     # The points are placed on the panel as ideal LEDs, whose strengths are levels.
-    panel = display.panel_surface(config, surface)
-    stars = LAYOUTS[config.points.kind](config.points, panel, display.ideal_led(led), band)
-    return display.panel_sources(config, panel, led, band, stars)
+    panel = panel_surface(config, surface)
+    stars = LAYOUTS[config.points.kind](config.points, panel, ideal_led(led), band)
+    return panel_sources(config, panel, led, band, stars)
 
 
 def projector(
     config: ProjectorConfig, surface: Surface, led: LedConfig, band: Band
 ) -> Sources:
     """Another layout's LEDs drawn on the nearest pixels of a projector: `display.projector_sources`."""
-    stars = LAYOUTS[config.points.kind](config.points, surface, display.ideal_led(led), band)
+    stars = LAYOUTS[config.points.kind](config.points, surface, ideal_led(led), band)
     return projector_sources(config, surface, led, band, stars)
 
 

@@ -5,6 +5,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
+from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
@@ -45,7 +47,7 @@ BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a mi
 
 
 def dimmed(
-    places: Callable[[Any, Surface, np.random.Generator], Floats],
+    places: Callable[[Any, Surface, Generator], Floats],
 ) -> Callable[[Any, Surface, LedConfig, Band], Sources]:
     """The layout of LEDs at a spread's places, each with a random level of the layout's `dimming`."""
 
@@ -57,23 +59,19 @@ def dimmed(
     return layout
 
 
-def fibonacci(config: FibonacciConfig, surface: Surface, _rng: np.random.Generator) -> Floats:
+def fibonacci(config: FibonacciConfig, surface: Surface, _rng: Generator) -> Floats:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
     return project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
 
 
-def random_places(
-    config: RandomPlacesConfig, surface: Surface, rng: np.random.Generator
-) -> Floats:
+def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> Floats:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     return project_from_bearing(
         surface, scattered_cap(config.count, np.radians(config.cap_deg), rng)
     )
 
 
-def poisson_disk(
-    config: PoissonDiskConfig, surface: Surface, rng: np.random.Generator
-) -> Floats:
+def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -117,7 +115,7 @@ def poisson_disk(
     return darts_m[thin(darts_m, config.spacing_m)]
 
 
-def optimized(config: OptimizedConfig, surface: Surface, rng: np.random.Generator) -> Floats:
+def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
@@ -195,7 +193,7 @@ def geodesic_vertices(frequency: int, class_: str) -> Floats:
     corners = icosahedron()
     # Corners with their weights: a vertex on an edge is the same from both faces.
     weights = set[tuple[tuple[int, int], ...]]()
-    for face in icosahedron_faces():
+    for face in ConvexHull(corners).simplices.tolist():
         for lattice in lattice_points(frequency, class_):
             pairs = zip(face, lattice, strict=True)
             weights.add(tuple(sorted((corner, n) for corner, n in pairs if n)))
@@ -224,18 +222,3 @@ def icosahedron() -> Floats:
     between = azimuth + np.pi / 5
     lower = np.column_stack([ring * np.cos(between), ring * np.sin(between), np.full(5, -z)])
     return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])
-
-
-def icosahedron_faces() -> list[tuple[int, int, int]]:
-    """The corners of the icosahedron's 20 faces, as rows of `icosahedron`."""
-    faces = []
-    for n in range(5):
-        following = (n + 1) % 5
-        upper = 1 + n
-        next_upper = 1 + following
-        lower = 6 + n
-        next_lower = 6 + following
-        # A face at the zenith, two between the rings, one at the nadir.
-        faces += [(0, upper, next_upper), (upper, lower, next_upper)]
-        faces += [(lower, next_lower, next_upper), (11, lower, next_lower)]
-    return faces

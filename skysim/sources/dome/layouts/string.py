@@ -16,6 +16,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_RAD
@@ -72,12 +73,7 @@ class Tape(NamedTuple):
     tilt_rad: Floats
     azimuth_rad: Floats
     length_m: Floats
-    closed: bool = False
-
-    def led_count(self, pitch_m: float) -> int:
-        """Number of LEDs that fit; on a ring the last has a pitch to the first."""
-        fit = int(self.length_m[-1] / pitch_m)
-        return max(fit, 1) if self.closed else fit + 1
+    closed: bool
 
     def rays(self, at_m: Floats) -> Floats:
         """(N, 3) unit vectors from the bearing to places along the tape."""
@@ -107,10 +103,10 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     if not tapes:
         zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
         return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
-    design_m = [
-        config.pitch_m * np.arange(tape.led_count(config.pitch_m), dtype=float)
-        for tape in tapes
-    ]
+    # As many as fit; on a ring the last has a pitch to the first.
+    fit = [int(tape.length_m[-1] / config.pitch_m) for tape in tapes]
+    counts = [max(n, 1) if tape.closed else n + 1 for n, tape in zip(fit, tapes, strict=True)]
+    design_m = [config.pitch_m * np.arange(n, dtype=float) for n in counts]
     rng = random_stream(config.hardware_seed, TAPE_STREAM)
     stretch = 1 + scaled_errors(config.pitch_error, rng.standard_normal(len(tapes)))
     # The pitch errs by a factor for each tape, the glue sideways along it.
@@ -118,11 +114,11 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     for tape, at_m, factor in zip(tapes, design_m, stretch, strict=True):
         sideways_m = scaled_errors(config.glue_scatter_m, wander(at_m, rng))
         place_m.append(aside(surface, tape, factor * at_m, sideways_m))
-    number = np.repeat(np.arange(len(tapes)), [len(at_m) for at_m in design_m])
+    number = np.repeat(np.arange(len(tapes)), counts)
     return Wound(np.concatenate(place_m), number, np.concatenate(design_m))
 
 
-def wander(at_m: Floats, rng: np.random.Generator) -> Floats:
+def wander(at_m: Floats, rng: Generator) -> Floats:
     """Standard normal numbers at increasing places of a tape, correlated by exp(-d / GLUE_M) (Gauss-Markov).
 
     x_n = rho x_(n-1) + sqrt(1 - rho^2) g_n, rho = exp(-(d_n - d_(n-1)) / GLUE_M).
@@ -285,7 +281,7 @@ def marked_m(
     surface: Surface,
     place_m: Floats,
     outward_m: Floats,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Floats:
     """(N, 3) places of holes that a laser marks for designed places (N, 3) of a surface that is outward_m off there.
 
