@@ -26,7 +26,7 @@ from estimator.identification.star_detections import Detections, field_area, ray
 
 @jit
 def trial(
-    detections: Detections, a: int, b: int, start: int, min_dex: float
+    detections: Detections, a: int, b: int, min_dex: float
 ) -> tuple[Floats, NDArray[np.int64], int]:
     """What the quick check of an attitude by two detections needs.
 
@@ -34,8 +34,6 @@ def trial(
     ----------
     a, b
         Rows of the two detections
-    start
-        The other detections are looked up from this row on
     min_dex
         Least evidence of interest, log10
 
@@ -44,12 +42,12 @@ def trial(
     gates
         (N,) matching radius of each detection, tangents
     order
-        (N - 2,) rows of the other detections
+        (N - 2,) rows of the other detections by increasing gate: near the pair, chance matches are rare
     required
         Number of matches, the pair included, without which the evidence cannot reach `min_dex`
     """
     gates = pair_gates(detections, a, b)
-    order = other_detections(len(detections.sigma), a, b, start)
+    order = other_detections(gates, a, b)
     pair_dex = attitude_dex(
         detections.tangent, detections.sigma, a, b, 8 * pi * pi, detections.focal_uncertainty
     )
@@ -87,17 +85,10 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
 
 
 @jit
-def other_detections(total: int, a: int, b: int, start: int) -> NDArray[np.int64]:
-    """Rows of all N detections but a and b, from row `start` on and around: (N - 2,)."""
-    out = np.empty(total, np.int64)
-    count = 0
-    for step in range(total):
-        # Wrap around at the end.
-        n = (start + step) % total
-        if n not in (a, b):
-            out[count] = n
-            count += 1
-    return out[:count]
+def other_detections(gates: Floats, a: int, b: int) -> NDArray[np.int64]:
+    """Rows of all N detections but a and b, by increasing gate (N,): (N - 2,)."""
+    order = np.argsort(gates)
+    return order[(order != a) & (order != b)]
 
 
 @jit

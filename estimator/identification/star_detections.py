@@ -4,17 +4,23 @@ A centroid in pixels becomes a tangent (x / z, y / z) in camera axes, with the i
 the fit and the error of its worst axis, which sets its matching radius.
 """
 
+from dataclasses import replace
 from math import hypot, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.camera import Distortion, undistorted
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import NO_SPREAD, Centroids
 from estimator.identification.chance import GATE_SIGMA
+
+DOUBLE_PX = 6.0  # greatest distance of double images
+CELLS = 6  # along each side of the field, in which the brightest lights are chosen
 
 
 class Detections(NamedTuple):
@@ -106,6 +112,82 @@ def flat_centroids(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
     )
 
 
+class Lights(NamedTuple):
+    """The lights of a frame that are identified.
+
+    Attributes
+    ----------
+    centroids
+        Their centroids
+    rows
+        (N,) rows of the frame's centroids: of each light's brightest image
+    offset_px
+        (2,) standard deviation along x and y of the common error of double images
+    """
+
+    centroids: Centroids
+    rows: NDArray[np.int64]
+    offset_px: Floats
+
+
+def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) -> Lights:
+    """The lights of a frame that are identified: not too many, and double images as one light.
+
+    1. Of more than `most` centroids the brightest of each part of the field are taken (`spread`).
+    2. If at least a third of them are within DOUBLE_PX of a brighter one, and no more than an eighth by chance, the
+       images are double, by vibration or a reflection, and either image may be the true one. The members of a group
+       become one light at their mean place, whose error reaches to the farthest member.
+    3. The images of a reflection are all displaced alike. The second moments of the displacements then have unequal
+       eigenvalues, and their difference is the variance of an error that is common to all lights.
+    """
+    # 1. Number
+    field = np.array([0.0, width_px, 0.0, height_px])
+    rows = spread(centroids.xy_px, field, most)
+    if len(rows) < len(centroids):
+        centroids = centroids.take(rows)
+    # 2. Double images
+    head = brighter_within(centroids.xy_px, DOUBLE_PX)
+    second = np.flatnonzero(head < np.arange(len(head)))
+    by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
+    if 3 * len(second) < len(head) or by_chance > 1 / 8:
+        return Lights(centroids, rows, np.zeros(2))
+    first, group = np.unique(head, return_inverse=True)
+    mean_px = np.stack([np.bincount(group, x) for x in centroids.xy_px.T], axis=1)
+    mean_px /= np.bincount(group)[:, None]
+    offset_px = centroids.xy_px - mean_px[group]
+    reach2_px2 = np.zeros(len(first))
+    np.maximum.at(reach2_px2, group, np.sum(offset_px**2, axis=1))
+    merged = centroids.take(first)
+    spread_px2 = merged.covariance_px2
+    if spread_px2 is not None:
+        spread_px2 = spread_px2 + reach2_px2[:, None, None] * np.eye(2)
+    merged = replace(
+        merged,
+        xy_px=mean_px,
+        sigma_px=np.sqrt(merged.sigma_px**2 + reach2_px2),
+        covariance_px2=spread_px2,
+    )
+    # 3. Common error
+    second_px = offset_px[second]
+    variance, axes = np.linalg.eigh(second_px.T @ second_px / len(second))
+    common_px = np.sqrt(variance[1] - variance[0]) * axes[:, 1]
+    return Lights(merged, rows[first], common_px)
+
+
+@jit
+def brighter_within(xy_px: Floats, reach_px: float) -> NDArray[np.int64]:
+    """(N,) row of the brightest light within reach that is not itself near a brighter one, or else the own row."""
+    head = np.arange(len(xy_px))
+    for n in range(len(xy_px)):
+        for m in range(n):
+            dx = xy_px[n, 0] - xy_px[m, 0]
+            dy = xy_px[n, 1] - xy_px[m, 1]
+            if head[m] == m and dx * dx + dy * dy < reach_px * reach_px:
+                head[n] = m
+                break
+    return head
+
+
 @jit
 def detections_of(
     lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float
@@ -175,6 +257,62 @@ def changed(
         detections.field,
         focal_uncertainty,
         detections.limit_mag if count == len(detections.sigma) else np.nan,
+    )
+
+
+@jit
+def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
+    """Rows of `count` lights, the brightest of each part of the field: a clump of false lights displaces no other.
+
+    The field is divided into CELLS x CELLS cells. First come the brightest lights of all cells, then the second
+    brightest, and so on.
+
+    Parameters
+    ----------
+    places
+        (N, 2) positions, brightest first
+    field
+        (4,) edges of the sensor in the same unit: left, right, top, bottom
+
+    Returns
+    -------
+    NDArray
+        Rows by decreasing brightness; all rows if there are no more than `count`
+    """
+    if len(places) <= count:
+        return np.arange(len(places))
+    used = np.zeros(CELLS * CELLS, np.int64)
+    rank = np.empty(len(places), np.int64)
+    for n in range(len(places)):
+        column = cell_of(CELLS * (places[n, 0] - field[0]) / (field[1] - field[0]), CELLS - 1)
+        row = cell_of(CELLS * (places[n, 1] - field[2]) / (field[3] - field[2]), CELLS - 1)
+        cell = row * CELLS + column
+        rank[n] = used[cell]
+        used[cell] += 1
+    keep = np.zeros(len(places), np.bool_)
+    taken = 0
+    level = 0
+    while taken < count:
+        for n in range(len(places)):
+            if rank[n] == level and taken < count:
+                keep[n] = True
+                taken += 1
+        level += 1
+    return np.flatnonzero(keep)
+
+
+@jit
+def chosen(detections: Detections, rows: NDArray) -> Detections:
+    """The detections of some rows."""
+    return Detections(
+        detections.tangent[rows],
+        detections.sigma[rows],
+        detections.weight[rows],
+        detections.mag[rows],
+        detections.mag_sigma,
+        detections.field,
+        detections.focal_uncertainty,
+        detections.limit_mag if len(rows) == len(detections.sigma) else np.nan,
     )
 
 

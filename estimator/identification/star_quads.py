@@ -27,6 +27,7 @@ from estimator.identification import star_check, star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import Detections, changed, ray
 from estimator.identification.star_evidence import (
+    FOCAL_MARGIN,
     Hypothesis,
     Solution,
     evaluate,
@@ -251,7 +252,7 @@ def _test_match(
     star_b = vectors.row(sky.vectors, star[1])
     # 4. The focal ratio and the attitude from A and B.
     ratio = star_search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
-    if abs(ratio - 1) > detections.focal_uncertainty:
+    if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
         return no_hypothesis()
     in_cam = np.empty((3, 3))
     in_ref = np.empty((3, 3))
@@ -260,7 +261,7 @@ def _test_match(
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
     # 5. Quick check of the other detections.
-    gates, order, required = star_check.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
+    gates, order, required = star_check.trial(detections, a, b, star_search.DECISIVE_DEX)
     grid = sky.cell_first, sky.cell_star, sky.side
     lookups, fits = star_check.quick_check(
         tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)

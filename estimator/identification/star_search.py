@@ -8,7 +8,7 @@ both.
 
 The steps; the same numbers return as comments in the code:
 
-1. Choose the detections and the effort: the FEW brightest first, then up to `max_detections` (`lost_in_space`).
+1. Choose up to `max_detections` detections, the brightest of each part of the field (`star_detections.spread`).
 2. Take the pair of detections that the fewest catalog pairs are expected to match (`search`).
 3. Look up the catalog pairs of the same separation within GATE_SIGMA (`_pair_range`).
 4. For each catalog pair, in both orders (`_test_pair`):
@@ -19,11 +19,11 @@ The steps; the same numbers return as comments in the code:
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
 9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
 
-Steps 2 to 8 are repeated with more detections, or with less strict quick checks, if they find nothing.
+Steps 2 to 7 are repeated with less strict quick checks if they find nothing.
 Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
-from math import log10, sqrt
+from math import hypot, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +35,21 @@ from estimator.core.jit import jit
 from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
-    SHORT_PAIR,
+    least,
     separation,
 )
 from estimator.identification.star_check import quick_check, trial
-from estimator.identification.star_detections import Detections, changed, gates_of, ray
+from estimator.identification.star_detections import (
+    Detections,
+    changed,
+    chosen,
+    field_area,
+    gates_of,
+    ray,
+    spread,
+)
 from estimator.identification.star_evidence import (
+    FOCAL_MARGIN,
     Hypothesis,
     Solution,
     build_solution,
@@ -62,10 +71,10 @@ MAG_GATE_SIGMA = (
 )
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
 EVALUATION_COST = 6
-FEW = 20  # number of detections of the first search
-# Fractions of `max_checks`: for the first search with FEW detections, and for that with many.
-SHORT_EFFORT = 1 / 16
-MANY_EFFORT = 1 / 4
+SHORTEST = 0.04  # of the field's size: shorter pairs are tried last
+# The star of detection r is one of the RANK_MARGIN + RANK_FACTOR r brightest per field.
+RANK_MARGIN = 8
+RANK_FACTOR = 3
 WRONG_FOCAL = (
     0.05  # greatest relative error of a calibrated focal length that step 9 can find
 )
@@ -81,10 +90,6 @@ def lost_in_space(
     detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> Solution:
     """Identify the detections and solve the attitude: the whole search (see the module's steps).
-
-    One search uses the FEW brightest detections: it finds a few bright stars among many faint false lights. Another
-    uses the `max_detections` brightest: it finds stars among brighter false lights. Each must reach twice the evidence,
-    so that both together accept a chance match as rarely as a single search would.
 
     Parameters
     ----------
@@ -104,36 +109,28 @@ def lost_in_space(
     """
     # 1. Choose the detections to search with.
     total = len(detections.sigma)
-    few = min(FEW, max_detections, total)
-    many = min(max_detections, total)
-    # Two searches must each reach twice the evidence.
-    accept_dex = ACCEPT_DEX if few == many else ACCEPT_DEX + log10(2.0)
-    candidate = no_hypothesis()
-    # A short search with few detections, one with many, then the first one again with the whole effort.
-    for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-        if few == many and effort < 1:
-            continue
-        # 2. to 8. The search.
-        searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-        candidate = search(searched, stars, int(effort * max_checks))
-        if candidate.dex >= accept_dex:
-            break
+    searched = chosen(
+        detections, spread(detections.tangent, detections.field, max_detections)
+    )
+    # 2. to 8. The search.
+    candidate = search(searched, stars, max_checks)
     # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
     calibrated = detections.focal_uncertainty == 0
     free = changed(detections, total, 1.0, WRONG_FOCAL) if calibrated else detections
-    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == total)
+    return fit_to_all(free, stars, candidate, ACCEPT_DEX, calibrated, max_detections >= total)
 
 
 @jit
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
 
-    Pairs of detections are tried by increasing cost: the expected number of catalog pairs that match them, doubled for
-    each earlier attempt with either detection, so that a false detection does not hold up the search.
+    Pairs of detections are tried in passes. A pass tries the pairs whose cost is below a limit, and the limit doubles
+    with each pass. The cost is `_pair_costs`, doubled for each earlier attempt with either detection, so that a false
+    detection does not hold up the search.
 
-    The first round drops a candidate after MAX_MISSES detections without a star and skips stars outside of the
-    magnitude gate. The second round has neither limit. It is skipped if MAX_MISSES covers all other detections
-    anyway.
+    The first round drops a candidate after a few detections without a star, one at first and MAX_MISSES later, and
+    skips stars outside of the magnitude gate or too faint for the detection's rank (`_faintest_stars`). The second
+    round has none of these limits.
 
     Parameters
     ----------
@@ -146,41 +143,52 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
         The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
     total = len(detections.sigma)
-    length = _pair_lengths(detections)
-    rarity = _rarity(detections, sky)
+    pairs = total * (total - 1) // 2
+    cost = _pair_costs(detections, sky)
     best = no_hypothesis()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     limit = max_checks
-    for max_misses in (MAX_MISSES, total):
+    for strict in (True, False):
+        faintest = _faintest_stars(detections, sky, strict)
         tried = np.zeros((total, total), np.bool_)
-        cost = rarity.copy()
-        for attempt in range(total * (total - 1) // 2):
-            # 2. The untried pair of detections of least cost.
-            a, b = _next_pair(length, tried, cost)
-            tried[a, b] = True
-            # 3. to 6. Every attempt starts its quick checks at another MAX_MISSES detections: a fixed order would
-            # drop every true candidate of a frame in which these are all false.
-            start = attempt * MAX_MISSES
-            candidate = _test_pair(detections, sky, a, b, start, max_misses, best, checks)
-            same = _same_attitude(candidate, best)
-            if candidate.dex > best.dex:
-                # The previous best becomes a rival unless it is the same attitude.
-                rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                if best.dex < ACCEPT_DEX <= candidate.dex:
-                    limit = min(max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT)
-                best = candidate
-            elif not same:
-                rival_dex = max(rival_dex, candidate.dex)
-            # 7. A decisive attitude needs no search for rivals.
-            if best.dex >= DECISIVE_DEX:
-                return best
-            cost[a] *= 2
-            cost[b] *= 2
-            if checks[0] > limit:
-                break
-        if checks[0] > limit or total - 2 <= MAX_MISSES:
-            break
+        weight = np.ones(total)
+        max_cost = 2 * least(cost.ravel())
+        attempt = 0
+        while attempt < pairs and checks[0] <= limit:
+            for a in range(total):
+                for b in range(a + 1, total):
+                    # 2. The untried pairs of detections of least cost.
+                    if (
+                        cost[a, b] * weight[a] * weight[b] > max_cost
+                        or tried[a, b]
+                        or checks[0] > limit
+                    ):
+                        continue
+                    tried[a, b] = True
+                    weight[a] *= 2
+                    weight[b] *= 2
+                    # 3. to 6. Test the pair.
+                    misses = min(1 + attempt // 4, MAX_MISSES) if strict else total
+                    attempt += 1
+                    candidate = _test_pair(
+                        detections, sky, a, b, misses, faintest, best, checks
+                    )
+                    same = _same_attitude(candidate, best)
+                    if candidate.dex > best.dex:
+                        # The previous best becomes a rival unless it is the same attitude.
+                        rival_dex = rival_dex if same else max(rival_dex, best.dex)
+                        if best.dex < ACCEPT_DEX <= candidate.dex:
+                            limit = min(
+                                max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT
+                            )
+                        best = candidate
+                    elif not same:
+                        rival_dex = max(rival_dex, candidate.dex)
+                    # 7. A decisive attitude needs no search for rivals.
+                    if best.dex >= DECISIVE_DEX:
+                        return best
+            max_cost *= 2
     # 8. A weaker attitude must be significant, and clearly better than any other.
     if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
         return best
@@ -202,79 +210,60 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 
 @jit
-def _pair_lengths(detections: Detections) -> Floats:
-    """Separations of all pairs of detections, for the order of the search.
+def _pair_costs(detections: Detections, sky: SkyIndex) -> Floats:
+    """Costs of all pairs of detections, for the order of the search.
 
-    The expected number of catalog pairs in a gate grows with sin(separation). A pair shorter than SHORT_PAIR of the
-    field determines the roll poorly: it is given a length beyond all others, the greater the shorter it is.
+        cost = s_ab sqrt(sa^2 + sb^2) f_a f_b c_a c_b
+
+    The expected number of catalog pairs in a gate grows with the separation s_ab, with the width of the gate, and with
+    the fractions f of the catalog's stars that the magnitudes allow. A detection among c others within SHORTEST of the
+    field is less probably a star the more there are: c + 1 counts clumps of false lights as one. A pair shorter than
+    SHORTEST of the field hardly determines the roll: it is given a separation beyond all others, the greater the
+    shorter it is.
 
     Returns
     -------
     Floats
-        (N, N) tangents, for a < b; the other elements are not set
+        (N, N) costs for a < b; infinite elsewhere
     """
     total = len(detections.sigma)
-    field = detections.field
-    min_length = SHORT_PAIR * sqrt((field[1] - field[0]) * (field[3] - field[2]))
-    out = np.empty((total, total))
+    min_length = SHORTEST * sqrt(field_area(detections))
+    weight = np.ones(total)
+    out = np.full((total, total), np.inf)
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
             # A short pair comes after all others.
             if length < min_length:
+                weight[a] += 1
+                weight[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
-            out[a, b] = length
-    return out
-
-
-@jit
-def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
-    """Fraction of the catalog's stars that each detection's magnitude allows.
-
-    Returns
-    -------
-    Floats
-        (N,) fraction of the stars inside the magnitude gate; 1 if the magnitude is unknown
-    """
-    out = np.ones(len(detections.sigma))
-    for n in range(len(out)):
+            out[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
+    for n in range(total):
         if np.isfinite(detections.mag[n]):
             # The gate's full width times the density of magnitudes; the small constant keeps every cost above 0.
             density = magnitude_density(sky, detections.mag[n])
-            out[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
+            weight[n] *= min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
+    for a in range(total):
+        for b in range(a + 1, total):
+            out[a, b] *= weight[a] * weight[b]
     return out
 
 
 @jit
-def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int]:
-    """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b].
+def _faintest_stars(detections: Detections, sky: SkyIndex, strict: bool) -> NDArray:
+    """(N,) row of the faintest star that each detection may be: the catalog's stars are sorted by brightness, too.
 
-    Parameters
-    ----------
-    length
-        (N, N) lengths of the pairs, see `_pair_lengths`
-    tried
-        (N, N) whether a pair has been tried
-    weight
-        (N,) cost of each detection
-
-    Returns
-    -------
-    tuple[int, int]
-        Rows of the two detections
+    False detections only increase the rank of a star among the detections, brightest first. The star of the detection
+    r, from 0, is therefore not much fainter than the r brightest stars of a field. RANK_FACTOR allows for fields with
+    fewer stars than the mean, RANK_MARGIN for the scatter of counts and magnitudes. Without `strict`, any star.
     """
-    best = np.inf
-    best_a = 0
-    best_b = 1
-    for a in range(len(weight)):
-        for b in range(a + 1, len(weight)):
-            # The costs change with every attempt: sorting the pairs once would not do.
-            cost = length[a, b] * weight[a] * weight[b]
-            if cost < best and not tried[a, b]:
-                best = cost
-                best_a = a
-                best_b = b
-    return best_a, best_b
+    out = np.full(len(detections.sigma), len(sky.vectors))
+    if strict:
+        fields = 4 * pi / field_area(detections)
+        for n in range(len(out)):
+            out[n] = int(min((RANK_MARGIN + RANK_FACTOR * n) * fields, 1e9))
+    return out
 
 
 @jit
@@ -283,8 +272,8 @@ def _test_pair(
     sky: SkyIndex,
     a: int,
     b: int,
-    start: int,
     max_misses: int,
+    faintest: NDArray,
     previous: Hypothesis,
     checks: NDArray,
 ) -> Hypothesis:
@@ -294,10 +283,10 @@ def _test_pair(
     ----------
     a, b
         Rows of the two detections
-    start
-        The quick check looks up the other detections from this row on
     max_misses
         The quick check drops a candidate after this many detections without a star
+    faintest
+        (N,) row of the faintest star that each detection may be
     previous
         Best hypothesis so far
     checks
@@ -308,7 +297,7 @@ def _test_pair(
     Hypothesis
         The first one with ACCEPT_DEX whose attitude is not that of `previous`, or else the best one
     """
-    gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
+    gates, order, required = trial(detections, a, b, ACCEPT_DEX)
     in_cam = np.empty((3, 3))
     in_ref = np.empty((3, 3))
     R_ref_from_cam = np.empty((3, 3))
@@ -318,7 +307,7 @@ def _test_pair(
     begin, end, chord, gate = _pair_range(detections, sky, a, b)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     tangent = detections.tangent
-    focal_uncertainty = detections.focal_uncertainty
+    focal_uncertainty = FOCAL_MARGIN * detections.focal_uncertainty
     pair = sky.pair
     star = sky.vectors
     mag = sky.mag
@@ -326,14 +315,18 @@ def _test_pair(
     vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
     mag_a = detections.mag[a]
     mag_b = detections.mag[b]
-    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
+    last_a = faintest[a]
+    last_b = faintest[b]
+    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses <= MAX_MISSES else np.inf
     # 4. Candidate attitudes.
     for p in range(begin, end):
         i = pair[p, 0]
         j = pair[p, 1]
-        # 4a. Compare magnitudes first: this needs no geometry.
-        forward = _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
-        backward = _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
+        # 4a. Compare ranks and magnitudes first: this needs no geometry.
+        forward = i <= last_a and j <= last_b
+        backward = j <= last_a and i <= last_b
+        forward = forward and _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
+        backward = backward and _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
         if not (forward or backward):
             continue
         star_i = vectors.row(star, i)
@@ -397,8 +390,8 @@ def _pair_range(
 ) -> tuple[int, int, float, float]:
     """Step 3: the catalog pairs whose separation two detections may have.
 
-    The gate is GATE_SIGMA sqrt(sa^2 + sb^2). A focal length that is uncertain by the fraction u widens the range of
-    angles to angle / (1 + u) .. angle / (1 - u).
+    The gate is GATE_SIGMA sqrt(sa^2 + sb^2). A focal length that is uncertain by the fraction u, with FOCAL_MARGIN,
+    widens the range of angles to angle / (1 + u) .. angle / (1 - u).
 
     Returns
     -------
@@ -414,8 +407,9 @@ def _pair_range(
     angle = 2 * np.arcsin(min(chord / 2, 1.0))
     # Cell k of the index holds the angles from k to k + 1 times bin_rad.
     last = len(sky.first) - 2
-    low = cell_of((angle / (1 + detections.focal_uncertainty) - gate) / sky.bin_rad, last + 1)
-    high = cell_of((angle / (1 - detections.focal_uncertainty) + gate) / sky.bin_rad, last)
+    uncertainty = FOCAL_MARGIN * detections.focal_uncertainty
+    low = cell_of((angle / (1 + uncertainty) - gate) / sky.bin_rad, last + 1)
+    high = cell_of((angle / (1 - uncertainty) + gate) / sky.bin_rad, last)
     return sky.first[low], sky.first[high + 1], chord, gate
 
 

@@ -39,6 +39,7 @@ from estimator.identification.star_detections import (
     Sensor,
     detections_of,
     flat_centroids,
+    lights_of,
 )
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit, warm_up
@@ -61,6 +62,9 @@ from estimator.trackers.search_models import (
 )
 
 NO_STARS = "too few stars detected"
+# Greatest number of lights that are identified: the larger of a minimum and a multiple of the stars in a mean field
+MIN_LIGHTS = 100
+LIGHTS_PER_STAR = 4
 
 SETTINGS = Settings()
 
@@ -329,7 +333,7 @@ class StarTracker(FrameTracker):
         """Identify and solve centroids of one time."""
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_by_evidence(centroids, searches, clock)
+            return self._identify_lights(centroids, searches, clock)
         compared = np.zeros(1, np.int64)
         attitude = self._identify_by_paper(centroids, clock, compared)
         return replace(attitude, angles_compared=int(compared[0]) or None)
@@ -445,6 +449,26 @@ class StarTracker(FrameTracker):
         """
         uncertainty = max(self.focal_uncertainty, focal_uncertainty)
         return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
+
+    def _identify_lights(
+        self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
+    ) -> Attitude:
+        """Solve by the default identifier, without a surplus of lights, and with double images as one light."""
+        camera = self.camera
+        stars = len(self.stars) * self._field_sr / (4 * np.pi)
+        most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
+        lights = lights_of(centroids, camera.width_px, camera.height_px, most)
+        attitude = self._identify_by_evidence(lights.centroids, searches, clock)
+        if attitude.match is None or len(lights.rows) == len(centroids):
+            return attitude
+        # The common error turns the camera about the axes across it.
+        x, y = lights.offset_px / camera.focal_px
+        turn_rad = np.array([-y, x, 0.0])
+        return replace(
+            attitude,
+            match=replace(attitude.match, observed=lights.rows[attitude.match.observed]),
+            covariance_rad2=attitude.covariance_rad2 + np.outer(turn_rad, turn_rad),
+        )
 
     def _identify_by_evidence(
         self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
