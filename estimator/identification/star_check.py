@@ -120,9 +120,9 @@ def quick_check(
     gates
         (N,) matching radius of each detection
     order
-        (N - 2,) rows of the detections other than the pair, in the order of the look-ups
+        Rows of the detections that are not matched yet, in the order of the look-ups
     required
-        Number of matches wanted, with the pair's two
+        Number of matches wanted, with those that are matched already
     max_misses
         Number of look-ups without any match after which the candidate is dropped
 
@@ -133,11 +133,11 @@ def quick_check(
     fits
         Whether `required` is reached
     """
-    count = 2
     remaining = len(order)
+    start = count = len(gates) - remaining
     for step in range(remaining):
         # Out of reach, or too many misses at the start.
-        if count + remaining - step < required or (step >= max_misses and count == 2):
+        if count + remaining - step < required or (step >= max_misses and count == start):
             return step, False
         # The star nearest to the detection's direction in the catalog's frame.
         n = order[step]
@@ -146,4 +146,4 @@ def quick_check(
         count += star >= 0
         if count >= required:
             return step + 1, True
-    return remaining, False
+    return remaining, count >= required

@@ -1,29 +1,35 @@
-"""Lost-in-space star identification by pair hypotheses and a Bayes factor: the default method.
+"""Lost-in-space star identification by triangle hypotheses and a Bayes factor: the default method.
 
-Two detections and two catalog stars with the same angular separation determine an attitude. If it is the true one, the
-other detections have catalog stars at their predicted directions. A quick check counts these stars. The Bayes factor
-(`star_evidence`) then decides whether chance could have placed them there. If the focal length is uncertain, each pair
-also determines it, from the ratio of the measured to the catalog separation, and the other detections must confirm
-both.
+A detection (the hub) and two others form a triangle. Three catalog stars with the same three separations and the same
+orientation determine an attitude. If it is the true one, the other detections have catalog stars at their predicted
+directions. A quick check counts these stars. The Bayes factor (`star_evidence`) then decides whether chance could have
+placed them there. If the focal length is uncertain, each side also determines it, from the ratio of the measured to the
+catalog separation, and the sides and the other detections must agree.
+
+The catalog lists pairs of stars by their separation (after the Pyramid algorithm, Mortari et al. 2004, Navigation 51,
+171). The pairs of the hub and one partner are linked to the star of the hub. Only those pairs of the hub and another
+partner that have the same star form a triangle, and most of these have a third side of another length. No star is
+therefore looked up by its direction before the triangle is closed.
 
 The steps; the same numbers return as comments in the code:
 
 1. Choose up to `max_detections` detections, the brightest of each part of the field (`star_detections.spread`).
-2. Take the pair of detections that the fewest catalog pairs are expected to match (`search`).
-3. Look up the catalog pairs of the same separation within GATE_SIGMA (`_pair_range`).
-4. For each catalog pair, in both orders (`_test_pair`):
-   reject it by its magnitudes and its separation, and compute the focal ratio and the attitude.
+2. Take a hub, bright and not in a clump first, and its partners, those first that the fewest catalog pairs are expected
+   to match (`search`, `_pair_costs`).
+3. Look up the catalog pairs of the separation of hub and partner within GATE_SIGMA (`_pair_range`).
+4. Close triangles with the pairs of earlier partners (`_test_partner`).
 5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`star_check`).
 6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
 7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
 9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
 
-Steps 2 to 7 are repeated with less strict quick checks if they find nothing.
+Steps 2 to 7 are repeated with more partners and less strict checks if they find nothing.
 Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
 from math import hypot, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +41,6 @@ from estimator.core.jit import jit
 from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
-    least,
     separation,
 )
 from estimator.identification.star_check import quick_check, trial
@@ -71,7 +76,7 @@ MAG_GATE_SIGMA = (
 )
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
 EVALUATION_COST = 6
-SHORTEST = 0.04  # of the field's size: shorter pairs are tried last
+SHORTEST = 0.07  # of the field's size: shorter pairs are tried last
 # The star of detection r is one of the RANK_MARGIN + RANK_FACTOR r brightest per field.
 RANK_MARGIN = 8
 RANK_FACTOR = 3
@@ -82,7 +87,10 @@ WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the ca
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried
 )
-MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
+MAX_MISSES = 12  # detections without a star after which the first round drops a candidate
+PARTNERS = 10  # of a hub in the first round; twice as many in the second
+MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
+STEPS_PER_CHECK = 16  # comparisons of catalog pairs that take as long as a star look-up
 
 
 @jit
@@ -124,71 +132,61 @@ def lost_in_space(
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
 
-    Pairs of detections are tried in passes. A pass tries the pairs whose cost is below a limit, and the limit doubles
-    with each pass. The cost is `_pair_costs`, doubled for each earlier attempt with either detection, so that a false
-    detection does not hold up the search.
-
-    The first round drops a candidate after a few detections without a star, one at first and MAX_MISSES later, and
-    skips stars outside of the magnitude gate or too faint for the detection's rank (`_faintest_stars`). The second
-    round has none of these limits.
+    The first round is strict (see `_test_partner`); the second one is not, and has more partners.
 
     Parameters
     ----------
     max_checks
-        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+        Bound on the effort: star look-ups, and what takes as long
 
     Returns
     -------
     Hypothesis
         The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
-    total = len(detections.sigma)
-    pairs = total * (total - 1) // 2
-    cost = _pair_costs(detections, sky)
+    cost, hubs = _pair_costs(detections, sky)
     best = no_hypothesis()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     limit = max_checks
+    links = _no_links(len(sky.vectors))
     for strict in (True, False):
         faintest = _faintest_stars(detections, sky, strict)
-        tried = np.zeros((total, total), np.bool_)
-        weight = np.ones(total)
-        max_cost = 2 * least(cost.ravel())
-        attempt = 0
-        while attempt < pairs and checks[0] <= limit:
-            for a in range(total):
-                for b in range(a + 1, total):
-                    # 2. The untried pairs of detections of least cost.
-                    if (
-                        cost[a, b] * weight[a] * weight[b] > max_cost
-                        or tried[a, b]
-                        or checks[0] > limit
-                    ):
-                        continue
-                    tried[a, b] = True
-                    weight[a] *= 2
-                    weight[b] *= 2
-                    # 3. to 6. Test the pair.
-                    misses = min(1 + attempt // 4, MAX_MISSES) if strict else total
-                    attempt += 1
-                    candidate = _test_pair(
-                        detections, sky, a, b, misses, faintest, best, checks
-                    )
-                    same = _same_attitude(candidate, best)
-                    if candidate.dex > best.dex:
-                        # The previous best becomes a rival unless it is the same attitude.
-                        rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                        if best.dex < ACCEPT_DEX <= candidate.dex:
-                            limit = min(
-                                max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT
-                            )
-                        best = candidate
-                    elif not same:
-                        rival_dex = max(rival_dex, candidate.dex)
-                    # 7. A decisive attitude needs no search for rivals.
-                    if best.dex >= DECISIVE_DEX:
-                        return best
-            max_cost *= 2
+        for hub in hubs:
+            # 2. A hub, and the partners of the least cost.
+            partners = np.argsort(cost[hub])[: PARTNERS if strict else 2 * PARTNERS]
+            for p in range(min(len(partners), len(hubs) - 1)):
+                # 3. to 6. Test the triangles of the hub, this partner and an earlier one.
+                candidate = _test_partner(
+                    detections,
+                    sky,
+                    hub,
+                    partners[: p + 1],
+                    strict,
+                    faintest,
+                    links,
+                    best,
+                    checks,
+                )
+                same = _same_attitude(candidate, best)
+                if candidate.dex > best.dex:
+                    # The previous best becomes a rival unless it is the same attitude.
+                    rival_dex = rival_dex if same else max(rival_dex, best.dex)
+                    if best.dex < ACCEPT_DEX <= candidate.dex:
+                        limit = min(
+                            max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT
+                        )
+                    best = candidate
+                elif not same:
+                    rival_dex = max(rival_dex, candidate.dex)
+                # 7. A decisive attitude needs no search for rivals.
+                if best.dex >= DECISIVE_DEX:
+                    return best
+                if checks[0] > limit:
+                    break
+            _clear(links)
+            if checks[0] > limit:
+                break
     # 8. A weaker attitude must be significant, and clearly better than any other.
     if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
         return best
@@ -210,44 +208,47 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 
 @jit
-def _pair_costs(detections: Detections, sky: SkyIndex) -> Floats:
-    """Costs of all pairs of detections, for the order of the search.
+def _pair_costs(detections: Detections, sky: SkyIndex) -> tuple[Floats, NDArray]:
+    """Costs of all pairs of detections, and the order of the hubs.
 
         cost = s_ab sqrt(sa^2 + sb^2) f_a f_b c_a c_b
 
     The expected number of catalog pairs in a gate grows with the separation s_ab, with the width of the gate, and with
-    the fractions f of the catalog's stars that the magnitudes allow. A detection among c others within SHORTEST of the
-    field is less probably a star the more there are: c + 1 counts clumps of false lights as one. A pair shorter than
-    SHORTEST of the field hardly determines the roll: it is given a separation beyond all others, the greater the
-    shorter it is.
+    the fractions f of the catalog's stars that the magnitudes allow. A detection among c - 1 others within SHORTEST of
+    the field is less probably a star the more there are: a clump of false lights counts as one. A pair shorter than
+    SHORTEST hardly determines the roll: it is given a separation beyond all others, the greater the shorter it is.
 
     Returns
     -------
-    Floats
-        (N, N) costs for a < b; infinite elsewhere
+    cost
+        (N, N) costs, infinite on the diagonal
+    hubs
+        (N,) rows of the detections, those first that are bright and alone
     """
     total = len(detections.sigma)
     min_length = SHORTEST * sqrt(field_area(detections))
-    weight = np.ones(total)
-    out = np.full((total, total), np.inf)
+    crowd = np.ones(total)
+    allowed = np.ones(total)
+    cost = np.full((total, total), np.inf)
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
             # A short pair comes after all others.
             if length < min_length:
-                weight[a] += 1
-                weight[b] += 1
+                crowd[a] += 1
+                crowd[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
-            out[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
+            cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
     for n in range(total):
         if np.isfinite(detections.mag[n]):
             # The gate's full width times the density of magnitudes; the small constant keeps every cost above 0.
             density = magnitude_density(sky, detections.mag[n])
-            weight[n] *= min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
+            allowed[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
     for a in range(total):
         for b in range(a + 1, total):
-            out[a, b] *= weight[a] * weight[b]
-    return out
+            cost[a, b] *= allowed[a] * crowd[a] * allowed[b] * crowd[b]
+            cost[b, a] = cost[a, b]
+    return cost, np.argsort((np.arange(total) + 1) * crowd)
 
 
 @jit
@@ -266,27 +267,80 @@ def _faintest_stars(detections: Detections, sky: SkyIndex, strict: bool) -> NDAr
     return out
 
 
+class Links(NamedTuple):
+    """Catalog pairs that the hub and one of its partners may be, by the star of the hub: linked lists.
+
+    Attributes
+    ----------
+    last
+        (S,) entry that was added last of each star, plus 1; 0 without one
+    hub, star, previous
+        (L,) of each entry: star of the hub, star of the partner, and the entry before it of the same hub, plus 1
+    partner, ratio
+        (L,) number of the partner, and the focal ratio by the separation
+    count
+        (1,) number of entries
+    """
+
+    last: NDArray[np.int32]
+    hub: NDArray[np.int32]
+    star: NDArray[np.int32]
+    previous: NDArray[np.int32]
+    partner: NDArray[np.int32]
+    ratio: Floats
+    count: NDArray[np.int64]
+
+
 @jit
-def _test_pair(
+def _no_links(stars: int) -> Links:
+    """No entry for any star: zeros, which take no time, as the system provides them when they are used."""
+    return Links(
+        np.zeros(stars, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS),
+        np.zeros(1, np.int64),
+    )
+
+
+@jit
+def _clear(links: Links) -> None:
+    """Remove all entries."""
+    for n in range(links.count[0]):
+        links.last[links.hub[n]] = 0
+    links.count[0] = 0
+
+
+@jit
+def _test_partner(
     detections: Detections,
     sky: SkyIndex,
-    a: int,
-    b: int,
-    max_misses: int,
+    hub: int,
+    partners: NDArray,
+    strict: bool,
     faintest: NDArray,
+    links: Links,
     previous: Hypothesis,
     checks: NDArray,
 ) -> Hypothesis:
-    """Steps 3 to 6: test two detections against every catalog pair of the same separation, in both orders.
+    """Steps 3 to 6: test the triangles of the hub, its last partner, and an earlier one.
+
+    Each catalog pair of the separation of hub and partner is compared with the links of its stars, in both orders. If
+    the stars of two partners are as far apart as the partners, and on the same side, the three stars are a candidate.
 
     Parameters
     ----------
-    a, b
-        Rows of the two detections
-    max_misses
-        The quick check drops a candidate after this many detections without a star
+    hub, partners
+        Row of the hub, and rows of its partners so far
+    strict
+        Whether stars outside of the magnitude gate are skipped, and a candidate is dropped after MAX_MISSES more
+        detections without a star
     faintest
         (N,) row of the faintest star that each detection may be
+    links
+        Pairs of the hub with its partners, to which those of the last one are added
     previous
         Best hypothesis so far
     checks
@@ -297,85 +351,198 @@ def _test_pair(
     Hypothesis
         The first one with ACCEPT_DEX whose attitude is not that of `previous`, or else the best one
     """
-    gates, order, required = trial(detections, a, b, ACCEPT_DEX)
-    in_cam = np.empty((3, 3))
-    in_ref = np.empty((3, 3))
-    R_ref_from_cam = np.empty((3, 3))
+    p = len(partners) - 1
+    y = partners[p]
     best = no_hypothesis()
-    focal_ratio = 1.0
     # 3. Catalog pairs of the same separation.
-    begin, end, chord, gate = _pair_range(detections, sky, a, b)
+    low, high, chord, gate = _pair_range(detections, sky, hub, y)
+    tolerance = gate / chord
+    side, side_gate, turn, ratio_gate = _other_sides(detections, hub, partners, tolerance)
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
-    tangent = detections.tangent
-    focal_uncertainty = FOCAL_MARGIN * detections.focal_uncertainty
+    (last, hub_star, partner_star, before, partner_number, ratios, count) = links
     pair = sky.pair
     star = sky.vectors
     mag = sky.mag
-    grid = (sky.cell_first, sky.cell_star, sky.side)
-    vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
-    mag_a = detections.mag[a]
-    mag_b = detections.mag[b]
-    last_a = faintest[a]
-    last_b = faintest[b]
-    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses <= MAX_MISSES else np.inf
-    # 4. Candidate attitudes.
-    for p in range(begin, end):
-        i = pair[p, 0]
-        j = pair[p, 1]
-        # 4a. Compare ranks and magnitudes first: this needs no geometry.
-        forward = i <= last_a and j <= last_b
-        backward = j <= last_a and i <= last_b
-        forward = forward and _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
-        backward = backward and _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
-        if not (forward or backward):
-            continue
-        star_i = vectors.row(star, i)
-        star_j = vectors.row(star, j)
-        catalog_chord = vectors.chord(star_i, star_j)
-        # 4b. An uncertain focal length follows from the separations; else the separations must agree.
-        if focal_uncertainty > 0:
-            focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
-            if abs(focal_ratio - 1) > focal_uncertainty:
+    uncertain = detections.focal_uncertainty > 0
+    last_hub = faintest[hub]
+    last_y = faintest[y]
+    mag_hub = detections.mag[hub]
+    mag_y = detections.mag[y]
+    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if strict else np.inf
+    check_gates = np.empty(0)
+    order = np.empty(0, np.int64)
+    required = 0
+    ratio = 1.0
+    tests = 0
+    for cell in range(low, high + 1):
+        if uncertain:
+            # The angle of a cell's pairs is known to the width of the cell, much less than the gate.
+            ratio = chord / (2 * np.sin((cell + 0.5) * sky.bin_rad / 2))
+        for row in range(2 * sky.first[cell], 2 * sky.first[cell + 1]):
+            # 4. Each pair in both orders; ranks and magnitudes first, as they need no geometry.
+            i = pair[row // 2, row % 2]
+            k = pair[row // 2, 1 - row % 2]
+            if (
+                i > last_hub
+                or k > last_y
+                or not _alike(mag_hub - mag[i], mag_y - mag[k], mag_gate)
+            ):
                 continue
-            vectors.pair_frame(
-                ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam
-            )
-        elif abs(catalog_chord - chord) > gate:
-            continue
-        vectors.pair_frame(star_i, star_j, in_ref)
-        for flip in range(2):
-            if flip:
-                # The star pair in reverse order: a half turn about its bisector, the first axis.
-                for k in range(3):
-                    in_ref[k, 1] = -in_ref[k, 1]
-                    in_ref[k, 2] = -in_ref[k, 2]
-            if not (backward if flip else forward):
-                continue
-            # 4c. The attitude turns the axes of the detections into those of the stars.
-            vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-            # 5. Quick check.
-            lookups, fits = quick_check(
-                tangent,
-                star,
-                *grid,
-                R_ref_from_cam,
-                focal_ratio,
-                gates,
-                order,
-                required,
-                max_misses,
-            )
-            checks[0] += 1 + lookups
-            if fits:
-                # 6. Evidence. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
-                checks[0] += EVALUATION_COST
-                candidate = evaluate(
-                    detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX
+            entry = last[i]
+            while entry:
+                n = entry - 1
+                entry = before[n]
+                q = partner_number[n]
+                tests += 1
+                if q == p or (uncertain and abs(ratios[n] / ratio - 1) > ratio_gate[q]):
+                    continue
+                j = partner_star[n]
+                star_j = vectors.row(star, j)
+                star_k = vectors.row(star, k)
+                if abs(vectors.chord(star_j, star_k) * ratio - side[q]) > side_gate[q]:
+                    continue
+                if (
+                    turn[q] * vectors.dot(vectors.row(star, i), vectors.cross(star_j, star_k))
+                    < 0
+                ):
+                    continue
+                # 5. and 6. Quick check and evidence.
+                if required == 0:
+                    check_gates, order, required = trial(detections, hub, y, ACCEPT_DEX)
+                candidate = _test_triangle(
+                    detections,
+                    sky,
+                    (hub, y, i, k),
+                    check_gates,
+                    order[order != partners[q]],
+                    required,
+                    MAX_MISSES if strict else len(order),
+                    checks,
                 )
                 if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
                     return candidate
                 best = candidate if candidate.dex > best.dex else best
+            if count[0] < MAX_LINKS:
+                n = count[0]
+                hub_star[n] = i
+                partner_star[n] = k
+                partner_number[n] = p
+                ratios[n] = ratio
+                before[n] = last[i]
+                count[0] += 1
+                last[i] = count[0]
+    checks[0] += 1 + (tests + sky.first[high + 1] - sky.first[low]) // STEPS_PER_CHECK
     return best
+
+
+@jit
+def _other_sides(
+    detections: Detections, hub: int, partners: NDArray, tolerance: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Third sides of the triangles of a hub, its last partner, and each earlier partner.
+
+    An uncertain focal length follows from the side between the hub and the last partner, whose relative error is
+    `tolerance`, and is compared with that from the other side at the hub. At the angle A from the boresight ratios of
+    chords differ by up to 2 u sin^2 A for a focal length that is wrong by the fraction u (see `star_quads._code_gate`).
+
+    Returns
+    -------
+    side, side_gate
+        (P,) chord between the two partners, and its greatest error
+    turn
+        (P,) triple product of hub, partner and last partner; 0 if its sign is uncertain
+    ratio_gate
+        (P,) greatest relative difference of the focal ratios of the two sides at the hub
+    """
+    tangent = detections.tangent
+    sigma = detections.sigma
+    count = len(partners)
+    side = np.empty(count)
+    side_gate = np.empty(count)
+    turn = np.empty(count)
+    ratio_gate = np.empty(count)
+    y = partners[-1]
+    u = FOCAL_MARGIN * detections.focal_uncertainty
+    r2 = np.max(detections.field**2) + np.min(detections.field**2)
+    slack = 2 * u * r2 / (1 + r2) + (tolerance if u > 0 else 0.0)
+    ray_hub = ray(tangent, hub, 1.0)
+    ray_y = ray(tangent, y, 1.0)
+    for q in range(count):
+        ray_x = ray(tangent, partners[q], 1.0)
+        at_hub = vectors.chord(ray_hub, ray_x)
+        side[q] = vectors.chord(ray_x, ray_y)
+        side_gate[q] = GATE_SIGMA * hypot(sigma[partners[q]], sigma[y]) + slack * side[q]
+        ratio_gate[q] = GATE_SIGMA * hypot(sigma[partners[q]], sigma[hub]) / at_hub + slack
+        # The triple product is the longer side times the distance of the third corner, whose error is the gate.
+        turn[q] = vectors.dot(ray_hub, vectors.cross(ray_x, ray_y))
+        if abs(turn[q]) < side_gate[q] * max(at_hub, side[q]):
+            turn[q] = 0.0
+    return side, side_gate, turn, ratio_gate
+
+
+@jit
+def _test_triangle(
+    detections: Detections,
+    sky: SkyIndex,
+    match: tuple[int, int, int, int],
+    gates: Floats,
+    order: NDArray,
+    required: int,
+    max_misses: int,
+    checks: NDArray,
+) -> Hypothesis:
+    """Steps 5 and 6: the hypothesis that two detections are two stars.
+
+    Parameters
+    ----------
+    match
+        Rows of the detections a and b, and of their stars
+    gates, order, required, max_misses
+        See `star_check`
+    checks
+        (1,) effort so far, increased in place
+
+    Returns
+    -------
+    Hypothesis
+        Empty if the focal length, the quick check or the evidence refutes it
+    """
+    a, b, i, j = match
+    tangent = detections.tangent
+    star_a = vectors.row(sky.vectors, i)
+    star_b = vectors.row(sky.vectors, j)
+    ratio = 1.0
+    if detections.focal_uncertainty > 0:
+        length = vectors.chord(ray(tangent, a, 1.0), ray(tangent, b, 1.0))
+        ratio = fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
+        if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
+            return no_hypothesis()
+    # The attitude turns the axes of the detections into those of the stars.
+    in_cam = np.empty((3, 3))
+    in_ref = np.empty((3, 3))
+    R_ref_from_cam = np.empty((3, 3))
+    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
+    vectors.pair_frame(star_a, star_b, in_ref)
+    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
+    # 5. Quick check.
+    grid = sky.cell_first, sky.cell_star, sky.side
+    lookups, fits = quick_check(
+        tangent,
+        sky.vectors,
+        *grid,
+        R_ref_from_cam,
+        ratio,
+        gates,
+        order,
+        required,
+        max_misses,
+    )
+    checks[0] += 1 + lookups
+    if not fits:
+        return no_hypothesis()
+    # 6. Evidence. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
+    checks[0] += EVALUATION_COST
+    return evaluate(detections, sky, R_ref_from_cam.T.copy(), ratio, gates, NO_RIVAL_DEX)
 
 
 @jit
@@ -395,8 +562,8 @@ def _pair_range(
 
     Returns
     -------
-    begin, end
-        Half-open range of rows of `sky.pair`
+    low, high
+        First and last cell of the pairs
     chord
         Chord between the two rays
     gate
@@ -410,7 +577,7 @@ def _pair_range(
     uncertainty = FOCAL_MARGIN * detections.focal_uncertainty
     low = cell_of((angle / (1 + uncertainty) - gate) / sky.bin_rad, last + 1)
     high = cell_of((angle / (1 - uncertainty) + gate) / sky.bin_rad, last)
-    return sky.first[low], sky.first[high + 1], chord, gate
+    return low, high, chord, gate
 
 
 @jit
