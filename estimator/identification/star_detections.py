@@ -136,7 +136,7 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     1. Of more than `most` centroids the brightest of each part of the field are taken (`spread`).
     2. If at least a third of them are within DOUBLE_PX of a brighter one, and no more than an eighth by chance, the
        images are double, by vibration or a reflection, and either image may be the true one. The members of a group
-       become one light at their mean place, whose error reaches to the farthest member.
+       become one light at their mean place, whose error reaches to the farthest member, or as far as in the median.
     3. The images of a reflection are all displaced alike. The second moments of the displacements then have unequal
        eigenvalues, and their difference is the variance of an error that is common to all lights.
     """
@@ -157,6 +157,8 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     offset_px = centroids.xy_px - mean_px[group]
     reach2_px2 = np.zeros(len(first))
     np.maximum.at(reach2_px2, group, np.sum(offset_px**2, axis=1))
+    # A light without a second image may be either of its images, too.
+    reach2_px2 = np.maximum(reach2_px2, np.median(np.sum(offset_px[second] ** 2, axis=1)))
     merged = centroids.take(first)
     spread_px2 = merged.covariance_px2
     if spread_px2 is not None:

@@ -90,6 +90,7 @@ FREE_DEX = (
 MAX_MISSES = 12  # detections without a star after which the first round drops a candidate
 PARTNERS = 10  # of a hub in the first round; twice as many in the second
 MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
+MAX_CLOSED = 2**12  # triangles of a hub and one partner
 STEPS_PER_CHECK = 16  # comparisons of catalog pairs that take as long as a star look-up
 
 
@@ -280,6 +281,8 @@ class Links(NamedTuple):
         (L,) number of the partner, and the focal ratio by the separation
     count
         (1,) number of entries
+    closed
+        (T, 3) of each triangle that was closed last: stars of the hub and of the last partner, and number of the other
     """
 
     last: NDArray[np.int32]
@@ -289,6 +292,7 @@ class Links(NamedTuple):
     partner: NDArray[np.int32]
     ratio: Floats
     count: NDArray[np.int64]
+    closed: NDArray[np.int64]
 
 
 @jit
@@ -302,6 +306,7 @@ def _no_links(stars: int) -> Links:
         np.empty(MAX_LINKS, np.int32),
         np.empty(MAX_LINKS),
         np.zeros(1, np.int64),
+        np.empty((MAX_CLOSED, 3), np.int64),
     )
 
 
@@ -351,42 +356,92 @@ def _test_partner(
     Hypothesis
         The first one with ACCEPT_DEX whose attitude is not that of `previous`, or else the best one
     """
-    p = len(partners) - 1
-    y = partners[p]
+    y = partners[-1]
     best = no_hypothesis()
     # 3. Catalog pairs of the same separation.
     low, high, chord, gate = _pair_range(detections, sky, hub, y)
-    tolerance = gate / chord
-    side, side_gate, turn, ratio_gate = _other_sides(detections, hub, partners, tolerance)
-    # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
-    (last, hub_star, partner_star, before, partner_number, ratios, count) = links
-    pair = sky.pair
-    star = sky.vectors
-    mag = sky.mag
-    uncertain = detections.focal_uncertainty > 0
-    last_hub = faintest[hub]
-    last_y = faintest[y]
-    mag_hub = detections.mag[hub]
-    mag_y = detections.mag[y]
+    # 4. Triangles.
+    wanted = _wanted(detections, hub, partners, gate / chord)
+    limits = (faintest[hub], faintest[y], detections.mag[hub], detections.mag[y])
     mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if strict else np.inf
-    check_gates = np.empty(0)
-    order = np.empty(0, np.int64)
-    required = 0
+    chord = chord if detections.focal_uncertainty > 0 else 0.0
+    pairs = (sky.pair, sky.first, low, high, sky.bin_rad)
+    closed, steps = _close(
+        pairs, sky.vectors, sky.mag, limits, mag_gate, chord, wanted, links
+    )
+    checks[0] += 1 + steps // STEPS_PER_CHECK
+    if closed:
+        gates, order, required = trial(detections, hub, y, ACCEPT_DEX)
+    for n in range(closed):
+        i, k, q = vectors.row(links.closed, n)
+        left = order[order != partners[q]]
+        misses = MAX_MISSES if strict else len(left)
+        # 5. and 6. Quick check and evidence.
+        candidate = _test_pair(
+            detections, sky, (hub, y, i, k), gates, left, required, misses, checks
+        )
+        if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
+            return candidate
+        best = candidate if candidate.dex > best.dex else best
+    return best
+
+
+@jit
+def _close(
+    pairs: tuple[NDArray, NDArray, int, int, float],
+    star: Floats,
+    mag: Floats,
+    limits: tuple[int, int, float, float],
+    mag_gate: float,
+    chord: float,
+    wanted: Floats,
+    links: Links,
+) -> tuple[int, int]:
+    """Step 4: close triangles with the catalog pairs of the hub and its last partner, and link these pairs.
+
+    Parameters
+    ----------
+    pairs
+        Pairs of the sky index, the first entries of its cells, the first and the last cell of the wanted separation,
+        and the width of a cell
+    star, mag
+        Stars and their magnitudes
+    limits
+        Row of the faintest star of the hub and of the partner, and their magnitudes
+    mag_gate
+        Greatest difference of the magnitudes
+    chord
+        Chord between hub and partner if the focal length is uncertain, else 0
+    wanted
+        See `_wanted`
+    links
+        Pairs of the earlier partners. The new ones are added; triangles are written to `closed`
+
+    Returns
+    -------
+    tuple[int, int]
+        Number of triangles, and of comparisons
+    """
+    # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
+    pair, first, low, high, bin_rad = pairs
+    last, hub_star, partner_star, before, partner_number, ratios, total, closed = links
+    last_hub, last_partner, mag_hub, mag_partner = limits
+    p = len(wanted) - 1
     ratio = 1.0
+    count = total[0]
+    found = 0
     tests = 0
     for cell in range(low, high + 1):
-        if uncertain:
+        if chord > 0:
             # The angle of a cell's pairs is known to the width of the cell, much less than the gate.
-            ratio = chord / (2 * np.sin((cell + 0.5) * sky.bin_rad / 2))
-        for row in range(2 * sky.first[cell], 2 * sky.first[cell + 1]):
-            # 4. Each pair in both orders; ranks and magnitudes first, as they need no geometry.
+            ratio = chord / (2 * np.sin((cell + 0.5) * bin_rad / 2))
+        for row in range(2 * first[cell], 2 * first[cell + 1]):
+            # Each pair in both orders; ranks and magnitudes first, as they need no geometry.
             i = pair[row // 2, row % 2]
             k = pair[row // 2, 1 - row % 2]
-            if (
-                i > last_hub
-                or k > last_y
-                or not _alike(mag_hub - mag[i], mag_y - mag[k], mag_gate)
-            ):
+            if i > last_hub or k > last_partner:
+                continue
+            if not _alike(mag_hub - mag[i], mag_partner - mag[k], mag_gate):
                 continue
             entry = last[i]
             while entry:
@@ -394,52 +449,35 @@ def _test_partner(
                 entry = before[n]
                 q = partner_number[n]
                 tests += 1
-                if q == p or (uncertain and abs(ratios[n] / ratio - 1) > ratio_gate[q]):
+                if q == p or abs(ratios[n] / ratio - 1) > wanted[q, 3]:
                     continue
-                j = partner_star[n]
-                star_j = vectors.row(star, j)
+                star_j = vectors.row(star, partner_star[n])
                 star_k = vectors.row(star, k)
-                if abs(vectors.chord(star_j, star_k) * ratio - side[q]) > side_gate[q]:
+                if abs(vectors.chord(star_j, star_k) * ratio - wanted[q, 0]) > wanted[q, 1]:
                     continue
-                if (
-                    turn[q] * vectors.dot(vectors.row(star, i), vectors.cross(star_j, star_k))
-                    < 0
-                ):
+                normal = vectors.cross(star_j, star_k)
+                if wanted[q, 2] * vectors.dot(vectors.row(star, i), normal) < 0:
                     continue
-                # 5. and 6. Quick check and evidence.
-                if required == 0:
-                    check_gates, order, required = trial(detections, hub, y, ACCEPT_DEX)
-                candidate = _test_triangle(
-                    detections,
-                    sky,
-                    (hub, y, i, k),
-                    check_gates,
-                    order[order != partners[q]],
-                    required,
-                    MAX_MISSES if strict else len(order),
-                    checks,
-                )
-                if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
-                    return candidate
-                best = candidate if candidate.dex > best.dex else best
-            if count[0] < MAX_LINKS:
-                n = count[0]
-                hub_star[n] = i
-                partner_star[n] = k
-                partner_number[n] = p
-                ratios[n] = ratio
-                before[n] = last[i]
-                count[0] += 1
-                last[i] = count[0]
-    checks[0] += 1 + (tests + sky.first[high + 1] - sky.first[low]) // STEPS_PER_CHECK
-    return best
+                if found < len(closed):
+                    closed[found, 0] = i
+                    closed[found, 1] = k
+                    closed[found, 2] = q
+                    found += 1
+            if count < len(hub_star):
+                hub_star[count] = i
+                partner_star[count] = k
+                partner_number[count] = p
+                ratios[count] = ratio
+                before[count] = last[i]
+                count += 1
+                last[i] = count
+    total[0] = count
+    return found, tests + first[high + 1] - first[low]
 
 
 @jit
-def _other_sides(
-    detections: Detections, hub: int, partners: NDArray, tolerance: float
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Third sides of the triangles of a hub, its last partner, and each earlier partner.
+def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: float) -> Floats:
+    """What stars must satisfy to form the triangle of a hub, its last partner, and each earlier partner.
 
     An uncertain focal length follows from the side between the hub and the last partner, whose relative error is
     `tolerance`, and is compared with that from the other side at the hub. At the angle A from the boresight ratios of
@@ -447,41 +485,35 @@ def _other_sides(
 
     Returns
     -------
-    side, side_gate
-        (P,) chord between the two partners, and its greatest error
-    turn
-        (P,) triple product of hub, partner and last partner; 0 if its sign is uncertain
-    ratio_gate
-        (P,) greatest relative difference of the focal ratios of the two sides at the hub
+    Floats
+        (P, 4) of each partner: chord to the last one, its greatest error; triple product of hub, partner and last
+        partner, 0 if its sign is uncertain; greatest relative difference of the focal ratios of the sides at the hub
     """
     tangent = detections.tangent
     sigma = detections.sigma
-    count = len(partners)
-    side = np.empty(count)
-    side_gate = np.empty(count)
-    turn = np.empty(count)
-    ratio_gate = np.empty(count)
+    out = np.empty((len(partners), 4))
     y = partners[-1]
     u = FOCAL_MARGIN * detections.focal_uncertainty
     r2 = np.max(detections.field**2) + np.min(detections.field**2)
     slack = 2 * u * r2 / (1 + r2) + (tolerance if u > 0 else 0.0)
     ray_hub = ray(tangent, hub, 1.0)
     ray_y = ray(tangent, y, 1.0)
-    for q in range(count):
-        ray_x = ray(tangent, partners[q], 1.0)
+    for q in range(len(partners)):
+        x = partners[q]
+        ray_x = ray(tangent, x, 1.0)
         at_hub = vectors.chord(ray_hub, ray_x)
-        side[q] = vectors.chord(ray_x, ray_y)
-        side_gate[q] = GATE_SIGMA * hypot(sigma[partners[q]], sigma[y]) + slack * side[q]
-        ratio_gate[q] = GATE_SIGMA * hypot(sigma[partners[q]], sigma[hub]) / at_hub + slack
-        # The triple product is the longer side times the distance of the third corner, whose error is the gate.
-        turn[q] = vectors.dot(ray_hub, vectors.cross(ray_x, ray_y))
-        if abs(turn[q]) < side_gate[q] * max(at_hub, side[q]):
-            turn[q] = 0.0
-    return side, side_gate, turn, ratio_gate
+        side = vectors.chord(ray_x, ray_y)
+        out[q, 0] = side
+        out[q, 1] = GATE_SIGMA * hypot(sigma[x], sigma[y]) + slack * side
+        # The triple product is one side times the distance of the third corner from it, whose error is the gate.
+        product = vectors.dot(ray_hub, vectors.cross(ray_x, ray_y))
+        out[q, 2] = 0.0 if abs(product) < out[q, 1] * max(at_hub, side) else product
+        out[q, 3] = GATE_SIGMA * hypot(sigma[x], sigma[hub]) / at_hub + slack
+    return out
 
 
 @jit
-def _test_triangle(
+def _test_pair(
     detections: Detections,
     sky: SkyIndex,
     match: tuple[int, int, int, int],

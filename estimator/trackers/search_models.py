@@ -32,12 +32,12 @@ class SearchModel(NamedTuple):
     focal_uncertainty: float = 0.0
 
 
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, WRONG_FOCAL)
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 60_000, True, WRONG_FOCAL)
 CALIBRATED_SEARCHES = (
-    SearchModel(MIN_ERROR_PX, 0.0, 40_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 15_000),
     WRONG_FOCAL_SEARCH,
-    SearchModel(0.5, 0.0, 25_000),
-    SearchModel(MIN_ERROR_PX, 0.0, 100_000),
+    SearchModel(0.5, 0.0, 10_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 30_000),
 )
 UNCALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.catalog import sky_index
 from estimator.core.errors import ImageError
-from estimator.core.types import NO_SPREAD
+from estimator.core.types import NO_SPREAD, Centroids
 from estimator.core.vectors import quaternion_xyzw
 from estimator.identification import star_detections as detections_module
 from estimator.identification import star_evidence, star_search
@@ -340,7 +340,9 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
         np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)
     )
     for a, b in ((0, 1), (1, 2), (2, 3)):
-        begin, end, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
+        low, high, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
+        begin = SKY.first[low]
+        end = SKY.first[high + 1]
         rays = np.column_stack([PLACES[[a, b]], np.ones(2)])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         seen = np.arccos(rays[0] @ rays[1])
@@ -351,8 +353,9 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
         )
         assert begin <= possible.min()
         assert possible.max() < end
+        margin = star_evidence.FOCAL_MARGIN * zoom
         outside = angle[begin:end] - np.clip(
-            angle[begin:end], seen / (1 + zoom) - gate, seen / (1 - zoom) + gate
+            angle[begin:end], seen / (1 + margin) - gate, seen / (1 - margin) + gate
         )
         assert np.abs(outside).max() <= SKY.bin_rad
 
@@ -367,34 +370,72 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         )
 
 
-def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
+def test_pairs_cost_as_many_catalog_pairs_as_are_expected() -> None:
+    """Length, error and magnitudes; a light among others costs as much as it has neighbors, a short pair most."""
     detections = unequal()
-    length = PLAIN._pair_lengths(detections)
-    rarity = PLAIN._rarity(detections, SKY)
-    least = 0.2 * np.sqrt((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))
-    a, b = np.triu_indices(6, 1)
-    distance = np.linalg.norm(PLACES[a] - PLACES[b], axis=1)
-    np.testing.assert_allclose(
-        length[a, b][distance >= least], distance[distance >= least], rtol=1e-12
-    )
-    short = np.flatnonzero(distance < least)
-    assert len(short) > 1
-    assert (length[a, b][short] > 100 * least).all()
-    # The shorter, the later.
-    assert (np.argsort(length[a, b][short]) == np.argsort(-distance[short])).all()
-    for n in range(5):  # within four deviations of the magnitude
-        share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
+    cost, hubs = PLAIN._pair_costs(detections, SKY)
+    np.testing.assert_array_equal(cost, cost.T)
+    # The last one is 3 mrad from the first: both are crowded.
+    crowd = np.array([2, 1, 1, 1, 1, 2])
+    assert (np.sort(hubs) == np.arange(6)).all()
+    assert (np.diff(((np.arange(6) + 1) * crowd)[hubs]) >= 0).all()
+    distance = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
+    weight = cost / crowd[:, None] / crowd / distance / np.hypot(UNEQUAL[:, None], UNEQUAL)
+    share = weight[:5, 5] * weight[5, 4] / weight[4, 5]
+    for n in range(
+        1, 5
+    ):  # within four deviations of the magnitude; the last one's is unknown
+        within = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
         # The density at the middle, over a range of two magnitudes.
-        assert rarity[n] == pytest.approx(share, rel=0.35)
-    assert rarity[5] == 1
-    tried = np.zeros((6, 6), bool)
-    costs = []
-    for _ in range(15):
-        pair = PLAIN._next_pair(length, tried, rarity)
-        assert not tried[pair]
-        tried[pair] = True
-        costs.append(length[pair] * rarity[pair[0]] * rarity[pair[1]])
-    assert (np.diff(costs) >= 0).all()
+        assert share[n] == pytest.approx(within, rel=0.35)
+    assert np.argmax(np.where(np.isfinite(cost), cost, 0)) in (5, 30)
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.02])
+def test_every_triangle_of_the_catalog_that_fits_is_closed(zoom: float) -> None:
+    """Against all triples of 60 stars: the sides within 3.5 errors, for one focal length, and the same orientation."""
+    vectors, mag = random_sky(60, 6)
+    vectors = vectors * [0.05, 0.05, 0] + [0, 0, 1]
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = sky_index.build(vectors, mag, WIDE_RAD)
+    sigma = 2e-4
+    tangent = vectors[[7, 30, 41], :2] / vectors[[7, 30, 41], 2:] * (1 + zoom / 2)
+    lights = detections_of(tangent, np.full(3, np.nan), sigma, zoom)
+    rays = np.column_stack([tangent, np.ones(3)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    links = PLAIN._no_links(60)
+    partners = np.array([1, 2])
+    closed = []
+    for count in (1, 2):
+        low, high, chord, gate = PLAIN._pair_range(lights, sky, 0, count)
+        wanted = PLAIN._wanted(lights, 0, partners[:count], gate / chord)
+        pairs = (sky.pair, sky.first, low, high, sky.bin_rad)
+        limits = (60, 60, np.nan, np.nan)
+        found, _ = PLAIN._close(
+            pairs, vectors, mag, limits, np.inf, chord if zoom else 0.0, wanted, links
+        )
+        closed = [tuple(row) for row in links.closed[:found, :2].tolist()]
+    side = [np.linalg.norm(rays[m] - rays[n]) for m, n in ((0, 1), (0, 2), (1, 2))]
+    i, j, k = np.meshgrid(*[np.arange(60)] * 3, indexing="ij")
+    chords = [
+        np.linalg.norm(vectors[m] - vectors[n], axis=-1) for m, n in ((i, j), (i, k), (j, k))
+    ]
+    ratio = np.array(side)[:, None, None, None] / np.maximum(chords, 1e-9)
+    middle = ratio[1] if zoom else 1.0
+    fits = (i != j) & (j != k) & (i != k) & (abs(ratio[1] - 1) < zoom + 1e-4)
+    for measured, there in zip(side, chords, strict=True):
+        fits &= abs(there * middle - measured) < 3 * np.sqrt(2) * sigma
+    fits &= (
+        np.einsum("...x,...x", vectors[i], np.cross(vectors[j], vectors[k]))
+        * (rays[0] @ np.cross(rays[1], rays[2]))
+        > 0
+    )
+    expected = set(zip(i[fits].tolist(), k[fits].tolist(), strict=True))
+    assert (7, 41) in expected
+    assert expected <= set(closed)
+    assert len(closed) < 60**2 / 10
+    PLAIN._clear(links)
+    assert not links.last.any()
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.01])
@@ -443,9 +484,9 @@ def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
     sky = sky_index.build_without_pairs(
         (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
     )
-    order = CHECK.other_detections(6, 0, 1, 0)
+    order = CHECK.other_detections(np.arange(6.0), 0, 1)
     assert order.tolist() == [2, 3, 4, 5]
-    assert CHECK.other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
+    assert CHECK.other_detections(np.arange(6.0, 0, -1), 2, 4).tolist() == [5, 3, 1, 0]
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
     found = CHECK.quick_check(
         places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses
@@ -491,3 +532,53 @@ def test_the_limiting_magnitude_is_taken_at_the_median_light() -> None:
     assert lights.limit_mag == pytest.approx(20 - 2.5 * np.log10(300))
     assert changed(lights, 5, 4.0, 0.0).limit_mag == lights.limit_mag
     assert np.isnan(changed(lights, 4, 1.0, 0.0).limit_mag)
+
+
+def test_a_clump_displaces_no_light_elsewhere() -> None:
+    """Of 300 lights in one cell and 20 elsewhere, all fainter, the 20 are among 40; the brightest of each cell are."""
+    rng = np.random.default_rng(3)
+    clump = 0.01 * rng.random((300, 2))
+    alone = np.array(
+        [[x, y] for x in (0.3, 0.45, 0.6, 0.75, 0.9) for y in (0.2, 0.4, 0.6, 0.8)]
+    )
+    rows = detections_module.spread(np.vstack([clump, alone]), np.array([0.0, 1, 0, 1]), 40)
+    assert rows.tolist() == [*range(20), *range(300, 320)]
+    few = detections_module.spread(alone, np.array([0.0, 1, 0, 1]), 20)
+    assert few.tolist() == list(range(20))
+
+
+@pytest.mark.parametrize("ghost", [True, False])
+def test_double_images_become_one_light_whose_error_reaches_both(ghost: bool) -> None:
+    rng = np.random.default_rng(4)
+    true = np.array(
+        [[x, y] for x in range(100, 1000, 100) for y in range(100, 1000, 300)], float
+    )
+    offset = np.array([3.0, 4.0]) * 0.8
+    if not ghost:
+        angle = rng.uniform(0, 2 * np.pi, len(true))
+        offset = 4 * np.column_stack([np.cos(angle), np.sin(angle)])
+    seen = Centroids(
+        np.vstack([true, true + offset]), np.full(54, 0.1), np.linspace(54, 1, 54)
+    )
+    lights = detections_module.lights_of(seen, 1100, 1100, 100)
+    assert lights.rows.tolist() == list(range(27))
+    np.testing.assert_allclose(lights.centroids.xy_px, true + offset / 2, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(lights.centroids.sigma_px, np.hypot(2, 0.1), rtol=1e-12)
+    # The images of a reflection have the same error; 27 random directions cancel but for a part of about 1 / sqrt(27).
+    if ghost:
+        np.testing.assert_allclose(np.abs(lights.offset_px), [1.2, 1.6], rtol=1e-12)
+    else:
+        assert np.sum(lights.offset_px**2) < 2 * 4 * 3 / np.sqrt(27)
+
+
+def test_pairs_of_some_stars_and_of_chance_stay_apart() -> None:
+    """Ten double stars among 40 lights, and 4,000 lights of which most are near another one."""
+    rng = np.random.default_rng(5)
+    places = rng.uniform(0, 4000, (30, 2))
+    for size, xy_px in (
+        (4000, np.vstack([places, places[:10] + 3])),
+        (1000, rng.uniform(0, 1000, (4000, 2))),
+    ):
+        count = len(xy_px)
+        seen = Centroids(xy_px, np.full(count, 0.1), np.linspace(count, 1, count))
+        assert detections_module.lights_of(seen, size, size, count).centroids is seen
