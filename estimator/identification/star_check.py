@@ -42,12 +42,12 @@ def trial(
     gates
         (N,) matching radius of each detection, tangents
     order
-        (N - 2,) rows of the other detections by increasing gate: near the pair, chance matches are rare
+        (N - 2,) rows of the other detections
     required
         Number of matches, the pair included, without which the evidence cannot reach `min_dex`
     """
     gates = pair_gates(detections, a, b)
-    order = other_detections(gates, a, b)
+    order = other_detections(len(gates), a, b)
     pair_dex = attitude_dex(
         detections.tangent, detections.sigma, a, b, 8 * pi * pi, detections.focal_uncertainty
     )
@@ -85,10 +85,10 @@ def pair_gates(detections: Detections, a: int, b: int) -> Floats:
 
 
 @jit
-def other_detections(gates: Floats, a: int, b: int) -> NDArray[np.int64]:
-    """Rows of all N detections but a and b, by increasing gate (N,): (N - 2,)."""
-    order = np.argsort(gates)
-    return order[(order != a) & (order != b)]
+def other_detections(total: int, a: int, b: int) -> NDArray[np.int64]:
+    """Rows of all N detections but a and b: (N - 2,)."""
+    rows = np.arange(total)
+    return rows[(rows != a) & (rows != b)]
 
 
 @jit
@@ -103,7 +103,6 @@ def quick_check(
     gates: Floats,
     order: NDArray,
     required: int,
-    max_misses: int,
 ) -> tuple[int, bool]:
     """Look up detections at an attitude, until it is clear whether enough of them have a star nearby.
 
@@ -123,8 +122,6 @@ def quick_check(
         Rows of the detections that are not matched yet, in the order of the look-ups
     required
         Number of matches wanted, with those that are matched already
-    max_misses
-        Number of look-ups without any match after which the candidate is dropped
 
     Returns
     -------
@@ -134,10 +131,9 @@ def quick_check(
         Whether `required` is reached
     """
     remaining = len(order)
-    start = count = len(gates) - remaining
+    count = len(gates) - remaining
     for step in range(remaining):
-        # Out of reach, or too many misses at the start.
-        if count + remaining - step < required or (step >= max_misses and count == start):
+        if count + remaining - step < required:
             return step, False
         # The star nearest to the detection's direction in the catalog's frame.
         n = order[step]

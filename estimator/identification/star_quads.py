@@ -264,7 +264,7 @@ def _test_match(
     gates, order, required = star_check.trial(detections, a, b, star_search.DECISIVE_DEX)
     grid = sky.cell_first, sky.cell_star, sky.side
     lookups, fits = star_check.quick_check(
-        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)
+        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required
     )
     checks[0] += 1 + lookups
     if not fits:

@@ -87,7 +87,6 @@ WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the ca
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried
 )
-MAX_MISSES = 12  # detections without a star after which the first round drops a candidate
 PARTNERS = 10  # of a hub in the first round; twice as many in the second
 MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
 MAX_CLOSED = 2**12  # triangles of a hub and one partner
@@ -340,8 +339,7 @@ def _test_partner(
     hub, partners
         Row of the hub, and rows of its partners so far
     strict
-        Whether stars outside of the magnitude gate are skipped, and a candidate is dropped after MAX_MISSES more
-        detections without a star
+        Whether stars outside of the magnitude gate are skipped
     faintest
         (N,) row of the faintest star that each detection may be
     links
@@ -375,11 +373,8 @@ def _test_partner(
     for n in range(closed):
         i, k, q = vectors.row(links.closed, n)
         left = order[order != partners[q]]
-        misses = MAX_MISSES if strict else len(left)
         # 5. and 6. Quick check and evidence.
-        candidate = _test_pair(
-            detections, sky, (hub, y, i, k), gates, left, required, misses, checks
-        )
+        candidate = _test_pair(detections, sky, (hub, y, i, k), gates, left, required, checks)
         if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
             return candidate
         best = candidate if candidate.dex > best.dex else best
@@ -520,7 +515,6 @@ def _test_pair(
     gates: Floats,
     order: NDArray,
     required: int,
-    max_misses: int,
     checks: NDArray,
 ) -> Hypothesis:
     """Steps 5 and 6: the hypothesis that two detections are two stars.
@@ -529,7 +523,7 @@ def _test_pair(
     ----------
     match
         Rows of the detections a and b, and of their stars
-    gates, order, required, max_misses
+    gates, order, required
         See `star_check`
     checks
         (1,) effort so far, increased in place
@@ -567,7 +561,6 @@ def _test_pair(
         gates,
         order,
         required,
-        max_misses,
     )
     checks[0] += 1 + lookups
     if not fits:

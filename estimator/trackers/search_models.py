@@ -33,11 +33,15 @@ class SearchModel(NamedTuple):
 
 
 WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 60_000, True, WRONG_FOCAL)
+# Short searches for each way in which a frame can be unlike its model, and then longer ones
 CALIBRATED_SEARCHES = (
+    SearchModel(MIN_ERROR_PX, 0.0, 600),
+    SearchModel(MIN_ERROR_PX, 0.0, 1_500, True, WRONG_FOCAL),
+    SearchModel(0.5, 0.0, 600),
     SearchModel(MIN_ERROR_PX, 0.0, 15_000),
     WRONG_FOCAL_SEARCH,
     SearchModel(0.5, 0.0, 10_000),
-    SearchModel(MIN_ERROR_PX, 0.0, 30_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
 )
 UNCALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),

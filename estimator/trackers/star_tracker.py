@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.attitude.systematic import with_focal_error
+from estimator.attitude.wahba import matrix_of
 from estimator.catalog import catalog, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
@@ -31,7 +32,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.identification import star_quads, star_search
+from estimator.identification import star_evidence, star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import advice
 from estimator.identification.star_detections import (
@@ -39,6 +40,7 @@ from estimator.identification.star_detections import (
     Sensor,
     detections_of,
     flat_centroids,
+    gates_of,
     lights_of,
 )
 from estimator.identification.star_evidence import Solution
@@ -529,12 +531,23 @@ class StarTracker(FrameTracker):
         at_once = not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s)
         if at_once and misfit.are_small(sigma_px / self.camera.focal_px):
             lights = flat_centroids(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, self.sky, most, model.max_checks)
+            solution, variance = misfit.identify(
+                lights, self.sensor, self.sky, most, model.max_checks
+            )
+            if model.min_error_px == MIN_ERROR_PX or not len(solution.star):
+                return solution, variance
+            # The larger errors have found the attitude; the residuals tell the errors.
+            claimed = self.detections(centroids, self.sigma_px(centroids))
+            R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+            found = star_evidence.evaluate(
+                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
+            )
+            solution = star_evidence.build_solution(claimed, self.sky, found)
+            return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return star_search.lost_in_space(
-                detections, self.sky, most, model.max_checks
-            ), 0.0
+            solution = star_search.lost_in_space(detections, self.sky, most, model.max_checks)
+            return solution, 0.0
         known = not self.focal_uncertainty
         solution = star_quads.identify(
             detections, self.quads, self.sky, most, model.max_checks, known

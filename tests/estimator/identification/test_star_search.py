@@ -373,22 +373,22 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
 def test_pairs_cost_as_many_catalog_pairs_as_are_expected() -> None:
     """Length, error and magnitudes; a light among others costs as much as it has neighbors, a short pair most."""
     detections = unequal()
-    cost, hubs = PLAIN._pair_costs(detections, SKY)
-    np.testing.assert_array_equal(cost, cost.T)
+    cost, hubs = PLAIN._pair_costs(detections._replace(mag=np.full(6, np.nan)), SKY)
     # The last one is 3 mrad from the first: both are crowded.
     crowd = np.array([2, 1, 1, 1, 1, 2])
-    assert (np.sort(hubs) == np.arange(6)).all()
-    assert (np.diff(((np.arange(6) + 1) * crowd)[hubs]) >= 0).all()
     distance = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
-    weight = cost / crowd[:, None] / crowd / distance / np.hypot(UNEQUAL[:, None], UNEQUAL)
-    share = weight[:5, 5] * weight[5, 4] / weight[4, 5]
+    expected = distance * np.hypot(UNEQUAL[:, None], UNEQUAL) * crowd[:, None] * crowd
+    far = distance > 0.01
+    np.testing.assert_allclose(cost[far], expected[far], rtol=1e-12)
+    assert cost[0, 5] == cost[5, 0] > 100 * expected.max()
+    assert (np.diff(((np.arange(6) + 1) * crowd)[hubs]) >= 0).all()
+    known, _ = PLAIN._pair_costs(detections, SKY)
     for n in range(
         1, 5
     ):  # within four deviations of the magnitude; the last one's is unknown
-        within = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
+        share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
         # The density at the middle, over a range of two magnitudes.
-        assert share[n] == pytest.approx(within, rel=0.35)
-    assert np.argmax(np.where(np.isfinite(cost), cost, 0)) in (5, 30)
+        assert known[n, 5] / cost[n, 5] == pytest.approx(share, rel=0.35)
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.02])
@@ -462,18 +462,17 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("true", "required", "max_misses", "lookups", "fits"),
+    ("true", "required", "lookups", "fits"),
     [
-        ("TTTT", 6, 9, 4, True),
-        ("TTTT", 4, 9, 2, True),
-        ("FFTT", 4, 9, 4, True),
-        ("FFTT", 4, 2, 2, False),  # two misses at first
-        ("TFFT", 5, 9, 3, False),  # out of reach
-        ("FFFF", 3, 9, 4, False),
+        ("TTTT", 6, 4, True),
+        ("TTTT", 4, 2, True),
+        ("FFTT", 4, 4, True),
+        ("TFFT", 5, 3, False),  # out of reach
+        ("FFFF", 3, 4, False),
     ],
 )
 def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
-    true: str, required: int, max_misses: int, lookups: int, fits: bool
+    true: str, required: int, lookups: int, fits: bool
 ) -> None:
     """Four detections beside the pair, with (T) and without (F) a star at their place."""
     places = np.vstack(
@@ -484,12 +483,11 @@ def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
     sky = sky_index.build_without_pairs(
         (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
     )
-    order = CHECK.other_detections(np.arange(6.0), 0, 1)
+    order = CHECK.other_detections(6, 0, 1)
     assert order.tolist() == [2, 3, 4, 5]
-    assert CHECK.other_detections(np.arange(6.0, 0, -1), 2, 4).tolist() == [5, 3, 1, 0]
     tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
     found = CHECK.quick_check(
-        places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses
+        places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required
     )
     assert found == (lookups, fits)
 
@@ -498,13 +496,14 @@ def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
 def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
     limit_mag: float, matches: int
 ) -> None:
-    """Four exact stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
+    """Four stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
     rng = np.random.default_rng(4)
     truth = Rotation.random(rng=rng)
-    tangent, mag, _ = observe(truth, rng)
+    sigma = 6 * SIGMA
+    tangent, mag, _ = observe(truth, rng, sigma)
     false = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (100, 2))
     lights = detections_of(
-        np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0))
+        np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0)), sigma
     )
     few = changed(lights, 4, 1.0, 0.0)
     candidate = star_evidence.evaluate(
@@ -572,12 +571,12 @@ def test_double_images_become_one_light_whose_error_reaches_both(ghost: bool) ->
 
 
 def test_pairs_of_some_stars_and_of_chance_stay_apart() -> None:
-    """Ten double stars among 40 lights, and 4,000 lights of which most are near another one."""
+    """Ten double stars among 40 lights, and 1,500 lights of which most are near another one."""
     rng = np.random.default_rng(5)
     places = rng.uniform(0, 4000, (30, 2))
     for size, xy_px in (
         (4000, np.vstack([places, places[:10] + 3])),
-        (1000, rng.uniform(0, 1000, (4000, 2))),
+        (200, rng.uniform(0, 200, (1500, 2))),
     ):
         count = len(xy_px)
         seen = Centroids(xy_px, np.full(count, 0.1), np.linspace(count, 1, count))
