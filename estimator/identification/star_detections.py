@@ -17,7 +17,7 @@ from estimator.core.camera import Distortion, undistorted
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import NO_SPREAD, Centroids
-from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.chance import GATE_SIGMA, middle, squared_separation
 
 DOUBLE_PX = 6.0  # greatest distance of double images
 CELLS = 6  # along each side of the field, in which the brightest lights are chosen
@@ -134,9 +134,10 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     """The lights of a frame that are identified: not too many, and double images as one light.
 
     1. Of more than `most` centroids the brightest of each part of the field are taken (`spread`).
-    2. If at least a third of them are within DOUBLE_PX of a brighter one, and no more than an eighth by chance, the
-       images are double, by vibration or a reflection, and either image may be the true one. The members of a group
-       become one light at their mean place, whose error reaches to the farthest member, or as far as in the median.
+    2. Lights within DOUBLE_PX of a brighter one form a group with it. If at least half of the groups are pairs, and no
+       more than an eighth of the lights are so close by chance, the images are double, by vibration or a reflection,
+       and either image may be the true one. The members of a group become one light at their mean place, whose error
+       reaches to the farthest member, or as far as in the median.
     3. The images of a reflection are all displaced alike. The second moments of the displacements then have unequal
        eigenvalues, and their difference is the variance of an error that is common to all lights.
     """
@@ -147,14 +148,14 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
         centroids = centroids.take(rows)
     # 2. Double images
     head = brighter_within(centroids.xy_px, DOUBLE_PX)
-    second = np.flatnonzero(head < np.arange(len(head)))
+    first, group, members = np.unique(head, return_inverse=True, return_counts=True)
     by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
-    if 3 * len(second) < len(head) or by_chance > 1 / 8:
+    if 2 * np.sum(members == 2) < len(first) or by_chance > 1 / 8:
         return Lights(centroids, rows, np.zeros(2))
-    first, group = np.unique(head, return_inverse=True)
     mean_px = np.stack([np.bincount(group, x) for x in centroids.xy_px.T], axis=1)
-    mean_px /= np.bincount(group)[:, None]
+    mean_px /= members[:, None]
     offset_px = centroids.xy_px - mean_px[group]
+    second = np.flatnonzero(head < np.arange(len(head)))
     reach2_px2 = np.zeros(len(first))
     np.maximum.at(reach2_px2, group, np.sum(offset_px**2, axis=1))
     # A light without a second image may be either of its images, too.
@@ -237,28 +238,17 @@ def detections_of(
 
 
 @jit
-def changed(
-    detections: Detections, count: int, variance: float, focal_uncertainty: float
-) -> Detections:
-    """The first `count` detections, with their variances multiplied by a factor and another focal uncertainty."""
-    sigma = np.empty(count)
-    weight = np.empty((count, 3))
-    factor = sqrt(variance)
-    # The inverse covariance falls as the variance grows.
-    for n in range(count):
-        sigma[n] = detections.sigma[n] * factor
-        for k in range(3):
-            weight[n, k] = detections.weight[n, k] / variance
-    # A part of the detections has no limiting magnitude.
+def changed(detections: Detections, variance: float, focal_uncertainty: float) -> Detections:
+    """The detections, with their variances multiplied by a factor and another focal uncertainty."""
     return Detections(
-        detections.tangent[:count],
-        sigma,
-        weight,
-        detections.mag[:count],
+        detections.tangent,
+        detections.sigma * sqrt(variance),
+        detections.weight / variance,
+        detections.mag,
         detections.mag_sigma,
         detections.field,
         focal_uncertainty,
-        detections.limit_mag if count == len(detections.sigma) else np.nan,
+        detections.limit_mag,
     )
 
 
@@ -305,7 +295,7 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
 
 @jit
 def chosen(detections: Detections, rows: NDArray) -> Detections:
-    """The detections of some rows."""
+    """The detections of some rows. A part of the detections has no limiting magnitude."""
     return Detections(
         detections.tangent[rows],
         detections.sigma[rows],
@@ -325,6 +315,35 @@ def gates_of(detections: Detections, factor: float) -> Floats:
     for n in range(len(gates)):
         gates[n] = factor * GATE_SIGMA * detections.sigma[n]
     return gates
+
+
+@jit
+def pair_gates(detections: Detections, a: int, b: int) -> Floats:
+    """Matching radius of each detection at the attitude of a pair: its own error and that of the attitude.
+
+        gate_n = GATE_SIGMA sqrt(s_n^2 + (sa^2 + sb^2) / 4 + (sa^2 + sb^2) d_n^2 / D^2)
+
+    The second term is the variance of the pair's midpoint. The third is that of its direction, and of its relative
+    length (for an uncertain focal length), which grows with the squared distance d_n from the midpoint; D is the
+    separation.
+
+    Returns
+    -------
+    Floats
+        (N,) tangents
+    """
+    tangent = detections.tangent
+    x, y = middle(tangent, a, b)
+    pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
+    direction_variance = pair_variance / squared_separation(tangent, a, b)
+    out = np.empty(len(detections.sigma))
+    for n in range(len(out)):
+        distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        # The detection's variance, that of the midpoint, and that of the direction at this distance.
+        out[n] = GATE_SIGMA * sqrt(
+            detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
+        )
+    return out
 
 
 def information_of(weight: Floats) -> Floats:

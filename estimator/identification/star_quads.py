@@ -9,10 +9,9 @@ The steps; the same numbers return as comments in the code:
 1. Take four detections, by brightness: the four brightest, then all fours with the fifth, and so on (`_search`).
 2. Call the two farthest apart A and B, and compute the code (`_test_quad`).
 3. Look up the catalog quads whose codes differ by no more than the gate (`_code_gate`).
-4. Compute the focal ratio and the attitude from A, B and their stars (`_test_match`).
-5. Quick check of the other detections (`star_check.quick_check`).
-6. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
-7. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
+4. Compute the focal ratio and the attitude from A, B and their stars (`star_search.pair_hypothesis`).
+5. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
+6. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
 """
 
 import numpy as np
@@ -23,14 +22,12 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.identification import star_check, star_search
+from estimator.identification import star_search
 from estimator.identification.chance import GATE_SIGMA
-from estimator.identification.star_detections import Detections, changed, ray
+from estimator.identification.star_detections import Detections, chosen, ray, spread
 from estimator.identification.star_evidence import (
-    FOCAL_MARGIN,
     Hypothesis,
     Solution,
-    evaluate,
     no_hypothesis,
 )
 
@@ -66,21 +63,19 @@ def identify(
     Solution
         Empty if no candidate reaches DECISIVE_DEX
     """
-    count = min(max_detections, len(detections.sigma))
-    searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-    best = _search(searched, quads, stars, max_checks)
-    # 7. Fit to all detections.
-    # The last argument matters for a calibrated camera only. A literal False would be compiled as another type.
-    return star_search.fit_to_all(
-        detections, stars, best, star_search.DECISIVE_DEX, calibrated, not calibrated
+    searched = chosen(
+        detections, spread(detections.tangent, detections.field, max_detections)
     )
+    best = _search(searched, quads, stars, max_checks)
+    # 6. Fit to all detections.
+    return star_search.fit_to_all(detections, stars, best, calibrated)
 
 
 @jit
 def _search(
     detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int
 ) -> Hypothesis:
-    """Steps 1 to 6: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
+    """Steps 1 to 5: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
     quad = np.empty(4, np.int64)
     checks = np.zeros(1, np.int64)
     # 1. Row d is the faintest of the four: every quad of brighter detections comes before any with a fainter one.
@@ -105,7 +100,7 @@ def _search(
 def _test_quad(
     detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
 ) -> Hypothesis:
-    """Steps 2 to 6: test four detections against every catalog quad of the same code.
+    """Steps 2 to 5: test four detections against every catalog quad of the same code.
 
     Parameters
     ----------
@@ -136,6 +131,7 @@ def _test_quad(
         frame, ray(detections.tangent, quad[3], 1.0), length
     )
     quad_index.arrange(code, quad)
+    a, b = quad[0], quad[1]
     # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)
     low = np.empty(4, np.int64)
@@ -152,9 +148,11 @@ def _test_quad(
                     checks[0] += 1
                     if not _alike(quads.code, q, code, gate):
                         continue
-                    # 4. to 6. Test the attitude of this quad.
-                    candidate = _test_match(
-                        detections, sky, quad, quads.star[q], length, checks
+                    # 4. and 5. Test the attitude of this quad.
+                    checks[0] += star_search.EVALUATION_COST
+                    stars = quads.star[q]
+                    candidate = star_search.pair_hypothesis(
+                        detections, sky, (a, b, stars[0], stars[1]), star_search.DECISIVE_DEX
                     )
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
@@ -223,54 +221,3 @@ def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
         sigma = max(sigma, detections.sigma[n])
         r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
     return GATE_SIGMA * sigma / length + detections.focal_uncertainty * r2 / (1 + r2)
-
-
-@jit
-def _test_match(
-    detections: Detections, sky: SkyIndex, quad: Ints, star: Ints, length: float, checks: Ints
-) -> Hypothesis:
-    """Steps 4 to 6: the hypothesis that four detections are four stars.
-
-    Parameters
-    ----------
-    quad, star
-        (4,) rows of the detections and of the stars: A, B, C, D
-    length
-        Chord between detections A and B
-    checks
-        (1,) effort so far, increased in place
-
-    Returns
-    -------
-    Hypothesis
-        Empty if the focal length, the quick check or the evidence refutes it
-    """
-    tangent = detections.tangent
-    a = quad[0]
-    b = quad[1]
-    star_a = vectors.row(sky.vectors, star[0])
-    star_b = vectors.row(sky.vectors, star[1])
-    # 4. The focal ratio and the attitude from A and B.
-    ratio = star_search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
-    if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
-        return no_hypothesis()
-    in_cam = np.empty((3, 3))
-    in_ref = np.empty((3, 3))
-    R_ref_from_cam = np.empty((3, 3))
-    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
-    vectors.pair_frame(star_a, star_b, in_ref)
-    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-    # 5. Quick check of the other detections.
-    gates, order, required = star_check.trial(detections, a, b, star_search.DECISIVE_DEX)
-    grid = sky.cell_first, sky.cell_star, sky.side
-    lookups, fits = star_check.quick_check(
-        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required
-    )
-    checks[0] += 1 + lookups
-    if not fits:
-        return no_hypothesis()
-    # 6. Evidence.
-    checks[0] += star_search.EVALUATION_COST
-    return evaluate(
-        detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX
-    )

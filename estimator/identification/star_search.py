@@ -2,9 +2,9 @@
 
 A detection (the hub) and two others form a triangle. Three catalog stars with the same three separations and the same
 orientation determine an attitude. If it is the true one, the other detections have catalog stars at their predicted
-directions. A quick check counts these stars. The Bayes factor (`star_evidence`) then decides whether chance could have
-placed them there. If the focal length is uncertain, each side also determines it, from the ratio of the measured to the
-catalog separation, and the sides and the other detections must agree.
+directions. The Bayes factor (`star_evidence`) decides whether chance could have placed them there. If the focal length
+is uncertain, each side also determines it, from the ratio of the measured to the catalog separation, and the sides and
+the other detections must agree.
 
 The catalog lists pairs of stars by their separation (after the Pyramid algorithm, Mortari et al. 2004, Navigation 51,
 171). The pairs of the hub and one partner are linked to the star of the hub. Only those pairs of the hub and another
@@ -18,23 +18,22 @@ The steps; the same numbers return as comments in the code:
    to match (`search`, `_pair_costs`).
 3. Look up the catalog pairs of the separation of hub and partner within GATE_SIGMA (`_pair_range`).
 4. Close triangles with the pairs of earlier partners (`_test_partner`).
-5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`star_check`).
+5. Take the attitude of one side (`pair_hypothesis`).
 6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
 7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
 9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
 
-Steps 2 to 7 are repeated with more partners and less strict checks if they find nothing.
 Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
-from math import hypot, pi, sqrt
+from math import hypot, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of, magnitude_density
+from estimator.catalog.sky_index import SkyIndex, cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -43,13 +42,13 @@ from estimator.identification.chance import (
     GATE_SIGMA,
     separation,
 )
-from estimator.identification.star_check import quick_check, trial
 from estimator.identification.star_detections import (
     Detections,
     changed,
     chosen,
     field_area,
     gates_of,
+    pair_gates,
     ray,
     spread,
 )
@@ -71,15 +70,10 @@ NO_RIVAL_DEX = (
 # Effort to find rivals of an accepted attitude: a multiple of the effort so far, plus a number of star look-ups.
 RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
-MAG_GATE_SIGMA = (
-    4.0  # greatest difference of magnitudes in the first round, in standard deviations
-)
+MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes, in standard deviations
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
-EVALUATION_COST = 6
+EVALUATION_COST = 40
 SHORTEST = 0.07  # of the field's size: shorter pairs are tried last
-# The star of detection r is one of the RANK_MARGIN + RANK_FACTOR r brightest per field.
-RANK_MARGIN = 8
-RANK_FACTOR = 3
 WRONG_FOCAL = (
     0.05  # greatest relative error of a calibrated focal length that step 9 can find
 )
@@ -87,7 +81,7 @@ WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the ca
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried
 )
-PARTNERS = 10  # of a hub in the first round; twice as many in the second
+PARTNERS = 12  # of a hub
 MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
 MAX_CLOSED = 2**12  # triangles of a hub and one partner
 STEPS_PER_CHECK = 16  # comparisons of catalog pairs that take as long as a star look-up
@@ -116,7 +110,6 @@ def lost_in_space(
         Empty if the search finds nothing beyond chance, or if all detections together do not confirm what it finds
     """
     # 1. Choose the detections to search with.
-    total = len(detections.sigma)
     searched = chosen(
         detections, spread(detections.tangent, detections.field, max_detections)
     )
@@ -124,15 +117,13 @@ def lost_in_space(
     candidate = search(searched, stars, max_checks)
     # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
     calibrated = detections.focal_uncertainty == 0
-    free = changed(detections, total, 1.0, WRONG_FOCAL) if calibrated else detections
-    return fit_to_all(free, stars, candidate, ACCEPT_DEX, calibrated, max_detections >= total)
+    free = changed(detections, 1.0, WRONG_FOCAL) if calibrated else detections
+    return fit_to_all(free, stars, candidate, calibrated)
 
 
 @jit
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
-
-    The first round is strict (see `_test_partner`); the second one is not, and has more partners.
 
     Parameters
     ----------
@@ -144,49 +135,37 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     Hypothesis
         The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
-    cost, hubs = _pair_costs(detections, sky)
+    cost, hubs = _pair_costs(detections)
     best = no_hypothesis()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     limit = max_checks
     links = _no_links(len(sky.vectors))
-    for strict in (True, False):
-        faintest = _faintest_stars(detections, sky, strict)
-        for hub in hubs:
-            # 2. A hub, and the partners of the least cost.
-            partners = np.argsort(cost[hub])[: PARTNERS if strict else 2 * PARTNERS]
-            for p in range(min(len(partners), len(hubs) - 1)):
-                # 3. to 6. Test the triangles of the hub, this partner and an earlier one.
-                candidate = _test_partner(
-                    detections,
-                    sky,
-                    hub,
-                    partners[: p + 1],
-                    strict,
-                    faintest,
-                    links,
-                    best,
-                    checks,
-                )
-                same = _same_attitude(candidate, best)
-                if candidate.dex > best.dex:
-                    # The previous best becomes a rival unless it is the same attitude.
-                    rival_dex = rival_dex if same else max(rival_dex, best.dex)
-                    if best.dex < ACCEPT_DEX <= candidate.dex:
-                        limit = min(
-                            max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT
-                        )
-                    best = candidate
-                elif not same:
-                    rival_dex = max(rival_dex, candidate.dex)
-                # 7. A decisive attitude needs no search for rivals.
-                if best.dex >= DECISIVE_DEX:
-                    return best
-                if checks[0] > limit:
-                    break
-            _clear(links)
+    for hub in hubs:
+        # 2. A hub, and the partners of the least cost.
+        partners = np.argsort(cost[hub])[:PARTNERS]
+        for p in range(min(len(partners), len(hubs) - 1)):
+            # 3. to 6. Test the triangles of the hub, this partner and an earlier one.
+            candidate = _test_partner(
+                detections, sky, hub, partners[: p + 1], links, best, checks
+            )
+            same = _same_attitude(candidate, best)
+            if candidate.dex > best.dex:
+                # The previous best becomes a rival unless it is the same attitude.
+                rival_dex = rival_dex if same else max(rival_dex, best.dex)
+                if best.dex < ACCEPT_DEX <= candidate.dex:
+                    limit = min(max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT)
+                best = candidate
+            elif not same:
+                rival_dex = max(rival_dex, candidate.dex)
+            # 7. A decisive attitude needs no search for rivals.
+            if best.dex >= DECISIVE_DEX:
+                return best
             if checks[0] > limit:
                 break
+        _clear(links)
+        if checks[0] > limit:
+            break
     # 8. A weaker attitude must be significant, and clearly better than any other.
     if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
         return best
@@ -208,13 +187,13 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 
 @jit
-def _pair_costs(detections: Detections, sky: SkyIndex) -> tuple[Floats, NDArray]:
+def _pair_costs(detections: Detections) -> tuple[Floats, NDArray]:
     """Costs of all pairs of detections, and the order of the hubs.
 
-        cost = s_ab sqrt(sa^2 + sb^2) f_a f_b c_a c_b
+        cost = s_ab sqrt(sa^2 + sb^2) c_a c_b
 
-    The expected number of catalog pairs in a gate grows with the separation s_ab, with the width of the gate, and with
-    the fractions f of the catalog's stars that the magnitudes allow. A detection among c - 1 others within SHORTEST of
+    The expected number of catalog pairs in a gate grows with the separation s_ab and with the width of the gate. A
+    detection among c - 1 others within SHORTEST of
     the field is less probably a star the more there are: a clump of false lights counts as one. A pair shorter than
     SHORTEST hardly determines the roll: it is given a separation beyond all others, the greater the shorter it is.
 
@@ -228,7 +207,6 @@ def _pair_costs(detections: Detections, sky: SkyIndex) -> tuple[Floats, NDArray]
     total = len(detections.sigma)
     min_length = SHORTEST * sqrt(field_area(detections))
     crowd = np.ones(total)
-    allowed = np.ones(total)
     cost = np.full((total, total), np.inf)
     for a in range(total):
         for b in range(a + 1, total):
@@ -239,32 +217,11 @@ def _pair_costs(detections: Detections, sky: SkyIndex) -> tuple[Floats, NDArray]
                 crowd[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
             cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
-    for n in range(total):
-        if np.isfinite(detections.mag[n]):
-            # The gate's full width times the density of magnitudes; the small constant keeps every cost above 0.
-            density = magnitude_density(sky, detections.mag[n])
-            allowed[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
     for a in range(total):
         for b in range(a + 1, total):
-            cost[a, b] *= allowed[a] * crowd[a] * allowed[b] * crowd[b]
+            cost[a, b] *= crowd[a] * crowd[b]
             cost[b, a] = cost[a, b]
     return cost, np.argsort((np.arange(total) + 1) * crowd)
-
-
-@jit
-def _faintest_stars(detections: Detections, sky: SkyIndex, strict: bool) -> NDArray:
-    """(N,) row of the faintest star that each detection may be: the catalog's stars are sorted by brightness, too.
-
-    False detections only increase the rank of a star among the detections, brightest first. The star of the detection
-    r, from 0, is therefore not much fainter than the r brightest stars of a field. RANK_FACTOR allows for fields with
-    fewer stars than the mean, RANK_MARGIN for the scatter of counts and magnitudes. Without `strict`, any star.
-    """
-    out = np.full(len(detections.sigma), len(sky.vectors))
-    if strict:
-        fields = 4 * pi / field_area(detections)
-        for n in range(len(out)):
-            out[n] = int(min((RANK_MARGIN + RANK_FACTOR * n) * fields, 1e9))
-    return out
 
 
 class Links(NamedTuple):
@@ -281,7 +238,7 @@ class Links(NamedTuple):
     count
         (1,) number of entries
     closed
-        (T, 3) of each triangle that was closed last: stars of the hub and of the last partner, and number of the other
+        (T, 2) of each triangle that was closed last: stars of the hub and of the last partner
     """
 
     last: NDArray[np.int32]
@@ -305,7 +262,7 @@ def _no_links(stars: int) -> Links:
         np.empty(MAX_LINKS, np.int32),
         np.empty(MAX_LINKS),
         np.zeros(1, np.int64),
-        np.empty((MAX_CLOSED, 3), np.int64),
+        np.empty((MAX_CLOSED, 2), np.int64),
     )
 
 
@@ -323,8 +280,6 @@ def _test_partner(
     sky: SkyIndex,
     hub: int,
     partners: NDArray,
-    strict: bool,
-    faintest: NDArray,
     links: Links,
     previous: Hypothesis,
     checks: NDArray,
@@ -338,10 +293,6 @@ def _test_partner(
     ----------
     hub, partners
         Row of the hub, and rows of its partners so far
-    strict
-        Whether stars outside of the magnitude gate are skipped
-    faintest
-        (N,) row of the faintest star that each detection may be
     links
         Pairs of the hub with its partners, to which those of the last one are added
     previous
@@ -360,21 +311,17 @@ def _test_partner(
     low, high, chord, gate = _pair_range(detections, sky, hub, y)
     # 4. Triangles.
     wanted = _wanted(detections, hub, partners, gate / chord)
-    limits = (faintest[hub], faintest[y], detections.mag[hub], detections.mag[y])
-    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if strict else np.inf
+    mags = (detections.mag[hub], detections.mag[y], MAG_GATE_SIGMA * detections.mag_sigma)
     chord = chord if detections.focal_uncertainty > 0 else 0.0
     pairs = (sky.pair, sky.first, low, high, sky.bin_rad)
-    closed, steps = _close(
-        pairs, sky.vectors, sky.mag, limits, mag_gate, chord, wanted, links
-    )
+    closed, steps = _close(pairs, sky.vectors, sky.mag, mags, chord, wanted, links)
     checks[0] += 1 + steps // STEPS_PER_CHECK
-    if closed:
-        gates, order, required = trial(detections, hub, y, ACCEPT_DEX)
     for n in range(closed):
-        i, k, q = vectors.row(links.closed, n)
-        left = order[order != partners[q]]
-        # 5. and 6. Quick check and evidence.
-        candidate = _test_pair(detections, sky, (hub, y, i, k), gates, left, required, checks)
+        # 5. and 6. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
+        checks[0] += EVALUATION_COST
+        candidate = pair_hypothesis(
+            detections, sky, (hub, y, links.closed[n, 0], links.closed[n, 1]), NO_RIVAL_DEX
+        )
         if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
             return candidate
         best = candidate if candidate.dex > best.dex else best
@@ -386,8 +333,7 @@ def _close(
     pairs: tuple[NDArray, NDArray, int, int, float],
     star: Floats,
     mag: Floats,
-    limits: tuple[int, int, float, float],
-    mag_gate: float,
+    mags: tuple[float, float, float],
     chord: float,
     wanted: Floats,
     links: Links,
@@ -401,10 +347,8 @@ def _close(
         and the width of a cell
     star, mag
         Stars and their magnitudes
-    limits
-        Row of the faintest star of the hub and of the partner, and their magnitudes
-    mag_gate
-        Greatest difference of the magnitudes
+    mags
+        Magnitudes of the hub and of the partner, and their greatest error
     chord
         Chord between hub and partner if the focal length is uncertain, else 0
     wanted
@@ -420,7 +364,7 @@ def _close(
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     pair, first, low, high, bin_rad = pairs
     last, hub_star, partner_star, before, partner_number, ratios, total, closed = links
-    last_hub, last_partner, mag_hub, mag_partner = limits
+    mag_hub, mag_partner, mag_gate = mags
     p = len(wanted) - 1
     ratio = 1.0
     count = total[0]
@@ -431,11 +375,9 @@ def _close(
             # The angle of a cell's pairs is known to the width of the cell, much less than the gate.
             ratio = chord / (2 * np.sin((cell + 0.5) * bin_rad / 2))
         for row in range(2 * first[cell], 2 * first[cell + 1]):
-            # Each pair in both orders; ranks and magnitudes first, as they need no geometry.
+            # Each pair in both orders; magnitudes first, as they need no geometry.
             i = pair[row // 2, row % 2]
             k = pair[row // 2, 1 - row % 2]
-            if i > last_hub or k > last_partner:
-                continue
             if not _alike(mag_hub - mag[i], mag_partner - mag[k], mag_gate):
                 continue
             entry = last[i]
@@ -456,7 +398,6 @@ def _close(
                 if found < len(closed):
                     closed[found, 0] = i
                     closed[found, 1] = k
-                    closed[found, 2] = q
                     found += 1
             if count < len(hub_star):
                 hub_star[count] = i
@@ -508,30 +449,25 @@ def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: floa
 
 
 @jit
-def _test_pair(
+def pair_hypothesis(
     detections: Detections,
     sky: SkyIndex,
     match: tuple[int, int, int, int],
-    gates: Floats,
-    order: NDArray,
-    required: int,
-    checks: NDArray,
+    min_dex: float,
 ) -> Hypothesis:
-    """Steps 5 and 6: the hypothesis that two detections are two stars.
+    """The hypothesis that two detections are two stars, with all others that match at the attitude of these two.
 
     Parameters
     ----------
     match
         Rows of the detections a and b, and of their stars
-    gates, order, required
-        See `star_check`
-    checks
-        (1,) effort so far, increased in place
+    min_dex
+        Least evidence of interest
 
     Returns
     -------
     Hypothesis
-        Empty if the focal length, the quick check or the evidence refutes it
+        Empty if the focal length or the evidence refutes it
     """
     a, b, i, j = match
     tangent = detections.tangent
@@ -543,31 +479,16 @@ def _test_pair(
         ratio = fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
         if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
             return no_hypothesis()
-    # The attitude turns the axes of the detections into those of the stars.
+    # The attitude turns the axes of the stars into those of the detections.
     in_cam = np.empty((3, 3))
     in_ref = np.empty((3, 3))
-    R_ref_from_cam = np.empty((3, 3))
+    R_cam_from_ref = np.empty((3, 3))
     vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
     vectors.pair_frame(star_a, star_b, in_ref)
-    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-    # 5. Quick check.
-    grid = sky.cell_first, sky.cell_star, sky.side
-    lookups, fits = quick_check(
-        tangent,
-        sky.vectors,
-        *grid,
-        R_ref_from_cam,
-        ratio,
-        gates,
-        order,
-        required,
+    vectors.multiply_transposed(in_cam, in_ref, R_cam_from_ref)
+    return evaluate(
+        detections, sky, R_cam_from_ref, ratio, pair_gates(detections, a, b), min_dex
     )
-    checks[0] += 1 + lookups
-    if not fits:
-        return no_hypothesis()
-    # 6. Evidence. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
-    checks[0] += EVALUATION_COST
-    return evaluate(detections, sky, R_ref_from_cam.T.copy(), ratio, gates, NO_RIVAL_DEX)
 
 
 @jit
@@ -637,9 +558,7 @@ def fit_to_all(
     detections: Detections,
     stars: SkyIndex,
     candidate: Hypothesis,
-    accept_dex: float,
     calibrated: bool,
-    whole: bool,
 ) -> Solution:
     """Step 9: fit a candidate attitude of some detections to all detections and all stars.
 
@@ -650,46 +569,36 @@ def fit_to_all(
     ----------
     detections
         All detections, with the focal uncertainty of the free fit
-    candidate, accept_dex
-        Best hypothesis of the search, and its least evidence, log10
+    candidate
+        Best hypothesis of the search
     calibrated
         Whether the focal length is calibrated
-    whole
-        Whether the candidate already is the calibrated fit to all detections
 
     Returns
     -------
     Solution
-        Empty if the candidate has less than `accept_dex`, if the full field keeps no more than half of its matches, or
+        Empty if the candidate is, if the full field keeps no more than half of its matches, or
         if all detections together are not beyond chance
     """
-    if not candidate.dex >= accept_dex:
-        return build_solution(detections, stars, no_hypothesis())
-    chosen = detections
+    if not len(candidate.star):
+        return build_solution(detections, stars, candidate)
+    fitted_to = detections
     full = no_hypothesis()
     # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.
     gates = gates_of(detections, 1.5)
     R = candidate.R_cam_from_ref
-    free = True
     if calibrated:
         # 9a. The fit with the calibrated focal length.
-        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
-        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
-        # If all detections match there is none that another focal length could match.
-        free = (
-            len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
-        )
-    if free:
+        fitted_to = changed(detections, 1.0, 0.0)
+        full = evaluate(fitted_to, stars, R.copy(), 1.0, gates, -np.inf)
+    # If all detections match there is none that another focal length could match.
+    if len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX:
         # 9b. The fit with a free focal length.
         fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)
         if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
-            chosen = detections
+            fitted_to = detections
             full = fitted
     # 9c. Refuse what all detections together do not confirm.
     if 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
-        return build_solution(chosen, stars, no_hypothesis())
-    dex = max(full.dex, candidate.dex)
-    best = Hypothesis(
-        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
-    )
-    return build_solution(chosen, stars, best)
+        full = no_hypothesis()
+    return build_solution(fitted_to, stars, full)

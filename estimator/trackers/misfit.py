@@ -100,9 +100,7 @@ def widened(
     dex = np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
-        wide = changed(
-            detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty
-        )
+        wide = changed(detections, TRIED[n], detections.focal_uncertainty)
         found = star_evidence.evaluate(
             wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf
         )
