@@ -152,8 +152,8 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
     if 2 * np.sum(members == 2) < len(first) or by_chance > 1 / 8:
         return Lights(centroids, rows, np.zeros(2))
-    mean_px = np.stack([np.bincount(group, x) for x in centroids.xy_px.T], axis=1)
-    mean_px /= members[:, None]
+    sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
+    mean_px = np.stack(sums_px, axis=1) / members[:, None]
     offset_px = centroids.xy_px - mean_px[group]
     second = np.flatnonzero(head < np.arange(len(head)))
     reach2_px2 = np.zeros(len(first))

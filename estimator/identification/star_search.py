@@ -235,7 +235,7 @@ class Links(NamedTuple):
         (L,) of each entry: star of the hub, star of the partner, and the entry before it of the same hub, plus 1
     partner, ratio
         (L,) number of the partner, and the focal ratio by the separation
-    count
+    total
         (1,) number of entries
     closed
         (T, 2) of each triangle that was closed last: stars of the hub and of the last partner
@@ -247,7 +247,7 @@ class Links(NamedTuple):
     previous: NDArray[np.int32]
     partner: NDArray[np.int32]
     ratio: Floats
-    count: NDArray[np.int64]
+    total: NDArray[np.int64]
     closed: NDArray[np.int64]
 
 
@@ -269,9 +269,9 @@ def _no_links(stars: int) -> Links:
 @jit
 def _clear(links: Links) -> None:
     """Remove all entries."""
-    for n in range(links.count[0]):
+    for n in range(links.total[0]):
         links.last[links.hub[n]] = 0
-    links.count[0] = 0
+    links.total[0] = 0
 
 
 @jit
