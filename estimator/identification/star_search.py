@@ -72,7 +72,7 @@ RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
 MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes, in standard deviations
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
-EVALUATION_COST = 40
+EVALUATION_COST = 15
 SHORTEST = 0.07  # of the field's size: shorter pairs are tried last
 WRONG_FOCAL = (
     0.05  # greatest relative error of a calibrated focal length that step 9 can find

@@ -18,7 +18,7 @@ class SearchModel(NamedTuple):
     relative_error
         Additional error, as a fraction of the distance from the principal point
     max_checks
-        Largest number of star look-ups; 400,000 take about 0.02 s
+        Bound on the effort; 50,000 take about 0.01 s
     by_quads
         Whether quads are searched in place of pairs
     focal_uncertainty
@@ -32,7 +32,7 @@ class SearchModel(NamedTuple):
     focal_uncertainty: float = 0.0
 
 
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 60_000, True, WRONG_FOCAL)
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 40_000, True, WRONG_FOCAL)
 # Short searches for each way in which a frame can be unlike its model, and then longer ones
 CALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 600),
