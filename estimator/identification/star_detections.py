@@ -4,17 +4,23 @@ A centroid in pixels becomes a tangent (x / z, y / z) in camera axes, with the i
 the fit and the error of its worst axis, which sets its matching radius.
 """
 
+from dataclasses import replace
 from math import hypot, log10, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.camera import Distortion, undistorted
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import NO_SPREAD, Centroids
-from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.chance import GATE_SIGMA, middle, squared_separation
+
+DOUBLE_PX = 6.0  # greatest distance of double images
+CELLS = 6  # along each side of the field, in which the brightest lights are chosen
 
 
 class Detections(NamedTuple):
@@ -109,6 +115,85 @@ def flat_centroids(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
     )
 
 
+class Lights(NamedTuple):
+    """The lights of a frame that are identified.
+
+    Attributes
+    ----------
+    centroids
+        Their centroids
+    rows
+        (N,) rows of the frame's centroids: of each light's brightest image
+    offset_px
+        (2,) standard deviation along x and y of the common error of double images
+    """
+
+    centroids: Centroids
+    rows: NDArray[np.int64]
+    offset_px: Floats
+
+
+def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) -> Lights:
+    """The lights of a frame that are identified: not too many, and double images as one light.
+
+    1. Of more than `most` centroids the brightest of each part of the field are taken (`spread`).
+    2. Lights within DOUBLE_PX of a brighter one form a group with it. If at least half of the groups are pairs, and no
+       more than an eighth of the lights are so close by chance, the images are double, by vibration or a reflection,
+       and either image may be the true one. The members of a group become one light at their mean place, whose error
+       reaches to the farthest member, or as far as in the median.
+    3. The images of a reflection are all displaced alike. The second moments of the displacements then have unequal
+       eigenvalues, and their difference is the variance of an error that is common to all lights.
+    """
+    # 1. Number
+    field = np.array([0.0, width_px, 0.0, height_px])
+    rows = spread(centroids.xy_px, field, most)
+    if len(rows) < len(centroids):
+        centroids = centroids.take(rows)
+    # 2. Double images
+    head = brighter_within(centroids.xy_px, DOUBLE_PX)
+    first, group, members = np.unique(head, return_inverse=True, return_counts=True)
+    by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
+    if 2 * np.sum(members == 2) < len(first) or by_chance > 1 / 8:
+        return Lights(centroids, rows, np.zeros(2))
+    sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
+    mean_px = np.stack(sums_px, axis=1) / members[:, None]
+    offset_px = centroids.xy_px - mean_px[group]
+    second = np.flatnonzero(head < np.arange(len(head)))
+    reach2_px2 = np.zeros(len(first))
+    np.maximum.at(reach2_px2, group, np.sum(offset_px**2, axis=1))
+    # A light without a second image may be either of its images, too.
+    reach2_px2 = np.maximum(reach2_px2, np.median(np.sum(offset_px[second] ** 2, axis=1)))
+    merged = centroids.take(first)
+    spread_px2 = merged.covariance_px2
+    if spread_px2 is not None:
+        spread_px2 = spread_px2 + reach2_px2[:, None, None] * np.eye(2)
+    merged = replace(
+        merged,
+        xy_px=mean_px,
+        sigma_px=np.sqrt(merged.sigma_px**2 + reach2_px2),
+        covariance_px2=spread_px2,
+    )
+    # 3. Common error
+    second_px = offset_px[second]
+    variance, axes = np.linalg.eigh(second_px.T @ second_px / len(second))
+    common_px = np.sqrt(variance[1] - variance[0]) * axes[:, 1]
+    return Lights(merged, rows[first], common_px)
+
+
+@jit
+def brighter_within(xy_px: Floats, reach_px: float) -> NDArray[np.int64]:
+    """(N,) row of the brightest light within reach that is not itself near a brighter one, or else the own row."""
+    head = np.arange(len(xy_px))
+    for n in range(len(xy_px)):
+        for m in range(n):
+            dx = xy_px[n, 0] - xy_px[m, 0]
+            dy = xy_px[n, 1] - xy_px[m, 1]
+            if head[m] == m and dx * dx + dy * dy < reach_px * reach_px:
+                head[n] = m
+                break
+    return head
+
+
 @jit
 def detections_of(
     lights: FlatCentroids, sensor: Sensor, focal_uncertainty: float
@@ -158,28 +243,73 @@ def detections_of(
 
 
 @jit
-def changed(
-    detections: Detections, count: int, variance: float, focal_uncertainty: float
-) -> Detections:
-    """The first `count` detections, with their variances multiplied by a factor and another focal uncertainty."""
-    sigma = np.empty(count)
-    weight = np.empty((count, 3))
-    factor = sqrt(variance)
-    # The inverse covariance falls as the variance grows.
-    for n in range(count):
-        sigma[n] = detections.sigma[n] * factor
-        for k in range(3):
-            weight[n, k] = detections.weight[n, k] / variance
-    # A part of the detections has no limiting magnitude.
+def changed(detections: Detections, variance: float, focal_uncertainty: float) -> Detections:
+    """The detections, with their variances multiplied by a factor and another focal uncertainty."""
     return Detections(
-        detections.tangent[:count],
-        sigma,
-        weight,
-        detections.mag[:count],
+        detections.tangent,
+        detections.sigma * sqrt(variance),
+        detections.weight / variance,
+        detections.mag,
         detections.mag_sigma,
         detections.field,
         focal_uncertainty,
-        detections.limit_mag if count == len(detections.sigma) else np.nan,
+        detections.limit_mag,
+    )
+
+
+@jit
+def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
+    """Rows of `count` lights, the brightest of each part of the field: a clump of false lights displaces no other.
+
+    The field is divided into CELLS x CELLS cells. First come the brightest lights of all cells, then the second
+    brightest, and so on.
+
+    Parameters
+    ----------
+    places
+        (N, 2) positions, brightest first
+    field
+        (4,) edges of the sensor in the same unit: left, right, top, bottom
+
+    Returns
+    -------
+    NDArray
+        Rows by decreasing brightness; all rows if there are no more than `count`
+    """
+    if len(places) <= count:
+        return np.arange(len(places))
+    used = np.zeros(CELLS * CELLS, np.int64)
+    rank = np.empty(len(places), np.int64)
+    for n in range(len(places)):
+        column = cell_of(CELLS * (places[n, 0] - field[0]) / (field[1] - field[0]), CELLS - 1)
+        row = cell_of(CELLS * (places[n, 1] - field[2]) / (field[3] - field[2]), CELLS - 1)
+        cell = row * CELLS + column
+        rank[n] = used[cell]
+        used[cell] += 1
+    keep = np.zeros(len(places), np.bool_)
+    taken = 0
+    level = 0
+    while taken < count:
+        for n in range(len(places)):
+            if rank[n] == level and taken < count:
+                keep[n] = True
+                taken += 1
+        level += 1
+    return np.flatnonzero(keep)
+
+
+@jit
+def chosen(detections: Detections, rows: NDArray) -> Detections:
+    """The detections of some rows. A part of the detections has no limiting magnitude."""
+    return Detections(
+        detections.tangent[rows],
+        detections.sigma[rows],
+        detections.weight[rows],
+        detections.mag[rows],
+        detections.mag_sigma,
+        detections.field,
+        detections.focal_uncertainty,
+        detections.limit_mag if len(rows) == len(detections.sigma) else np.nan,
     )
 
 
@@ -190,6 +320,35 @@ def gates_of(detections: Detections, factor: float) -> Floats:
     for n in range(len(gates)):
         gates[n] = factor * GATE_SIGMA * detections.sigma[n]
     return gates
+
+
+@jit
+def pair_gates(detections: Detections, a: int, b: int) -> Floats:
+    """Matching radius of each detection at the attitude of a pair: its own error and that of the attitude.
+
+        gate_n = GATE_SIGMA sqrt(s_n^2 + (sa^2 + sb^2) / 4 + (sa^2 + sb^2) d_n^2 / D^2)
+
+    The second term is the variance of the pair's midpoint. The third is that of its direction, and of its relative
+    length (for an uncertain focal length), which grows with the squared distance d_n from the midpoint; D is the
+    separation.
+
+    Returns
+    -------
+    Floats
+        (N,) tangents
+    """
+    tangent = detections.tangent
+    x, y = middle(tangent, a, b)
+    pair_variance = detections.sigma[a] ** 2 + detections.sigma[b] ** 2
+    direction_variance = pair_variance / squared_separation(tangent, a, b)
+    out = np.empty(len(detections.sigma))
+    for n in range(len(out)):
+        distance2 = (tangent[n, 0] - x) ** 2 + (tangent[n, 1] - y) ** 2
+        # The detection's variance, that of the midpoint, and that of the direction at this distance.
+        out[n] = GATE_SIGMA * sqrt(
+            detections.sigma[n] ** 2 + pair_variance / 4 + direction_variance * distance2
+        )
+    return out
 
 
 def information_of(weight: Floats) -> Floats:

@@ -25,7 +25,7 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 5. Compute the evidence (`_evidence`), and count the missing stars (`_count_missing`).
 """
 
-from math import log, log10, pi, sqrt
+from math import lgamma, log, log10, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +51,9 @@ from estimator.identification.star_detections import Detections, field_area, gat
 MAG_OUTLIER_FRACTION = 0.05
 # Penalty for each detection brighter than the faintest match that is unmatched, in excess of the number of matches.
 UNMATCHED_PENALTY_DEX = 0.5
+UNMATCHED_SHARE = 0.5  # of the evidence that this penalty takes at most
+# Greatest difference of the focal length from the assumed one, in units of its uncertainty.
+FOCAL_MARGIN = 1.2
 # Fraction of the field in which an unmatched star counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.97
 
@@ -175,7 +178,7 @@ def evaluate(
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if n < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
-            if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
+            if abs(focal_ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
             if n == 1 and fall < CONVERGED_CHI2:
                 break
@@ -476,8 +479,9 @@ def _evidence(
     Returns
     -------
     float
-        dex. Unmatched detections cost nothing as long as they are no more than the matches; each further one among the
-        detections brighter than the faintest match costs UNMATCHED_PENALTY_DEX
+        dex, of all detections or of the brightest ones down to any match, whichever is greater. Unmatched detections
+        cost nothing as long as they are no more than the matches; each further one among the detections brighter than
+        that match costs UNMATCHED_PENALTY_DEX
     """
     # Attitude and focal length: (2 pi)^(n/2) / sqrt(det info) over the prior volume.
     count = 4 if detections.focal_uncertainty > 0 else 3
@@ -488,21 +492,43 @@ def _evidence(
         total -= log10(factor[i, i])
     # Positions and magnitudes of the matched detections.
     fraction_brighter = _fraction_brighter(sky, detections.mag)
-    last = np.int64(0)
+    lights = len(detections.sigma)
+    prefix = np.int64(0)
+    best = -np.inf
     for k in range(len(observed)):
-        # Every number of false detections is equally probable a priori, so that n of them against n - m contribute the
-        # ratio n! / (n - m)!: the density drops by one detection per match.
-        density = (len(detections.sigma) - k) / field_area(detections)
-        last = max(last, observed[k])
+        prefix = max(prefix, observed[k] + 1)
         xx, yy, xy = vectors.row(detections.weight, observed[k])
         ratio = _magnitude_ratio(detections, sky, observed[k], star[k], fraction_brighter)
-        total += log10(ratio * sqrt(xx * yy - xy * xy) / (2 * pi * density))
+        total += log10(ratio * sqrt(xx * yy - xy * xy) / (2 * pi) * field_area(detections))
         if with_residuals:
             distance2 = squared_mahalanobis(
                 detections, sky, R, focal_ratio, observed[k], star[k]
             )
             total -= distance2 / 2 / log(10.0)
-    return total - UNMATCHED_PENALTY_DEX * max(last + 1 - 2.0 * len(observed), 0.0)
+        if k + 1 >= MIN_EVIDENCE_MATCHES:
+            # Only the detections down to this one count; any number of them is equally probable.
+            dex = total - log10(lights) - _ways_dex(prefix, k + 1)
+            best = max(best, dex - _unmatched_dex(prefix, k + 1, dex))
+    # All detections count.
+    dex = total - _ways_dex(lights, len(observed))
+    return max(best, dex - _unmatched_dex(prefix, len(observed), dex))
+
+
+@jit
+def _unmatched_dex(lights: int, matched: int, dex: float) -> float:
+    """Penalty of unmatched detections in excess of the matches, of `lights` detections with the evidence `dex`."""
+    excess = max(lights - 2.0 * matched, 0.0)
+    return min(UNMATCHED_PENALTY_DEX * excess, UNMATCHED_SHARE * max(dex, 0.0))
+
+
+@jit
+def _ways_dex(lights: int, matched: int) -> float:
+    """log10 of lights! / (lights - matched)!, the number of ways to choose the detections of the matched stars.
+
+    Every number of false detections is equally probable a priori: of n detections, m matches leave n - m false ones,
+    and the density drops by one detection per match.
+    """
+    return (lgamma(lights + 1.0) - lgamma(lights - matched + 1.0)) / log(10.0)
 
 
 @jit

@@ -9,13 +9,10 @@ The steps; the same numbers return as comments in the code:
 1. Take four detections, by brightness: the four brightest, then all fours with the fifth, and so on (`_search`).
 2. Call the two farthest apart A and B, and compute the code (`_test_quad`).
 3. Look up the catalog quads whose codes differ by no more than the gate (`_code_gate`).
-4. Compute the focal ratio and the attitude from A, B and their stars (`_test_match`).
-5. Quick check of the other detections (`star_check.quick_check`).
-6. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
-7. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
+4. Compute the focal ratio and the attitude from A, B and their stars (`star_search.pair_hypothesis`).
+5. Match all detections, fit, and compute the Bayes factor (`star_evidence.evaluate`).
+6. Stop at the first candidate with DECISIVE_DEX, and fit it to all detections (`star_search.fit_to_all`).
 """
-
-from math import hypot, sqrt
 
 import numpy as np
 
@@ -25,19 +22,15 @@ from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.identification import star_check, star_search
+from estimator.identification import star_search
 from estimator.identification.chance import GATE_SIGMA
-from estimator.identification.star_detections import Detections, changed, ray
+from estimator.identification.star_detections import Detections, chosen, ray, spread
 from estimator.identification.star_evidence import (
     Hypothesis,
     Solution,
-    evaluate,
     no_hypothesis,
 )
 
-# Quads compared before the search by pairs, for each catalog pair in a mean gate.
-QUAD_EFFORT = 25.0
-MAG_SHARE = 0.1  # share of the catalog's pairs that known magnitudes allow
 COMBINED = 24  # number of brightest detections that are combined to quads
 
 
@@ -70,57 +63,19 @@ def identify(
     Solution
         Empty if no candidate reaches DECISIVE_DEX
     """
-    count = min(max_detections, len(detections.sigma))
-    searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-    best = _search(searched, quads, stars, max_checks, calibrated)
-    # 7. Fit to all detections, unless that is done.
-    whole = best.focal_ratio == 1 and count == len(detections.sigma)
-    return star_search.fit_to_all(
-        detections, stars, best, star_search.DECISIVE_DEX, calibrated, whole
+    searched = chosen(
+        detections, spread(detections.tangent, detections.field, max_detections)
     )
-
-
-@jit
-def quads_or_pairs(
-    detections: Detections,
-    quads: QuadIndex,
-    stars: SkyIndex,
-    max_detections: int,
-    max_checks: int,
-) -> Solution:
-    """Identify the detections of a calibrated camera: by a short search for quads, then by pairs.
-
-    A code leaves a few candidates of a whole sky, a separation hundreds: where four of the brightest lights are stars
-    of the index, quads take half of the time for a field of 15 degrees, and a hundredth for one of 2.6 degrees. They
-    get an effort in proportion to that of a pair of lights: in a gate of the width g are g / (greatest separation) of
-    the catalog's pairs, and the share MAG_SHARE of these if magnitudes are known.
-
-    Parameters
-    ----------
-    max_checks
-        Bound on the effort of the search by pairs
-    """
-    gate = 2 * GATE_SIGMA * sqrt(2.0) * detections.sigma[0]
-    candidates = len(stars.pair) * gate / (stars.bin_rad * (len(stars.first) - 1))
-    if np.isfinite(detections.mag[0]):
-        candidates *= MAG_SHARE
-    checks = int(min(QUAD_EFFORT * candidates, 2.0 * max_checks))
-    free = changed(detections, len(detections.sigma), 1.0, star_search.WRONG_FOCAL)
-    solution = identify(free, quads, stars, max_detections, checks, True)
-    if len(solution.star):
-        return solution
-    return star_search.lost_in_space(detections, stars, max_detections, max_checks)
+    best = _search(searched, quads, stars, max_checks)
+    # 6. Fit to all detections.
+    return star_search.fit_to_all(detections, stars, best, calibrated)
 
 
 @jit
 def _search(
-    detections: Detections,
-    quads: QuadIndex,
-    sky: SkyIndex,
-    max_checks: int,
-    calibrated: bool,
+    detections: Detections, quads: QuadIndex, sky: SkyIndex, max_checks: int
 ) -> Hypothesis:
-    """Steps 1 to 6: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
+    """Steps 1 to 5: the first hypothesis of the quads with DECISIVE_DEX, or else the empty one."""
     quad = np.empty(4, np.int64)
     checks = np.zeros(1, np.int64)
     # 1. Row d is the faintest of the four: every quad of brighter detections comes before any with a fainter one.
@@ -132,32 +87,25 @@ def _search(
                     quad[1] = b
                     quad[2] = c
                     quad[3] = d
-                    candidate = _test_quad(detections, quads, sky, quad, calibrated, checks)
+                    candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
                     # Give up when the effort is used up.
                     if checks[0] > max_checks:
-                        return no_hypothesis()
+                        return no_hypothesis(np.nan)
     return no_hypothesis()
 
 
 @jit
 def _test_quad(
-    detections: Detections,
-    quads: QuadIndex,
-    sky: SkyIndex,
-    quad: Ints,
-    calibrated: bool,
-    checks: Ints,
+    detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
 ) -> Hypothesis:
-    """Steps 2 to 6: test four detections against every catalog quad of the same code.
+    """Steps 2 to 5: test four detections against every catalog quad of the same code.
 
     Parameters
     ----------
     quad
         (4,) rows of the detections, reordered in place to A, B, C, D
-    calibrated
-        See `identify`
     checks
         (1,) effort so far, increased in place
 
@@ -183,6 +131,7 @@ def _test_quad(
         frame, ray(detections.tangent, quad[3], 1.0), length
     )
     quad_index.arrange(code, quad)
+    a, b = quad[0], quad[1]
     # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)
     low = np.empty(4, np.int64)
@@ -199,9 +148,11 @@ def _test_quad(
                     checks[0] += 1
                     if not _alike(quads.code, q, code, gate):
                         continue
-                    # 4. to 6. Test the attitude of this quad.
-                    candidate = _test_match(
-                        detections, sky, quad, quads.star[q], length, calibrated, checks
+                    # 4. and 5. Test the attitude of this quad.
+                    checks[0] += star_search.EVALUATION_COST
+                    stars = quads.star[q]
+                    candidate = star_search.pair_hypothesis(
+                        detections, sky, (a, b, stars[0], stars[1]), star_search.DECISIVE_DEX
                     )
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
@@ -270,66 +221,3 @@ def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
         sigma = max(sigma, detections.sigma[n])
         r2 = max(r2, detections.tangent[n, 0] ** 2 + detections.tangent[n, 1] ** 2)
     return GATE_SIGMA * sigma / length + detections.focal_uncertainty * r2 / (1 + r2)
-
-
-@jit
-def _test_match(
-    detections: Detections,
-    sky: SkyIndex,
-    quad: Ints,
-    star: Ints,
-    length: float,
-    calibrated: bool,
-    checks: Ints,
-) -> Hypothesis:
-    """Steps 4 to 6: the hypothesis that four detections are four stars.
-
-    Parameters
-    ----------
-    quad, star
-        (4,) rows of the detections and of the stars: A, B, C, D
-    length
-        Chord between detections A and B
-    calibrated
-        Whether the focal length should be right: it is not fitted where it agrees with A and B
-    checks
-        (1,) effort so far, increased in place
-
-    Returns
-    -------
-    Hypothesis
-        Empty if the focal length, the quick check or the evidence refutes it
-    """
-    tangent = detections.tangent
-    a = quad[0]
-    b = quad[1]
-    star_a = vectors.row(sky.vectors, star[0])
-    star_b = vectors.row(sky.vectors, star[1])
-    # 4. The focal ratio and the attitude from A and B.
-    ratio = star_search.fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
-    if abs(ratio - 1) > detections.focal_uncertainty:
-        return no_hypothesis()
-    in_cam = np.empty((3, 3))
-    in_ref = np.empty((3, 3))
-    R_ref_from_cam = np.empty((3, 3))
-    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
-    vectors.pair_frame(star_a, star_b, in_ref)
-    vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-    # 5. Quick check of the other detections.
-    gates, order, required = star_check.trial(detections, a, b, 0, star_search.DECISIVE_DEX)
-    grid = sky.cell_first, sky.cell_star, sky.side
-    lookups, fits = star_check.quick_check(
-        tangent, sky.vectors, *grid, R_ref_from_cam, ratio, gates, order, required, len(gates)
-    )
-    checks[0] += 1 + lookups
-    if not fits:
-        return no_hypothesis()
-    # 6. Evidence.
-    gate = GATE_SIGMA * hypot(detections.sigma[a], detections.sigma[b])
-    if calibrated and abs(ratio - 1) * length < gate:
-        ratio = 1.0
-        detections = changed(detections, len(gates), 1.0, 0.0)
-    checks[0] += star_search.EVALUATION_COST
-    return evaluate(
-        detections, sky, R_ref_from_cam.T.copy(), ratio, gates, star_search.DECISIVE_DEX
-    )

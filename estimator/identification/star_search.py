@@ -1,46 +1,59 @@
-"""Lost-in-space star identification by pair hypotheses and a Bayes factor: the default method.
+"""Lost-in-space star identification by triangle hypotheses and a Bayes factor: the default method.
 
-Two detections and two catalog stars with the same angular separation determine an attitude. If it is the true one, the
-other detections have catalog stars at their predicted directions. A quick check counts these stars. The Bayes factor
-(`star_evidence`) then decides whether chance could have placed them there. If the focal length is uncertain, each pair
-also determines it, from the ratio of the measured to the catalog separation, and the other detections must confirm
-both.
+A detection (the hub) and two others form a triangle. Three catalog stars with the same three separations and the same
+orientation determine an attitude. If it is the true one, the other detections have catalog stars at their predicted
+directions. The Bayes factor (`star_evidence`) decides whether chance could have placed them there. If the focal length
+is uncertain, each side also determines it, from the ratio of the measured to the catalog separation, and the sides and
+the other detections must agree.
+
+The catalog lists pairs of stars by their separation (after the Pyramid algorithm, Mortari et al. 2004, Navigation 51,
+171). The pairs of the hub and one partner are linked to the star of the hub. Only those pairs of the hub and another
+partner that have the same star form a triangle, and most of these have a third side of another length. No star is
+therefore looked up by its direction before the triangle is closed.
 
 The steps; the same numbers return as comments in the code:
 
-1. Choose the detections and the effort: the FEW brightest first, then up to `max_detections` (`lost_in_space`).
-2. Take the pair of detections that the fewest catalog pairs are expected to match (`search`).
-3. Look up the catalog pairs of the same separation within GATE_SIGMA (`_pair_range`).
-4. For each catalog pair, in both orders (`_test_pair`):
-   reject it by its magnitudes and its separation, and compute the focal ratio and the attitude.
-5. Quick check: look up the other detections, until enough of them or too few have a star nearby (`star_check`).
+1. Choose up to `max_detections` detections, the brightest of each part of the field (`star_detections.spread`).
+2. Take a hub, bright and not in a clump first, and its partners, those first that the fewest catalog pairs are expected
+   to match (`search`, `_pair_costs`).
+3. Look up the catalog pairs of the separation of hub and partner within GATE_SIGMA (`_pair_range`).
+4. Close triangles with the pairs of earlier partners (`_test_partner`).
+5. Take the attitude of one side (`pair_hypothesis`).
 6. Match all detections, fit the attitude and compute its Bayes factor (`star_evidence.evaluate`).
 7. Stop at DECISIVE_DEX. From ACCEPT_DEX on, continue only to find rivals, with limited effort (`search`).
 8. Accept an attitude that passes ACCEPT_DEX and beats every other one by MARGIN_DEX (`search`).
 9. Fit the attitude to all detections, with the calibrated and with a free focal length (`fit_to_all`).
 
-Steps 2 to 8 are repeated with more detections, or with less strict quick checks, if they find nothing.
 Angles in the image are tangents; `ref` is the frame of the catalog's vectors.
 """
 
-from math import log10, sqrt
+from math import hypot, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.catalog.sky_index import SkyIndex, cell_of, magnitude_density
+from estimator.catalog.sky_index import SkyIndex, cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
-    SHORT_PAIR,
     separation,
 )
-from estimator.identification.star_check import quick_check, trial
-from estimator.identification.star_detections import Detections, changed, gates_of, ray
+from estimator.identification.star_detections import (
+    Detections,
+    changed,
+    chosen,
+    field_area,
+    gates_of,
+    pair_gates,
+    ray,
+    spread,
+)
 from estimator.identification.star_evidence import (
+    FOCAL_MARGIN,
     Hypothesis,
     Solution,
     build_solution,
@@ -57,15 +70,10 @@ NO_RIVAL_DEX = (
 # Effort to find rivals of an accepted attitude: a multiple of the effort so far, plus a number of star look-ups.
 RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
-MAG_GATE_SIGMA = (
-    4.0  # greatest difference of magnitudes in the first round, in standard deviations
-)
+MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes, in standard deviations
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
-EVALUATION_COST = 6
-FEW = 20  # number of detections of the first search
-# Fractions of `max_checks`: for the first search with FEW detections, and for that with many.
-SHORT_EFFORT = 1 / 16
-MANY_EFFORT = 1 / 4
+EVALUATION_COST = 15
+SHORTEST = 0.07  # of the field's size: shorter pairs are tried last
 WRONG_FOCAL = (
     0.05  # greatest relative error of a calibrated focal length that step 9 can find
 )
@@ -73,7 +81,10 @@ WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the ca
 FREE_DEX = (
     1.0  # least gain by a free focal length, with the same matches, for which it is tried
 )
-MAX_MISSES = 4  # detections without a star after which the first round drops a candidate
+PARTNERS = 12  # of a hub
+MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
+MAX_CLOSED = 2**12  # triangles of a hub and one partner
+STEPS_PER_CHECK = 16  # comparisons of catalog pairs that take as long as a star look-up
 
 
 @jit
@@ -81,10 +92,6 @@ def lost_in_space(
     detections: Detections, stars: SkyIndex, max_detections: int, max_checks: int
 ) -> Solution:
     """Identify the detections and solve the attitude: the whole search (see the module's steps).
-
-    One search uses the FEW brightest detections: it finds a few bright stars among many faint false lights. Another
-    uses the `max_detections` brightest: it finds stars among brighter false lights. Each must reach twice the evidence,
-    so that both together accept a chance match as rarely as a single search would.
 
     Parameters
     ----------
@@ -103,66 +110,45 @@ def lost_in_space(
         Empty if the search finds nothing beyond chance, or if all detections together do not confirm what it finds
     """
     # 1. Choose the detections to search with.
-    total = len(detections.sigma)
-    few = min(FEW, max_detections, total)
-    many = min(max_detections, total)
-    # Two searches must each reach twice the evidence.
-    accept_dex = ACCEPT_DEX if few == many else ACCEPT_DEX + log10(2.0)
-    candidate = no_hypothesis()
-    # A short search with few detections, one with many, then the first one again with the whole effort.
-    for count, effort in ((few, SHORT_EFFORT), (many, MANY_EFFORT), (few, 1.0)):
-        if few == many and effort < 1:
-            continue
-        # 2. to 8. The search.
-        searched = changed(detections, count, 1.0, detections.focal_uncertainty)
-        candidate = search(searched, stars, int(effort * max_checks))
-        if candidate.dex >= accept_dex:
-            break
+    searched = chosen(
+        detections, spread(detections.tangent, detections.field, max_detections)
+    )
+    # 2. to 8. The search.
+    candidate = search(searched, stars, max_checks)
     # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
     calibrated = detections.focal_uncertainty == 0
-    free = changed(detections, total, 1.0, WRONG_FOCAL) if calibrated else detections
-    return fit_to_all(free, stars, candidate, accept_dex, calibrated, few == total)
+    free = changed(detections, 1.0, WRONG_FOCAL) if calibrated else detections
+    return fit_to_all(free, stars, candidate, calibrated)
 
 
 @jit
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
 
-    Pairs of detections are tried by increasing cost: the expected number of catalog pairs that match them, doubled for
-    each earlier attempt with either detection, so that a false detection does not hold up the search.
-
-    The first round drops a candidate after MAX_MISSES detections without a star and skips stars outside of the
-    magnitude gate. The second round has neither limit. It is skipped if MAX_MISSES covers all other detections
-    anyway.
-
     Parameters
     ----------
     max_checks
-        Bound on the effort: star look-ups, plus EVALUATION_COST for each candidate evaluated
+        Bound on the effort: star look-ups, and what takes as long
 
     Returns
     -------
     Hypothesis
         The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
-    total = len(detections.sigma)
-    length = _pair_lengths(detections)
-    rarity = _rarity(detections, sky)
+    cost, hubs = _pair_costs(detections)
     best = no_hypothesis()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     limit = max_checks
-    for max_misses in (MAX_MISSES, total):
-        tried = np.zeros((total, total), np.bool_)
-        cost = rarity.copy()
-        for attempt in range(total * (total - 1) // 2):
-            # 2. The untried pair of detections of least cost.
-            a, b = _next_pair(length, tried, cost)
-            tried[a, b] = True
-            # 3. to 6. Every attempt starts its quick checks at another MAX_MISSES detections: a fixed order would
-            # drop every true candidate of a frame in which these are all false.
-            start = attempt * MAX_MISSES
-            candidate = _test_pair(detections, sky, a, b, start, max_misses, best, checks)
+    links = _no_links(len(sky.vectors))
+    for hub in hubs:
+        # 2. A hub, and the partners of the least cost.
+        partners = np.argsort(cost[hub])[:PARTNERS]
+        for p in range(min(len(partners), len(hubs) - 1)):
+            # 3. to 6. Test the triangles of the hub, this partner and an earlier one.
+            candidate = _test_partner(
+                detections, sky, hub, partners[: p + 1], links, best, checks
+            )
             same = _same_attitude(candidate, best)
             if candidate.dex > best.dex:
                 # The previous best becomes a rival unless it is the same attitude.
@@ -175,11 +161,10 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
             # 7. A decisive attitude needs no search for rivals.
             if best.dex >= DECISIVE_DEX:
                 return best
-            cost[a] *= 2
-            cost[b] *= 2
             if checks[0] > limit:
                 break
-        if checks[0] > limit or total - 2 <= MAX_MISSES:
+        _clear(links)
+        if checks[0] > limit:
             break
     # 8. A weaker attitude must be significant, and clearly better than any other.
     if best.dex >= ACCEPT_DEX and best.dex - rival_dex >= MARGIN_DEX:
@@ -202,102 +187,114 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 
 @jit
-def _pair_lengths(detections: Detections) -> Floats:
-    """Separations of all pairs of detections, for the order of the search.
+def _pair_costs(detections: Detections) -> tuple[Floats, NDArray]:
+    """Costs of all pairs of detections, and the order of the hubs.
 
-    The expected number of catalog pairs in a gate grows with sin(separation). A pair shorter than SHORT_PAIR of the
-    field determines the roll poorly: it is given a length beyond all others, the greater the shorter it is.
+        cost = s_ab sqrt(sa^2 + sb^2) c_a c_b
+
+    The expected number of catalog pairs in a gate grows with the separation s_ab and with the width of the gate. A
+    detection among c - 1 others within SHORTEST of
+    the field is less probably a star the more there are: a clump of false lights counts as one. A pair shorter than
+    SHORTEST hardly determines the roll: it is given a separation beyond all others, the greater the shorter it is.
 
     Returns
     -------
-    Floats
-        (N, N) tangents, for a < b; the other elements are not set
+    cost
+        (N, N) costs, infinite on the diagonal
+    hubs
+        (N,) rows of the detections, those first that are bright and alone
     """
     total = len(detections.sigma)
-    field = detections.field
-    min_length = SHORT_PAIR * sqrt((field[1] - field[0]) * (field[3] - field[2]))
-    out = np.empty((total, total))
+    min_length = SHORTEST * sqrt(field_area(detections))
+    crowd = np.ones(total)
+    cost = np.full((total, total), np.inf)
     for a in range(total):
         for b in range(a + 1, total):
             length = separation(detections.tangent, a, b)
             # A short pair comes after all others.
             if length < min_length:
+                crowd[a] += 1
+                crowd[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
-            out[a, b] = length
-    return out
+            cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
+    for a in range(total):
+        for b in range(a + 1, total):
+            cost[a, b] *= crowd[a] * crowd[b]
+            cost[b, a] = cost[a, b]
+    return cost, np.argsort((np.arange(total) + 1) * crowd)
 
 
-@jit
-def _rarity(detections: Detections, sky: SkyIndex) -> Floats:
-    """Fraction of the catalog's stars that each detection's magnitude allows.
+class Links(NamedTuple):
+    """Catalog pairs that the hub and one of its partners may be, by the star of the hub: linked lists.
 
-    Returns
-    -------
-    Floats
-        (N,) fraction of the stars inside the magnitude gate; 1 if the magnitude is unknown
-    """
-    out = np.ones(len(detections.sigma))
-    for n in range(len(out)):
-        if np.isfinite(detections.mag[n]):
-            # The gate's full width times the density of magnitudes; the small constant keeps every cost above 0.
-            density = magnitude_density(sky, detections.mag[n])
-            out[n] = min(2 * MAG_GATE_SIGMA * detections.mag_sigma * density + 1e-3, 1.0)
-    return out
-
-
-@jit
-def _next_pair(length: Floats, tried: NDArray, weight: Floats) -> tuple[int, int]:
-    """The untried pair a < b of the least cost length[a, b] * weight[a] * weight[b].
-
-    Parameters
+    Attributes
     ----------
-    length
-        (N, N) lengths of the pairs, see `_pair_lengths`
-    tried
-        (N, N) whether a pair has been tried
-    weight
-        (N,) cost of each detection
-
-    Returns
-    -------
-    tuple[int, int]
-        Rows of the two detections
+    last
+        (S,) entry that was added last of each star, plus 1; 0 without one
+    hub, star, previous
+        (L,) of each entry: star of the hub, star of the partner, and the entry before it of the same hub, plus 1
+    partner, ratio
+        (L,) number of the partner, and the focal ratio by the separation
+    total
+        (1,) number of entries
+    closed
+        (T, 2) of each triangle that was closed last: stars of the hub and of the last partner
     """
-    best = np.inf
-    best_a = 0
-    best_b = 1
-    for a in range(len(weight)):
-        for b in range(a + 1, len(weight)):
-            # The costs change with every attempt: sorting the pairs once would not do.
-            cost = length[a, b] * weight[a] * weight[b]
-            if cost < best and not tried[a, b]:
-                best = cost
-                best_a = a
-                best_b = b
-    return best_a, best_b
+
+    last: NDArray[np.int32]
+    hub: NDArray[np.int32]
+    star: NDArray[np.int32]
+    previous: NDArray[np.int32]
+    partner: NDArray[np.int32]
+    ratio: Floats
+    total: NDArray[np.int64]
+    closed: NDArray[np.int64]
 
 
 @jit
-def _test_pair(
+def _no_links(stars: int) -> Links:
+    """No entry for any star: zeros, which take no time, as the system provides them when they are used."""
+    return Links(
+        np.zeros(stars, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS, np.int32),
+        np.empty(MAX_LINKS),
+        np.zeros(1, np.int64),
+        np.empty((MAX_CLOSED, 2), np.int64),
+    )
+
+
+@jit
+def _clear(links: Links) -> None:
+    """Remove all entries."""
+    for n in range(links.total[0]):
+        links.last[links.hub[n]] = 0
+    links.total[0] = 0
+
+
+@jit
+def _test_partner(
     detections: Detections,
     sky: SkyIndex,
-    a: int,
-    b: int,
-    start: int,
-    max_misses: int,
+    hub: int,
+    partners: NDArray,
+    links: Links,
     previous: Hypothesis,
     checks: NDArray,
 ) -> Hypothesis:
-    """Steps 3 to 6: test two detections against every catalog pair of the same separation, in both orders.
+    """Steps 3 to 6: test the triangles of the hub, its last partner, and an earlier one.
+
+    Each catalog pair of the separation of hub and partner is compared with the links of its stars, in both orders. If
+    the stars of two partners are as far apart as the partners, and on the same side, the three stars are a candidate.
 
     Parameters
     ----------
-    a, b
-        Rows of the two detections
-    start
-        The quick check looks up the other detections from this row on
-    max_misses
-        The quick check drops a candidate after this many detections without a star
+    hub, partners
+        Row of the hub, and rows of its partners so far
+    links
+        Pairs of the hub with its partners, to which those of the last one are added
     previous
         Best hypothesis so far
     checks
@@ -308,81 +305,190 @@ def _test_pair(
     Hypothesis
         The first one with ACCEPT_DEX whose attitude is not that of `previous`, or else the best one
     """
-    gates, order, required = trial(detections, a, b, start, ACCEPT_DEX)
+    y = partners[-1]
+    best = no_hypothesis()
+    # 3. Catalog pairs of the same separation.
+    low, high, chord, gate = _pair_range(detections, sky, hub, y)
+    # 4. Triangles.
+    wanted = _wanted(detections, hub, partners, gate / chord)
+    mags = (detections.mag[hub], detections.mag[y], MAG_GATE_SIGMA * detections.mag_sigma)
+    chord = chord if detections.focal_uncertainty > 0 else 0.0
+    pairs = (sky.pair, sky.first, low, high, sky.bin_rad)
+    closed, steps = _close(pairs, sky.vectors, sky.mag, mags, chord, wanted, links)
+    checks[0] += 1 + steps // STEPS_PER_CHECK
+    for n in range(closed):
+        # 5. and 6. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
+        checks[0] += EVALUATION_COST
+        candidate = pair_hypothesis(
+            detections, sky, (hub, y, links.closed[n, 0], links.closed[n, 1]), NO_RIVAL_DEX
+        )
+        if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
+            return candidate
+        best = candidate if candidate.dex > best.dex else best
+    return best
+
+
+@jit
+def _close(
+    pairs: tuple[NDArray, NDArray, int, int, float],
+    star: Floats,
+    mag: Floats,
+    mags: tuple[float, float, float],
+    chord: float,
+    wanted: Floats,
+    links: Links,
+) -> tuple[int, int]:
+    """Step 4: close triangles with the catalog pairs of the hub and its last partner, and link these pairs.
+
+    Parameters
+    ----------
+    pairs
+        Pairs of the sky index, the first entries of its cells, the first and the last cell of the wanted separation,
+        and the width of a cell
+    star, mag
+        Stars and their magnitudes
+    mags
+        Magnitudes of the hub and of the partner, and their greatest error
+    chord
+        Chord between hub and partner if the focal length is uncertain, else 0
+    wanted
+        See `_wanted`
+    links
+        Pairs of the earlier partners. The new ones are added; triangles are written to `closed`
+
+    Returns
+    -------
+    tuple[int, int]
+        Number of triangles, and of comparisons
+    """
+    # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
+    pair, first, low, high, bin_rad = pairs
+    last, hub_star, partner_star, before, partner_number, ratios, total, closed = links
+    mag_hub, mag_partner, mag_gate = mags
+    p = len(wanted) - 1
+    ratio = 1.0
+    count = total[0]
+    found = 0
+    tests = 0
+    for cell in range(low, high + 1):
+        if chord > 0:
+            # The angle of a cell's pairs is known to the width of the cell, much less than the gate.
+            ratio = chord / (2 * np.sin((cell + 0.5) * bin_rad / 2))
+        for row in range(2 * first[cell], 2 * first[cell + 1]):
+            # Each pair in both orders; magnitudes first, as they need no geometry.
+            i = pair[row // 2, row % 2]
+            k = pair[row // 2, 1 - row % 2]
+            if not _alike(mag_hub - mag[i], mag_partner - mag[k], mag_gate):
+                continue
+            entry = last[i]
+            while entry:
+                n = entry - 1
+                entry = before[n]
+                q = partner_number[n]
+                tests += 1
+                if q == p or abs(ratios[n] / ratio - 1) > wanted[q, 3]:
+                    continue
+                star_j = vectors.row(star, partner_star[n])
+                star_k = vectors.row(star, k)
+                if abs(vectors.chord(star_j, star_k) * ratio - wanted[q, 0]) > wanted[q, 1]:
+                    continue
+                normal = vectors.cross(star_j, star_k)
+                if wanted[q, 2] * vectors.dot(vectors.row(star, i), normal) < 0:
+                    continue
+                if found < len(closed):
+                    closed[found, 0] = i
+                    closed[found, 1] = k
+                    found += 1
+            if count < len(hub_star):
+                hub_star[count] = i
+                partner_star[count] = k
+                partner_number[count] = p
+                ratios[count] = ratio
+                before[count] = last[i]
+                count += 1
+                last[i] = count
+    total[0] = count
+    return found, tests + first[high + 1] - first[low]
+
+
+@jit
+def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: float) -> Floats:
+    """What stars must satisfy to form the triangle of a hub, its last partner, and each earlier partner.
+
+    An uncertain focal length follows from the side between the hub and the last partner, whose relative error is
+    `tolerance`, and is compared with that from the other side at the hub. At the angle A from the boresight ratios of
+    chords differ by up to 2 u sin^2 A for a focal length that is wrong by the fraction u (see `star_quads._code_gate`).
+
+    Returns
+    -------
+    Floats
+        (P, 4) of each partner: chord to the last one, its greatest error; triple product of hub, partner and last
+        partner, 0 if its sign is uncertain; greatest relative difference of the focal ratios of the sides at the hub
+    """
+    tangent = detections.tangent
+    sigma = detections.sigma
+    out = np.empty((len(partners), 4))
+    y = partners[-1]
+    u = FOCAL_MARGIN * detections.focal_uncertainty
+    r2 = np.max(detections.field**2) + np.min(detections.field**2)
+    slack = 2 * u * r2 / (1 + r2) + (tolerance if u > 0 else 0.0)
+    ray_hub = ray(tangent, hub, 1.0)
+    ray_y = ray(tangent, y, 1.0)
+    for q in range(len(partners)):
+        x = partners[q]
+        ray_x = ray(tangent, x, 1.0)
+        at_hub = vectors.chord(ray_hub, ray_x)
+        side = vectors.chord(ray_x, ray_y)
+        out[q, 0] = side
+        out[q, 1] = GATE_SIGMA * hypot(sigma[x], sigma[y]) + slack * side
+        # The triple product is one side times the distance of the third corner from it, whose error is the gate.
+        product = vectors.dot(ray_hub, vectors.cross(ray_x, ray_y))
+        out[q, 2] = 0.0 if abs(product) < out[q, 1] * max(at_hub, side) else product
+        out[q, 3] = GATE_SIGMA * hypot(sigma[x], sigma[hub]) / at_hub + slack
+    return out
+
+
+@jit
+def pair_hypothesis(
+    detections: Detections,
+    sky: SkyIndex,
+    match: tuple[int, int, int, int],
+    min_dex: float,
+) -> Hypothesis:
+    """The hypothesis that two detections are two stars, with all others that match at the attitude of these two.
+
+    Parameters
+    ----------
+    match
+        Rows of the detections a and b, and of their stars
+    min_dex
+        Least evidence of interest
+
+    Returns
+    -------
+    Hypothesis
+        Empty if the focal length or the evidence refutes it
+    """
+    a, b, i, j = match
+    tangent = detections.tangent
+    star_a = vectors.row(sky.vectors, i)
+    star_b = vectors.row(sky.vectors, j)
+    ratio = 1.0
+    if detections.focal_uncertainty > 0:
+        length = vectors.chord(ray(tangent, a, 1.0), ray(tangent, b, 1.0))
+        ratio = fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
+        if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
+            return no_hypothesis()
+    # The attitude turns the axes of the stars into those of the detections.
     in_cam = np.empty((3, 3))
     in_ref = np.empty((3, 3))
-    R_ref_from_cam = np.empty((3, 3))
-    best = no_hypothesis()
-    focal_ratio = 1.0
-    # 3. Catalog pairs of the same separation.
-    begin, end, chord, gate = _pair_range(detections, sky, a, b)
-    # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
-    tangent = detections.tangent
-    focal_uncertainty = detections.focal_uncertainty
-    pair = sky.pair
-    star = sky.vectors
-    mag = sky.mag
-    grid = (sky.cell_first, sky.cell_star, sky.side)
-    vectors.pair_frame(ray(tangent, a, 1.0), ray(tangent, b, 1.0), in_cam)
-    mag_a = detections.mag[a]
-    mag_b = detections.mag[b]
-    mag_gate = MAG_GATE_SIGMA * detections.mag_sigma if max_misses == MAX_MISSES else np.inf
-    # 4. Candidate attitudes.
-    for p in range(begin, end):
-        i = pair[p, 0]
-        j = pair[p, 1]
-        # 4a. Compare magnitudes first: this needs no geometry.
-        forward = _alike(mag_a - mag[i], mag_b - mag[j], mag_gate)
-        backward = _alike(mag_a - mag[j], mag_b - mag[i], mag_gate)
-        if not (forward or backward):
-            continue
-        star_i = vectors.row(star, i)
-        star_j = vectors.row(star, j)
-        catalog_chord = vectors.chord(star_i, star_j)
-        # 4b. An uncertain focal length follows from the separations; else the separations must agree.
-        if focal_uncertainty > 0:
-            focal_ratio = fit_focal_ratio(tangent, a, b, chord, catalog_chord)
-            if abs(focal_ratio - 1) > focal_uncertainty:
-                continue
-            vectors.pair_frame(
-                ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio), in_cam
-            )
-        elif abs(catalog_chord - chord) > gate:
-            continue
-        vectors.pair_frame(star_i, star_j, in_ref)
-        for flip in range(2):
-            if flip:
-                # The star pair in reverse order: a half turn about its bisector, the first axis.
-                for k in range(3):
-                    in_ref[k, 1] = -in_ref[k, 1]
-                    in_ref[k, 2] = -in_ref[k, 2]
-            if not (backward if flip else forward):
-                continue
-            # 4c. The attitude turns the axes of the detections into those of the stars.
-            vectors.multiply_transposed(in_ref, in_cam, R_ref_from_cam)
-            # 5. Quick check.
-            lookups, fits = quick_check(
-                tangent,
-                star,
-                *grid,
-                R_ref_from_cam,
-                focal_ratio,
-                gates,
-                order,
-                required,
-                max_misses,
-            )
-            checks[0] += 1 + lookups
-            if fits:
-                # 6. Evidence. Below NO_RIVAL_DEX the candidate is neither acceptable nor a rival.
-                checks[0] += EVALUATION_COST
-                candidate = evaluate(
-                    detections, sky, R_ref_from_cam.T.copy(), focal_ratio, gates, NO_RIVAL_DEX
-                )
-                if candidate.dex >= ACCEPT_DEX and not _same_attitude(candidate, previous):
-                    return candidate
-                best = candidate if candidate.dex > best.dex else best
-    return best
+    R_cam_from_ref = np.empty((3, 3))
+    vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
+    vectors.pair_frame(star_a, star_b, in_ref)
+    vectors.multiply_transposed(in_cam, in_ref, R_cam_from_ref)
+    return evaluate(
+        detections, sky, R_cam_from_ref, ratio, pair_gates(detections, a, b), min_dex
+    )
 
 
 @jit
@@ -397,13 +503,13 @@ def _pair_range(
 ) -> tuple[int, int, float, float]:
     """Step 3: the catalog pairs whose separation two detections may have.
 
-    The gate is GATE_SIGMA sqrt(sa^2 + sb^2). A focal length that is uncertain by the fraction u widens the range of
-    angles to angle / (1 + u) .. angle / (1 - u).
+    The gate is GATE_SIGMA sqrt(sa^2 + sb^2). A focal length that is uncertain by the fraction u, with FOCAL_MARGIN,
+    widens the range of angles to angle / (1 + u) .. angle / (1 - u).
 
     Returns
     -------
-    begin, end
-        Half-open range of rows of `sky.pair`
+    low, high
+        First and last cell of the pairs
     chord
         Chord between the two rays
     gate
@@ -414,9 +520,10 @@ def _pair_range(
     angle = 2 * np.arcsin(min(chord / 2, 1.0))
     # Cell k of the index holds the angles from k to k + 1 times bin_rad.
     last = len(sky.first) - 2
-    low = cell_of((angle / (1 + detections.focal_uncertainty) - gate) / sky.bin_rad, last + 1)
-    high = cell_of((angle / (1 - detections.focal_uncertainty) + gate) / sky.bin_rad, last)
-    return sky.first[low], sky.first[high + 1], chord, gate
+    uncertainty = FOCAL_MARGIN * detections.focal_uncertainty
+    low = cell_of((angle / (1 + uncertainty) - gate) / sky.bin_rad, last + 1)
+    high = cell_of((angle / (1 - uncertainty) + gate) / sky.bin_rad, last)
+    return low, high, chord, gate
 
 
 @jit
@@ -451,9 +558,7 @@ def fit_to_all(
     detections: Detections,
     stars: SkyIndex,
     candidate: Hypothesis,
-    accept_dex: float,
     calibrated: bool,
-    whole: bool,
 ) -> Solution:
     """Step 9: fit a candidate attitude of some detections to all detections and all stars.
 
@@ -464,46 +569,36 @@ def fit_to_all(
     ----------
     detections
         All detections, with the focal uncertainty of the free fit
-    candidate, accept_dex
-        Best hypothesis of the search, and its least evidence, log10
+    candidate
+        Best hypothesis of the search
     calibrated
         Whether the focal length is calibrated
-    whole
-        Whether the candidate already is the calibrated fit to all detections
 
     Returns
     -------
     Solution
-        Empty if the candidate has less than `accept_dex`, if the full field keeps no more than half of its matches, or
+        Empty if the candidate is, if the full field keeps no more than half of its matches, or
         if all detections together are not beyond chance
     """
-    if not candidate.dex >= accept_dex:
-        return build_solution(detections, stars, no_hypothesis(candidate.dex))
-    chosen = detections
+    if not len(candidate.star):
+        return build_solution(detections, stars, candidate)
+    fitted_to = detections
     full = no_hypothesis()
     # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.
     gates = gates_of(detections, 1.5)
     R = candidate.R_cam_from_ref
-    free = True
     if calibrated:
         # 9a. The fit with the calibrated focal length.
-        chosen = changed(detections, len(detections.sigma), 1.0, 0.0)
-        full = candidate if whole else evaluate(chosen, stars, R.copy(), 1.0, gates, -np.inf)
-        # If all detections match there is none that another focal length could match.
-        free = (
-            len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX
-        )
-    if free:
+        fitted_to = changed(detections, 1.0, 0.0)
+        full = evaluate(fitted_to, stars, R.copy(), 1.0, gates, -np.inf)
+    # If all detections match there is none that another focal length could match.
+    if len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX:
         # 9b. The fit with a free focal length.
         fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)
         if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:
-            chosen = detections
+            fitted_to = detections
             full = fitted
     # 9c. Refuse what all detections together do not confirm.
     if 2 * len(full.observed) <= len(candidate.observed) or full.dex < ACCEPT_DEX:
-        return build_solution(chosen, stars, no_hypothesis())
-    dex = max(full.dex, candidate.dex)
-    best = Hypothesis(
-        full.observed, full.star, full.R_cam_from_ref, full.focal_ratio, full.info, dex
-    )
-    return build_solution(chosen, stars, best)
+        full = no_hypothesis()
+    return build_solution(fitted_to, stars, full)

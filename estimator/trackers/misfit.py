@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
-from estimator.catalog.quad_index import QuadIndex
 from estimator.catalog.sky_index import SkyIndex, nearest
 from estimator.core import least_squares, vectors
 from estimator.core.camera import Camera
@@ -24,7 +23,7 @@ from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT
-from estimator.identification import star_evidence, star_quads
+from estimator.identification import star_evidence, star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import (
     Detections,
@@ -80,9 +79,7 @@ def widened(
     dex = np.empty(len(TRIED))
     dex[0] = solution.dex
     for n in range(1, len(TRIED)):
-        wide = changed(
-            detections, len(detections.sigma), TRIED[n], detections.focal_uncertainty
-        )
+        wide = changed(detections, TRIED[n], detections.focal_uncertainty)
         found = star_evidence.evaluate(
             wide, sky, R_cam_from_ref.copy(), ratio, gates_of(wide, 1.5), -np.inf
         )
@@ -176,19 +173,18 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 def identify(
     lights: FlatCentroids,
     sensor: Sensor,
-    quads: QuadIndex,
     stars: SkyIndex,
     max_detections: int,
     max_checks: int,
 ) -> tuple[Solution, float]:
     """Search centroids of a calibrated camera, and match the field again where the residuals are doubtful.
 
-    Returns the solution of `star_quads.quads_or_pairs` and the factor of the variances: that of `widened`, or 1 without
+    Returns the solution of `star_search.lost_in_space` and the factor of the variances: that of `widened`, or 1 without
     doubt. The factor is 0 where the residuals are so large that the calibration may be wrong: the solution is then as
     it was found.
     """
     detections = detections_of(lights, sensor, 0.0)
-    solution = star_quads.quads_or_pairs(detections, quads, stars, max_detections, max_checks)
+    solution = star_search.lost_in_space(detections, stars, max_detections, max_checks)
     if residuals_too_great(solution) or solution.focal_ratio != 1:
         return solution, 0.0
     if not len(solution.star):

@@ -21,7 +21,7 @@ class SearchModel(NamedTuple):
     relative_error
         Additional error, as a fraction of the distance from the principal point
     max_checks
-        Largest number of star look-ups; 400,000 take about 0.02 s
+        Bound on the effort; 50,000 take about 0.01 s
     by_quads
         Whether quads are searched in place of pairs
     focal_uncertainty
@@ -38,15 +38,19 @@ class SearchModel(NamedTuple):
     aspect: float = 1.0
 
 
-WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 200_000, True, WRONG_FOCAL)
+WRONG_FOCAL_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 40_000, True, WRONG_FOCAL)
 # Of a frame that is refused: whether it would be solved with another focal length
 WRONG_SCALE_SEARCH = SearchModel(MIN_ERROR_PX, 0.0, 10_000, True, 0.4)
+# Short searches for each way in which a frame can be unlike its model, and then longer ones
 CALIBRATED_SEARCHES = (
-    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 600),
+    SearchModel(MIN_ERROR_PX, 0.0, 1_500, True, WRONG_FOCAL),
+    SearchModel(0.5, 0.0, 600),
+    SearchModel(MIN_ERROR_PX, 0.0, 15_000),
     WRONG_FOCAL_SEARCH,
     # A wrong camera model: `lens_fit` then extends the match.
-    SearchModel(0.5, 0.003, 50_000),
-    SearchModel(MIN_ERROR_PX, 0.0, 400_000),
+    SearchModel(0.5, 0.003, 10_000),
+    SearchModel(MIN_ERROR_PX, 0.0, 25_000),
 )
 UNCALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),

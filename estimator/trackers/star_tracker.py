@@ -33,7 +33,7 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of
-from estimator.identification import star_quads, star_search
+from estimator.identification import star_evidence, star_quads, star_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import (
     BUDGET,
@@ -49,6 +49,8 @@ from estimator.identification.star_detections import (
     Sensor,
     detections_of,
     flat_centroids,
+    gates_of,
+    lights_of,
 )
 from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit, warm_up
@@ -71,6 +73,10 @@ from estimator.trackers.search_models import (
     WRONG_SCALE_SEARCH,
     SearchModel,
 )
+
+# Greatest number of lights that are identified: the larger of a minimum and a multiple of the stars in a mean field
+MIN_LIGHTS = 100
+LIGHTS_PER_STAR = 4
 
 SETTINGS = Settings()
 
@@ -333,13 +339,15 @@ class StarTracker(FrameTracker):
         compared = np.zeros(1, np.int64)
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            attitude = self._identify_by_evidence(centroids, searches, clock)
-            unnamed = effort is None and attitude.status in (BUDGET, FALSE_LIGHTS)
-            if unnamed and self._is_wrong_scale(centroids):
-                attitude = Attitude(WRONG_SCALE)
-        else:
-            attitude = self._identify_by_paper(centroids, clock, compared)
-            attitude = replace(attitude, angles_compared=int(compared[0]) or None)
+            return self._identify_lights(centroids, searches, clock, effort is None)
+        attitude = self._identify_by_paper(centroids, clock, compared)
+        attitude = replace(attitude, angles_compared=int(compared[0]) or None)
+        return self._with_rivals(attitude, centroids, clock)
+
+    def _with_rivals(
+        self, attitude: Attitude, centroids: Centroids, clock: Clock
+    ) -> Attitude:
+        """Return the attitude, or an ambiguous answer if the unmatched lights are those of another sky."""
         attitude = with_rivals(
             attitude, centroids, self.sigma_px, self.sensor, self.sky, self.field_matcher
         )
@@ -493,6 +501,43 @@ class StarTracker(FrameTracker):
         uncertainty = max(FOCAL_MARGIN * self.focal_uncertainty, focal_uncertainty)
         return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
+    def _identify_lights(
+        self,
+        centroids: Centroids,
+        searches: tuple[SearchModel, ...],
+        clock: Clock,
+        names_scale: bool,
+    ) -> Attitude:
+        """Solve by the default identifier, without a surplus of lights, and with double images as one light.
+
+        A refusal of all searches says whether another scale would be solved (`names_scale`).
+        """
+        camera = self.camera
+        stars = len(self.stars) * self._field_sr / (4 * np.pi)
+        most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
+        lights = lights_of(centroids, camera.width_px, camera.height_px, most)
+        attitude = self._identify_by_evidence(lights.centroids, searches, clock)
+        unnamed = names_scale and attitude.status in (BUDGET, FALSE_LIGHTS)
+        if unnamed and self._is_wrong_scale(lights.centroids):
+            return Attitude(WRONG_SCALE)
+        attitude = self._with_rivals(attitude, lights.centroids, clock)
+        if len(lights.rows) == len(centroids):
+            return attitude
+        # The common error turns the camera about the axes across it.
+        x, y = lights.offset_px / camera.focal_px
+        turn_rad = np.array([-y, x, 0.0])
+
+        def of_frame(found: Attitude) -> Attitude:
+            if found.match is None:
+                return found
+            return replace(
+                found,
+                match=replace(found.match, observed=lights.rows[found.match.observed]),
+                covariance_rad2=found.covariance_rad2 + np.outer(turn_rad, turn_rad),
+            )
+
+        return replace(of_frame(attitude), rivals=tuple(map(of_frame, attitude.rivals)))
+
     def _identify_by_evidence(
         self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
     ) -> Attitude:
@@ -539,7 +584,6 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
-        index = self.quads, self.sky
         effort = self.settings.searched_stars, model.max_checks
         calibrated = not (model.by_quads or self.focal_uncertainty)
         if (
@@ -548,15 +592,26 @@ class StarTracker(FrameTracker):
             and misfit.are_small(sigma_px / self.camera.focal_px)
         ):
             lights = flat_centroids(centroids, sigma_px)
-            return misfit.identify(lights, self.sensor, *index, *effort)
+            solution, variance = misfit.identify(lights, self.sensor, self.sky, *effort)
+            exact = model.min_error_px == MIN_ERROR_PX or bool(model.relative_error)
+            if exact or not len(solution.star):
+                return solution, variance
+            # The larger errors have found the attitude; the residuals tell the errors.
+            claimed = self.detections(centroids, self.sigma_px(centroids))
+            R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+            found = star_evidence.evaluate(
+                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
+            )
+            solution = star_evidence.build_solution(claimed, self.sky, found)
+            return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
-        if calibrated:
-            return star_quads.quads_or_pairs(detections, *index, *effort), 0.0
         if not model.by_quads:
             return star_search.lost_in_space(detections, self.sky, *effort), 0.0
         detections = detections._replace(tangent=detections.tangent / [1.0, model.aspect])
-        found = star_quads.identify(detections, *index, *effort, not self.focal_uncertainty)
-        return found, 0.0
+        quads = self.quads, self.sky
+        return star_quads.identify(
+            detections, *quads, *effort, not self.focal_uncertainty
+        ), 0.0
 
     def refit(
         self,

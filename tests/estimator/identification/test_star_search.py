@@ -294,7 +294,8 @@ def test_a_matrix_has_the_rotation_of_its_quaternion(seed: int, axis) -> None:
 # ---- steps of the search, by the interpreter
 
 PLAIN = interpreted("estimator.identification.star_search")
-CHECK = interpreted("estimator.identification.star_check")
+CHANCE = interpreted("estimator.identification.chance")
+DETECTIONS = interpreted("estimator.identification.star_detections")
 PLACES = np.array(
     [[0.01, 0.02], [-0.05, 0.03], [0.06, -0.04], [-0.02, -0.06], [0.03, 0.0], [0.012, 0.018]]
 )
@@ -325,7 +326,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     )
     middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
     errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
-    gates = CHECK.pair_gates(unequal(), a, b)
+    gates = DETECTIONS.pair_gates(unequal(), a, b)
     for n in (1, 2, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
         # 4 deviations of a variance of 20,000.
@@ -340,7 +341,9 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
         np.linalg.norm(np.cross(one, other), axis=1), np.sum(one * other, axis=1)
     )
     for a, b in ((0, 1), (1, 2), (2, 3)):
-        begin, end, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
+        low, high, chord, gate = PLAIN._pair_range(unequal(zoom), SKY, a, b)
+        begin = SKY.first[low]
+        end = SKY.first[high + 1]
         rays = np.column_stack([PLACES[[a, b]], np.ones(2)])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         seen = np.arccos(rays[0] @ rays[1])
@@ -351,8 +354,9 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
         )
         assert begin <= possible.min()
         assert possible.max() < end
+        margin = star_evidence.FOCAL_MARGIN * zoom
         outside = angle[begin:end] - np.clip(
-            angle[begin:end], seen / (1 + zoom) - gate, seen / (1 - zoom) + gate
+            angle[begin:end], seen / (1 + margin) - gate, seen / (1 - margin) + gate
         )
         assert np.abs(outside).max() <= SKY.bin_rad
 
@@ -367,34 +371,63 @@ def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
         )
 
 
-def test_pairs_are_tried_once_in_order_of_length_and_rarity() -> None:
-    detections = unequal()
-    length = PLAIN._pair_lengths(detections)
-    rarity = PLAIN._rarity(detections, SKY)
-    least = 0.2 * np.sqrt((FIELD[1] - FIELD[0]) * (FIELD[3] - FIELD[2]))
-    a, b = np.triu_indices(6, 1)
-    distance = np.linalg.norm(PLACES[a] - PLACES[b], axis=1)
-    np.testing.assert_allclose(
-        length[a, b][distance >= least], distance[distance >= least], rtol=1e-12
+def test_pairs_cost_as_many_catalog_pairs_as_are_expected() -> None:
+    """Length times error; a light among others costs as much as it has neighbors, and a short pair most."""
+    cost, hubs = PLAIN._pair_costs(unequal())
+    # The last one is 3 mrad from the first: both are crowded.
+    crowd = np.array([2, 1, 1, 1, 1, 2])
+    distance = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
+    expected = distance * np.hypot(UNEQUAL[:, None], UNEQUAL) * crowd[:, None] * crowd
+    far = distance > 0.01
+    np.testing.assert_allclose(cost[far], expected[far], rtol=1e-12)
+    assert cost[0, 5] == cost[5, 0] > 100 * expected.max()
+    assert (np.diff(((np.arange(6) + 1) * crowd)[hubs]) >= 0).all()
+
+
+@pytest.mark.parametrize("zoom", [0.0, 0.02])
+def test_every_triangle_of_the_catalog_that_fits_is_closed(zoom: float) -> None:
+    """Against all triples of 60 stars: the sides within 3.5 errors, for one focal length, and the same orientation."""
+    vectors, mag = random_sky(60, 6)
+    vectors = vectors * [0.05, 0.05, 0] + [0, 0, 1]
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = sky_index.build(vectors, mag, WIDE_RAD)
+    sigma = 2e-4
+    tangent = vectors[[7, 30, 41], :2] / vectors[[7, 30, 41], 2:] * (1 + zoom / 2)
+    lights = detections_of(tangent, np.full(3, np.nan), sigma, zoom)
+    rays = np.column_stack([tangent, np.ones(3)])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    links = PLAIN._no_links(60)
+    partners = np.array([1, 2])
+    closed = []
+    for count in (1, 2):
+        low, high, chord, gate = PLAIN._pair_range(lights, sky, 0, count)
+        wanted = PLAIN._wanted(lights, 0, partners[:count], gate / chord)
+        pairs = (sky.pair, sky.first, low, high, sky.bin_rad)
+        found, _ = PLAIN._close(
+            pairs, vectors, mag, (np.nan, np.nan, 1.0), chord if zoom else 0.0, wanted, links
+        )
+        closed = [tuple(row) for row in links.closed[:found, :2].tolist()]
+    side = [np.linalg.norm(rays[m] - rays[n]) for m, n in ((0, 1), (0, 2), (1, 2))]
+    i, j, k = np.meshgrid(*[np.arange(60)] * 3, indexing="ij")
+    chords = [
+        np.linalg.norm(vectors[m] - vectors[n], axis=-1) for m, n in ((i, j), (i, k), (j, k))
+    ]
+    ratio = np.array(side)[:, None, None, None] / np.maximum(chords, 1e-9)
+    middle = ratio[1] if zoom else 1.0
+    fits = (i != j) & (j != k) & (i != k) & (abs(ratio[1] - 1) < zoom + 1e-4)
+    for measured, there in zip(side, chords, strict=True):
+        fits &= abs(there * middle - measured) < 3 * np.sqrt(2) * sigma
+    fits &= (
+        np.einsum("...x,...x", vectors[i], np.cross(vectors[j], vectors[k]))
+        * (rays[0] @ np.cross(rays[1], rays[2]))
+        > 0
     )
-    short = np.flatnonzero(distance < least)
-    assert len(short) > 1
-    assert (length[a, b][short] > 100 * least).all()
-    # The shorter, the later.
-    assert (np.argsort(length[a, b][short]) == np.argsort(-distance[short])).all()
-    for n in range(5):  # within four deviations of the magnitude
-        share = np.mean(np.abs(MAG - detections.mag[n]) < 4 * 0.25)
-        # The density at the middle, over a range of two magnitudes.
-        assert rarity[n] == pytest.approx(share, rel=0.35)
-    assert rarity[5] == 1
-    tried = np.zeros((6, 6), bool)
-    costs = []
-    for _ in range(15):
-        pair = PLAIN._next_pair(length, tried, rarity)
-        assert not tried[pair]
-        tried[pair] = True
-        costs.append(length[pair] * rarity[pair[0]] * rarity[pair[1]])
-    assert (np.diff(costs) >= 0).all()
+    expected = set(zip(i[fits].tolist(), k[fits].tolist(), strict=True))
+    assert (7, 41) in expected
+    assert expected <= set(closed)
+    assert len(closed) < 60**2 / 10
+    PLAIN._clear(links)
+    assert not links.last.any()
 
 
 @pytest.mark.parametrize("zoom", [0.0, 0.01])
@@ -414,58 +447,26 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     wanted = np.log10(
         np.sqrt(2 * np.pi) ** count / np.sqrt(np.linalg.det(info[:count, :count])) / volume
     )
-    found = CHECK.attitude_dex(
+    found = CHANCE.attitude_dex(
         detections.tangent, detections.sigma, 0, 1, 8 * np.pi**2, detections.focal_uncertainty
     )
     assert found == pytest.approx(wanted, abs=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("true", "required", "max_misses", "lookups", "fits"),
-    [
-        ("TTTT", 6, 9, 4, True),
-        ("TTTT", 4, 9, 2, True),
-        ("FFTT", 4, 9, 4, True),
-        ("FFTT", 4, 2, 2, False),  # two misses at first
-        ("TFFT", 5, 9, 3, False),  # out of reach
-        ("FFFF", 3, 9, 4, False),
-    ],
-)
-def test_the_quick_check_of_stars_stops_once_the_outcome_is_decided(
-    true: str, required: int, max_misses: int, lookups: int, fits: bool
-) -> None:
-    """Four detections beside the pair, with (T) and without (F) a star at their place."""
-    places = np.vstack(
-        [PLACES[:2], [[0.03, 0.03], [-0.03, 0.01], [0.02, -0.05], [-0.06, -0.03]]]
-    )
-    rays = np.column_stack([places, np.ones(6)])
-    there = [0, 1] + [2 + n for n, letter in enumerate(true) if letter == "T"]
-    sky = sky_index.build_without_pairs(
-        (rays / np.linalg.norm(rays, axis=1, keepdims=True))[there], np.ones(len(there))
-    )
-    order = CHECK.other_detections(6, 0, 1, 0)
-    assert order.tolist() == [2, 3, 4, 5]
-    assert CHECK.other_detections(6, 2, 4, 9).tolist() == [3, 5, 0, 1]
-    tables = sky.vectors, sky.cell_first, sky.cell_star, sky.side
-    found = CHECK.quick_check(
-        places, *tables, np.eye(3), 1.0, np.full(6, 1e-4), order, required, max_misses
-    )
-    assert found == (lookups, fits)
 
 
 @pytest.mark.parametrize(("limit_mag", "matches"), [(np.nan, 4), (6.0, 0)])
 def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
     limit_mag: float, matches: int
 ) -> None:
-    """Four exact stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
+    """Four stars are beyond chance among four lights, not among 104 as faint as stars that are missing."""
     rng = np.random.default_rng(4)
     truth = Rotation.random(rng=rng)
-    tangent, mag, _ = observe(truth, rng)
+    sigma = 6 * SIGMA
+    tangent, mag, _ = observe(truth, rng, sigma)
     false = rng.uniform(FIELD[[0, 2]], FIELD[[1, 3]], (100, 2))
     lights = detections_of(
-        np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0))
+        np.concatenate([tangent[:4], false]), np.append(mag[:4], np.full(100, 6.0)), sigma
     )
-    few = changed(lights, 4, 1.0, 0.0)
+    few = detections_module.chosen(lights, np.arange(4))
     candidate = star_evidence.evaluate(
         few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf
     )
@@ -474,9 +475,7 @@ def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
         lights._replace(limit_mag=limit_mag),
         SKY,
         candidate,
-        star_search.ACCEPT_DEX,
         True,
-        False,
     )
     assert len(found.star) == matches
 
@@ -489,5 +488,18 @@ def test_the_limiting_magnitude_is_taken_at_the_median_light() -> None:
         FlatCentroids(np.eye(5, 2), sigma_px, flux, NO_SPREAD, sigma_px), lens, 0.0
     )
     assert lights.limit_mag == pytest.approx(20 - 2.5 * np.log10(300))
-    assert changed(lights, 5, 4.0, 0.0).limit_mag == lights.limit_mag
-    assert np.isnan(changed(lights, 4, 1.0, 0.0).limit_mag)
+    assert changed(lights, 4.0, 0.0).limit_mag == lights.limit_mag
+    assert np.isnan(detections_module.chosen(lights, np.arange(4)).limit_mag)
+
+
+def test_a_clump_displaces_no_light_elsewhere() -> None:
+    """Of 300 lights in one cell and 20 elsewhere, all fainter, the 20 are among 40; the brightest of each cell are."""
+    rng = np.random.default_rng(3)
+    clump = 0.01 * rng.random((300, 2))
+    alone = np.array(
+        [[x, y] for x in (0.3, 0.45, 0.6, 0.75, 0.9) for y in (0.2, 0.4, 0.6, 0.8)]
+    )
+    rows = detections_module.spread(np.vstack([clump, alone]), np.array([0.0, 1, 0, 1]), 40)
+    assert rows.tolist() == [*range(20), *range(300, 320)]
+    few = detections_module.spread(alone, np.array([0.0, 1, 0, 1]), 20)
+    assert few.tolist() == list(range(20))

@@ -103,7 +103,7 @@ def test_wider_errors_in_closed_form_match_the_full_evaluation(
     """The closed form agrees with the evaluation of every factor, which an unmatched light beside a star asks for."""
     _, centroids = field(tracker, 5, CAMERA, claimed)
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
-    wide = changed(detections, len(centroids), 25.0, 0.0)
+    wide = changed(detections, 25.0, 0.0)
     found = star_search.lost_in_space(wide, tracker.sky, 80, 100_000)
     R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
     gates = np.full(len(centroids), 0.01)
