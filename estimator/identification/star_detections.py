@@ -115,7 +115,7 @@ def flat_centroids(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
     )
 
 
-class Lights(NamedTuple):
+class ChosenLights(NamedTuple):
     """The lights of a frame that are identified.
 
     Attributes
@@ -133,7 +133,7 @@ class Lights(NamedTuple):
     offset_px: Floats
 
 
-def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) -> Lights:
+def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) -> ChosenLights:
     """The lights of a frame that are identified: not too many, and double images as one light.
 
     1. Of more than `most` centroids the brightest of each part of the field are taken (`spread`).
@@ -154,7 +154,7 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     first, group, members = np.unique(head, return_inverse=True, return_counts=True)
     by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
     if 2 * np.sum(members == 2) < len(first) or by_chance > 1 / 8:
-        return Lights(centroids, rows, np.zeros(2))
+        return ChosenLights(centroids, rows, np.zeros(2))
     sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
     mean_px = np.stack(sums_px, axis=1) / members[:, None]
     offset_px = centroids.xy_px - mean_px[group]
@@ -177,7 +177,7 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     second_px = offset_px[second]
     variance, axes = np.linalg.eigh(second_px.T @ second_px / len(second))
     common_px = np.sqrt(variance[1] - variance[0]) * axes[:, 1]
-    return Lights(merged, rows[first], common_px)
+    return ChosenLights(merged, rows[first], common_px)
 
 
 @jit

@@ -84,7 +84,7 @@ def prior_sigma(camera: Camera, focal_uncertainty: float) -> Floats:
 
 
 @dataclass(frozen=True)
-class Lens:
+class FittedCamera:
     """A fitted attitude and camera.
 
     Attributes
@@ -192,7 +192,9 @@ class Sights:
     vectors_ref: Floats
     match: Match
 
-    def grow(self, lens: Lens, pairs: NDArray, prior: Floats) -> tuple[Lens, NDArray, float]:
+    def grow(
+        self, lens: FittedCamera, pairs: NDArray, prior: Floats
+    ) -> tuple[FittedCamera, NDArray, float]:
         """Extend a candidate over the field: the numbered steps of the module.
 
         Parameters
@@ -204,7 +206,7 @@ class Sights:
 
         Returns
         -------
-        Lens
+        FittedCamera
             The fitted camera and attitude
         pairs
             (2, K) rows of the matched centroids and stars
@@ -233,7 +235,7 @@ class Sights:
             pairs = pairs[:, near]
         return lens, pairs, chi2
 
-    def _matched(self, lens: Lens) -> NDArray:
+    def _matched(self, lens: FittedCamera) -> NDArray:
         """Return the pairs of centroids and stars within the gates of the prediction: steps 2 and 3."""
         # MAX_FALSE random lights are within this distance.
         pixels = lens.given.width_px * lens.given.height_px
@@ -250,8 +252,13 @@ class Sights:
         return pairs[:, near]
 
     def fit(
-        self, lens: Lens, pairs: NDArray, prior: Floats, robust: bool, steps: int = STEPS
-    ) -> tuple[Lens, Floats, float]:
+        self,
+        lens: FittedCamera,
+        pairs: NDArray,
+        prior: Floats,
+        robust: bool,
+        steps: int = STEPS,
+    ) -> tuple[FittedCamera, Floats, float]:
         """Fit the unknowns to matches by Gauss-Newton, with the factor of the variances that the residuals imply.
 
         Parameters
@@ -266,7 +273,7 @@ class Sights:
 
         Returns
         -------
-        Lens
+        FittedCamera
             The fitted camera and attitude
         distance2
             (K,) squared Mahalanobis distances
@@ -298,7 +305,7 @@ class Sights:
             else:
                 variance = variance_factor(chi2, dof)
             most = MOST_SIGMA * prior[FOCAL:]
-            lens = Lens(
+            lens = FittedCamera(
                 lens.given,
                 Rotation.from_rotvec(step[:FOCAL]) * lens.cam_from_ref,
                 np.append(

@@ -162,7 +162,7 @@ class FieldMatcher:
 
     def _start(
         self, solution: Solution, centroids: Centroids, weight: Floats, variance: float
-    ) -> tuple[lens_fit.Sights, lens_fit.Lens, NDArray]:
+    ) -> tuple[lens_fit.Sights, lens_fit.FittedCamera, NDArray]:
         """Return centroids and a solution as input of the fit of the camera; parameters as of `with_lens`."""
         information = information_of(weight) / self.camera.focal_px**2
         whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
@@ -174,7 +174,7 @@ class FieldMatcher:
             lens_fit.Sights(
                 centroids.xy_px, whiten, self.stars.vectors, partial(self.nearest, centroids)
             ),
-            lens_fit.Lens(self.camera, cam_from_ref, change, unknown, variance),
+            lens_fit.FittedCamera(self.camera, cam_from_ref, change, unknown, variance),
             np.array([solution.observed, solution.star]),
         )
 

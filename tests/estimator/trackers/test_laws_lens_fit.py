@@ -34,16 +34,16 @@ def sky(limit_mag: float = 6.0) -> catalog.StarCatalog:
     return catalog.brighter_than(catalog.hipparcos(), limit_mag)
 
 
-def lens_at(rng: np.random.Generator, given: Camera = CAMERA) -> lens_fit.Lens:
+def lens_at(rng: np.random.Generator, given: Camera = CAMERA) -> lens_fit.FittedCamera:
     """A camera with all errors, as large as their priors."""
     sigma = lens_fit.prior_sigma(given, 0.0)
     change = np.where(np.isfinite(sigma), sigma, 0.0) * rng.uniform(-1, 1, UNKNOWNS)
     truth = Rotation.random(rng=rng)
-    return lens_fit.Lens(given, truth, change, np.zeros((UNKNOWNS, UNKNOWNS)), 1.0)
+    return lens_fit.FittedCamera(given, truth, change, np.zeros((UNKNOWNS, UNKNOWNS)), 1.0)
 
 
 def seen_by(
-    lens: lens_fit.Lens, rng: np.random.Generator, count: int
+    lens: lens_fit.FittedCamera, rng: np.random.Generator, count: int
 ) -> tuple[Floats, lens_fit.Sights]:
     """Directions within the field, and their noisy centroids."""
     rays = CAMERA.rays(rng.uniform(0, [1023, 779], (count, 2)))
@@ -63,7 +63,7 @@ def seen_by(
     return vectors, lens_fit.Sights(xy_px, whiten, vectors, match)
 
 
-@law(lens_fit.Lens.project)
+@law(lens_fit.FittedCamera.project)
 @given(rng=SEEDS)
 def test_slopes_are_difference_quotients(rng: np.random.Generator) -> None:
     lens = lens_at(rng)
@@ -87,7 +87,7 @@ def test_slopes_are_difference_quotients(rng: np.random.Generator) -> None:
         np.testing.assert_allclose(slopes[:, :, unknown], numeric, rtol=0, atol=0.01 * scale)
 
 
-@law(lens_fit.Lens.camera)
+@law(lens_fit.FittedCamera.camera)
 @given(rng=SEEDS)
 def test_a_camera_without_shear_projects_as_the_model(rng: np.random.Generator) -> None:
     lens = lens_at(rng)
@@ -102,7 +102,7 @@ def test_a_camera_without_shear_projects_as_the_model(rng: np.random.Generator) 
     )
 
 
-@law(lens_fit.Sights.fit, lens_fit.prior_sigma, lens_fit.Lens.covariance_rad2)
+@law(lens_fit.Sights.fit, lens_fit.prior_sigma, lens_fit.FittedCamera.covariance_rad2)
 @given(rng=SEEDS)
 def test_the_fitted_camera_has_an_honest_covariance(rng: np.random.Generator) -> None:
     """Errors of all unknowns, whitened by their covariance, are a chi-square with as many degrees of freedom."""
@@ -123,7 +123,7 @@ def test_the_fitted_camera_has_an_honest_covariance(rng: np.random.Generator) ->
     assert abs(np.mean(errors) - UNKNOWNS) < 5 * np.sqrt(2 * UNKNOWNS / 20)
 
 
-@law(lens_fit.Sights.grow, lens_fit.Lens.needed, lens_fit.Lens.sheared)
+@law(lens_fit.Sights.grow, lens_fit.FittedCamera.needed, lens_fit.FittedCamera.sheared)
 @given(rng=SEEDS, far=some.booleans())
 def test_a_match_grows_from_a_corner_to_the_field(
     rng: np.random.Generator, far: bool
