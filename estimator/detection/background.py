@@ -142,7 +142,7 @@ def flattened(image: NDArray, saturation: float) -> NDArray:
     top = min(saturation, float(image.max()))
     full = mean((bins >= top).astype(float)) > CROWDED
     dark = mean(mean(full.astype(float))) > TINY
-    excess[image >= top] = top
+    excess[image >= saturation] = saturation
     dark = np.kron(dark, np.ones((BIN_PX, BIN_PX), bool))[:height, :width]
     y, x = np.nonzero(dark)
     noise = (

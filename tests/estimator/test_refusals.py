@@ -170,8 +170,8 @@ SKIES: list[Case] = [
     ("lights", lambda: TRACKER.solve_centroids(XY), "centroids is .* allowed: Centroids"),
     (
         "effort",
-        lambda: TRACKER.solve_centroids(LIGHTS, effort=3),
-        "effort is 3; allowed: 0 to 2",
+        lambda: TRACKER.solve_centroids(LIGHTS, effort=TRACKER.efforts),
+        rf"effort is {TRACKER.efforts}; allowed: 0 to {TRACKER.efforts - 1}, or None",
     ),
     (
         "no row",
@@ -354,8 +354,16 @@ OTHERS: list[Case] = [
         lambda: star_field.self_calibrate([XY], lambda *_: TRACKER, CAMERA),
         "allowed: Centroids",
     ),
-    ("survey", lambda: dome_survey.survey([5], LEDS, LEVER, CAMERA), "frames: number 0 is 5"),
-    ("survey map", lambda: dome_survey.survey([], None, LEVER, CAMERA), "leds is None"),
+    (
+        "survey",
+        lambda: dome_survey.survey([5], LEDS, LEVER, CAMERA, leds_sigma_m=0.01),
+        "frames: number 0 is 5",
+    ),
+    (
+        "survey map",
+        lambda: dome_survey.survey([], None, LEVER, CAMERA, leds_sigma_m=0.01),
+        "leds is None",
+    ),
     (
         "home",
         lambda: home_position.calibrate([5], CAMERA, LEDS, LEVER),

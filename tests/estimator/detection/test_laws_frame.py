@@ -253,7 +253,7 @@ def test_replacing_bad_pixels_changes_no_other_pixel(
     assert frame.min() <= mended.min() <= mended.max() <= frame.max()
 
 
-@law()
+@law(classify.find_captions)
 @given(SEEDS, some.integers(5, 12), some.integers(8, 30), some.booleans())
 def test_letters_are_flagged_as_text_anywhere(
     rng: np.random.Generator, letters: int, height: int, even: bool

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
-from estimator.core.types import Centroids
+from estimator.core.types import Attitude, Centroids
 from estimator.identification.refusals import AMBIGUOUS, NO_LIGHTS, NO_STARS, WRONG_SCALE
 from estimator.trackers import rivals
 from estimator.trackers.star_tracker import StarTracker
+from tests.helpers.laws import SEEDS, law
 
 CAMERA = Camera.from_fov(1024, 1024, fov_deg=16.0)
 TRACKER = StarTracker.for_sky(CAMERA)
@@ -36,6 +38,27 @@ def lights(*skies: tuple[Rotation, float, int], scale: float = 1.0) -> Centroids
     mag = np.concatenate(mags)
     order = np.argsort(mag)
     return Centroids(xy_px[order], np.full(len(mag), 0.05), 10 ** (-0.4 * mag[order]))
+
+
+@law(rivals.with_rivals)
+@given(rng=SEEDS)
+def test_one_sky_has_no_rival_among_false_lights(rng: np.random.Generator) -> None:
+    """As many false lights as stars, and a refusal is returned as it is."""
+    frame = lights((Rotation.random(rng=rng), 0.0, 100))
+    false_px = rng.uniform(0, 1023, (len(frame), 2))
+    order = rng.permutation(2 * len(frame))
+    xy_px = np.concatenate([frame.xy_px, false_px])[order]
+    flux = np.concatenate([frame.flux, frame.flux])[order]
+    bright = np.argsort(-flux)
+    answer = TRACKER.solve_centroids(
+        Centroids(xy_px[bright], np.full(len(order), 0.05), flux[bright])
+    )
+    assert answer.rivals == ()
+    refused = Attitude(NO_STARS)
+    sky = TRACKER.sky
+    matcher = TRACKER.field_matcher
+    same = rivals.with_rivals(refused, frame, TRACKER.sigma_px, TRACKER.sensor, sky, matcher)
+    assert same is refused
 
 
 @pytest.mark.parametrize("turn", TURNS, ids=["half turn", "shift"])
