@@ -24,7 +24,7 @@ CONVERGED_PX = 1e-3
 # Prior of the factor of claimed variances: the probability that it is 1. Otherwise it is from 1 to MAX_VARIANCE_FACTOR,
 # evenly in its logarithm.
 PRIOR_RIGHT = 0.5
-MAX_VARIANCE_FACTOR = 100.0
+MAX_VARIANCE_FACTOR = 1000.0
 FACTORS = np.geomspace(1.0, MAX_VARIANCE_FACTOR, 60)
 
 

@@ -141,7 +141,7 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
        more than an eighth of the lights are so close by chance, the images are double, by vibration or a reflection,
        and either image may be the true one. The members of a group become one light at their mean place, whose error
        reaches to the farthest member, or as far as in the median.
-    3. The images of a reflection are all displaced alike. The second moments of the displacements then have unequal
+    3. The images of a reflection are all displaced alike. The medians of their second moments then have unequal
        eigenvalues, and their difference is the variance of an error that is common to all lights.
     """
     # 1. Number
@@ -175,7 +175,9 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     )
     # 3. Common error
     second_px = offset_px[second]
-    variance, axes = np.linalg.eigh(second_px.T @ second_px / len(second))
+    # Medians: a star beside another one is displaced otherwise.
+    moments = np.median(second_px[:, :, None] * second_px[:, None, :], axis=0)
+    variance, axes = np.linalg.eigh(moments)
     common_px = np.sqrt(variance[1] - variance[0]) * axes[:, 1]
     return ChosenLights(merged, rows[first], common_px)
 

@@ -39,7 +39,7 @@ from estimator.identification.star_evidence import Solution
 
 TELLING = 1.5  # variance factor above which the lens is fitted
 DOUBTFUL = 0.7  # reduced chi-square above which larger errors are tried, also where every centroid is matched
-TRIED = 2.0 ** np.arange(7)  # factors of the variances that are tried
+TRIED = 2.0 ** np.arange(11)  # factors of the variances that are tried
 # log10 of the prior odds of each larger factor against the claimed errors.
 PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))
 LENS_MATCHES = 6  # least number of matches for a fit of the lens

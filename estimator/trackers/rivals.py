@@ -19,8 +19,9 @@ weak for that:
 
     P(n_A or more of n lights belong to A) = sum over k from n_A to n of  C(n, k) q^k (1 - q)^(n - k)  >  10^-3
 
-With equal fields, 9 lights against 30 are no rival, and 10 are. A reflection is not brighter than its stars: the sky of
-significantly more matches is the true one.
+With equal fields, 9 lights against 30 are no rival, and 10 are. A sky of half as many lights is comparable in any case,
+as a camera that reports only its brightest lights does not show all stars of a rich field. A reflection is not brighter
+than its stars: the sky of significantly more matches is the true one.
 """
 
 from collections.abc import Callable
@@ -58,7 +59,7 @@ from estimator.trackers.refinement import FieldMatcher
 LOG10_COMPARABLE = -3.0
 MOST_RIVALS = 3
 MOST_LIGHTS = 20  # unmatched lights that are searched
-MAX_CHECKS = 1500  # effort of the search
+MAX_CHECKS = 5000  # effort of the search
 MAGNITUDE_SIGMA = 0.3  # least error of a difference of magnitudes
 SAME_SIGMAS = 5.0  # difference of attitudes that the covariance of the first one covers
 SAME_RAD = 0.1  # difference of attitudes that no misfit of the camera model causes
@@ -151,7 +152,8 @@ def _compared(
         for one in (first, second)
     )
     attitudes = tuple(one for _, one in skies)
-    if _is_comparable(len(first.star), len(second.star), rich / (rich + poor)):
+    matches = len(first.star), len(second.star)
+    if 2 * matches[1] >= matches[0] or _is_comparable(*matches, rich / (rich + poor)):
         return Attitude(AMBIGUOUS, rivals=attitudes)
     return replace(best, rivals=attitudes[1:])
 

@@ -183,7 +183,7 @@ def matrix(
     if not isinstance(node, dict):
         raise InputError(path, f"{key}: missing", "a matrix with rows, cols and data")
     shape = (node.get("rows"), node.get("cols"))
-    data = node.get("data")
+    data = node.get("data") or []
     if shape not in shapes:
         raise InputError(
             path,
@@ -191,14 +191,19 @@ def matrix(
             ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
+    try:
+        # OpenCV 5 writes 3e-09, which is a text for YAML 1.1.
+        values = [float(one) for one in data if type(one) in (int, float, str)]
+    except (TypeError, ValueError):
+        values = []
     # Below 1e12 excludes infinity and NaN.
     if (
         not isinstance(data, list)
-        or len(data) != count
-        or not all(type(one) in (int, float) and abs(one) < 1e12 for one in data)
+        or not len(data) == len(values) == count
+        or not all(abs(one) < 1e12 for one in values)
     ):
         raise InputError(path, f"{key}: other data", f"{count} finite numbers")
-    return [float(value) for value in data]
+    return values
 
 
 def text(calibration: OpencvCalibration) -> str:

@@ -412,6 +412,7 @@ def test_json_output_keeps_its_keys_and_adds_details(gray: NDArray, tmp_path: Pa
         "focal_px",
         "center_px",
         "distortion",
+        "pixel_aspect",
         "log10_chance",
         "matches",
         "rms_arcsec",

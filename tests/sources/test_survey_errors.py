@@ -196,6 +196,7 @@ def test_the_survey_does_not_change_the_hardware() -> None:
 # --- what they do -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_pupil_position_error_rotates_the_attitude_by_shift_over_led_distance(
     seed: int,

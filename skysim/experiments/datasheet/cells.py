@@ -62,7 +62,7 @@ BENDS_PX = (1.0, 4.0, 16.0, 64.0)  # acceleration times the square of the exposu
 TRACKED = 2  # frames before one in tracking mode: the second one gives a rate
 TRACKED_STREAKS_PX = (2.0, 8.0, 16.0, 32.0)  # lengths of the streaks in tracking mode
 # Acceleration times the square of the time between frames, in tracking mode.
-MISSED_PX = (3.0, 6.0, 12.0, 24.0)
+MISSED_PX = (8.0, 30.0, 60.0, 120.0)
 
 
 class Size(NamedTuple):
@@ -331,8 +331,8 @@ class Designer:
     def tracked(self) -> Cells:
         """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
 
-        The prediction extrapolates the mean rate between the last two frames, so an acceleration a displaces the next
-        one, t later, by a t^2 from it.
+        The prediction extrapolates the mean rate between the last two frames, and its change where the streaks tell it:
+        an acceleration a displaces the next frame, t later, by a t^2 from the mean rate alone.
         """
         if not tracks(self.scene):
             return

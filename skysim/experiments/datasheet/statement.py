@@ -473,7 +473,8 @@ def tracking_section(statement: Statement) -> StatementSection:
         f"Two frames of each attitude that differ in their noise, solved in tracking mode after {TRACKED} frames of the"
         " same motion, without a gyro: stars are detected in windows of 8 pixels around their predicted places. A frame"
         " that only the lost-in-space search would solve counts as refused. The prediction extrapolates the rate"
-        " between the last two frames, so an acceleration a misses by a t².",
+        " between the last two frames, and its change by the lengths of the streaks. Without the change, an"
+        " acceleration a misses by a t².",
         bracket_text("tracking in rate", rates, "rate_deg_s"),
         bracket_text("tracking in acceleration", accelerations, "acceleration_deg_s2"),
     ]

@@ -191,6 +191,7 @@ def test_an_error_at_the_first_frame_keeps_earlier_results(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.slow
 def test_a_black_frame_of_a_camera_outside_of_the_dome_has_a_warning(
     skysim: Skysim, tmp_path: Path
 ) -> None:

@@ -125,6 +125,7 @@ def test_directions_err_equally_in_the_whole_field() -> None:
     np.testing.assert_allclose(np.sqrt((off**2).mean(axis=1) / 2), 3.0, rtol=4 / 2 / 44.7)
 
 
+@pytest.mark.slow
 def test_the_tracker_measures_the_catalog_s_magnitudes() -> None:
     """In the band V a star of V = 4 is measured as 4, whatever its color: to .04 mag."""
     scene = loader.load("ptase_monte_carlo")
