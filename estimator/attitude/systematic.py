@@ -181,6 +181,7 @@ def with_focal_error(
     xy_px: Floats,
     seen_cam: Floats,
     sigma_rad: Floats,
+    noise_px2: Floats | None = None,
 ) -> tuple[Floats, Floats | None]:
     """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
 
@@ -194,13 +195,16 @@ def with_focal_error(
         (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
     sigma_rad
         (K,) standard deviations on which the covariance is based
+    noise_px2
+        (K,) variances of the frame's noise alone; None for sigma_rad without the focal length's part
     """
     if not camera.focal_sigma:
         return covariance_rad2, None
     view = geometry(seen_cam, seen_cam)
-    # The noise of the frame alone: sigma without the focal length's part; the limit guards against rounding.
-    focal_rad = focal_error_px(camera, xy_px) / camera.focal_px
-    noise_rad2 = np.maximum(sigma_rad**2 - focal_rad**2, (0.01 * sigma_rad) ** 2)
+    if noise_px2 is None:
+        noise_px2 = (sigma_rad * camera.focal_px) ** 2 - focal_error_px(camera, xy_px) ** 2
+    # The limit guards against rounding.
+    noise_rad2 = np.maximum(noise_px2 / camera.focal_px**2, (0.01 * sigma_rad) ** 2)
     noise = isotropic(np.sqrt(noise_rad2))
     common = camera.focal_sigma * view.tangent[None]
     return with_survey(covariance_rad2, view, sigma_rad, noise, np.zeros_like(noise), common)

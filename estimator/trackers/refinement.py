@@ -34,9 +34,9 @@ PARTIAL = f"{MISFIT}: only a part of the stars matches; calibrate the lens"
 # Least number of near misses per match for a wrong camera model; centroid errors that are claimed three times too small
 # give up to 0.75.
 MISFIT_SHARE = 0.8
-# Largest distance of a near miss, as a share of half the diagonal: of a calibrated and of an uncertain camera
-NEAR = 0.008
-NEAR_UNCERTAIN = 0.03
+# Largest distances of a near miss, as shares of half the diagonal: of a calibrated and of an uncertain camera
+NEAR = (0.008, 0.03)
+NEAR_UNCERTAIN = (0.03, 0.06)
 RADIUS_PX = 2.5  # of a match, for its chance
 KEPT_VARIANCE = 4.0  # factor of the variances to which a search's evidence holds after the fit of the camera
 # A detection brighter than its star by this much is a mismatch: colors, variables and doubles explain less.
@@ -96,7 +96,8 @@ class FieldMatcher:
             Whether the solution's evidence is by these errors
         """
         sights, start, pairs = self._start(solution, centroids, weight, variance)
-        lens, (observed, star), chi2 = sights.grow(start, pairs, self.prior)
+        lens, pairs, chi2 = sights.grow(start, pairs, self.prior)
+        observed, star = np.ascontiguousarray(pairs)  # compiled functions have one layout
         camera = lens.camera
         dex = solution.dex
         if self.focal_uncertainty or not exact:
@@ -194,7 +195,7 @@ class FieldMatcher:
         if lens.needed(self.prior)[lens_fit.ASPECT :].any():
             return False
         # 3. Near misses
-        near, by_chance = self.near_misses(start.camera, solution, centroids)
+        near, by_chance = self.near_misses(start.camera, solution, centroids)[0]
         return near <= 1 + 2 * by_chance
 
     def misfits(self, camera: Camera, solution: Solution, centroids: Centroids) -> bool:
@@ -206,8 +207,10 @@ class FieldMatcher:
         matched = len(solution.star)
         if len(centroids) - matched < MISFIT_SHARE * matched:
             return False
-        near, by_chance = self.near_misses(camera, solution, centroids)
-        return bool(near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance)))
+        return any(
+            near - by_chance > max(MISFIT_SHARE * matched, 3 * np.sqrt(by_chance))
+            for near, by_chance in self.near_misses(camera, solution, centroids)
+        )
 
     def reason_against(self, refitted: Refit, centroids: Centroids) -> str:
         """Return the reason to refuse a solution with its camera; empty if there is none."""
@@ -220,20 +223,23 @@ class FieldMatcher:
 
     def near_misses(
         self, camera: Camera, solution: Solution, centroids: Centroids
-    ) -> tuple[int, float]:
-        """Return the number of unmatched detections beside a star, and the number expected by chance."""
+    ) -> list[tuple[int, float]]:
+        """Return the number of unmatched detections beside an unmatched star, and that by chance, for each distance."""
         size_px = self.camera.width_px, self.camera.height_px
-        share = NEAR_UNCERTAIN if self.focal_uncertainty else NEAR
-        gate_px = share * np.hypot(*size_px) / 2 + 2
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)
-        _, star_px = self.in_field(camera, cam_from_ref)
+        rows, star_px = self.in_field(camera, cam_from_ref)
+        star_px = star_px[~np.isin(rows, solution.star)]
         others_px = np.delete(centroids.xy_px, solution.observed, axis=0)
         if not len(star_px):
-            return 0, 0.0
+            return [(0, 0.0)]
         distance_px, _ = cKDTree(star_px).query(others_px)
-        # The gates of all stars cover this share of the sensor.
-        covered = min(len(star_px) * np.pi * gate_px**2 / np.prod(size_px), 1.0)
-        return int(np.sum(distance_px < gate_px)), len(others_px) * covered
+        found = []
+        for share in NEAR_UNCERTAIN if self.focal_uncertainty else NEAR:
+            gate_px = share * np.hypot(*size_px) / 2 + 2
+            # The gates of all stars cover this share of the sensor.
+            covered = min(len(star_px) * np.pi * gate_px**2 / np.prod(size_px), 1.0)
+            found.append((int(np.sum(distance_px < gate_px)), len(others_px) * covered))
+        return found
 
 
 def log10_chance(

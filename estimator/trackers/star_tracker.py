@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rate import covariance_of
 from estimator.attitude.solvers import SOLVERS, covariance
-from estimator.attitude.systematic import with_focal_error
+from estimator.attitude.systematic import focal_error_px, with_focal_error
 from estimator.attitude.wahba import matrix_of
 from estimator.catalog import catalog, index_file, pair_index, quad_index, sky_index
 from estimator.catalog.refraction import SiteAir, solve_through_air
@@ -45,11 +45,11 @@ from estimator.identification.refusals import (
     advice,
 )
 from estimator.identification.star_detections import (
+    GATE_SIGMA,
     Detections,
     Sensor,
     detections_of,
     flat_centroids,
-    gates_of,
     lights_of,
 )
 from estimator.identification.star_evidence import Solution
@@ -599,8 +599,9 @@ class StarTracker(FrameTracker):
             # The larger errors have found the attitude; the residuals tell the errors.
             claimed = self.detections(centroids, self.sigma_px(centroids))
             R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+            gates = 1.5 * GATE_SIGMA * claimed.sigma
             found = star_evidence.evaluate(
-                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
+                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates, -np.inf
             )
             solution = star_evidence.build_solution(claimed, self.sky, found)
             return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
@@ -685,13 +686,24 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _, detections = refitted
+        noise_px2 = None
         if self.settings.centroid_sigma_px is None and detections is not None:
             searched_px = self.settings.searched_sigma_px
-            solution, floor_px2 = misfit.with_floor(
+            if camera.focal_sigma:
+                # The error of the focal length is common: an unknown of the residuals, not a noise.
+                noise_px2 = sigma_px**2 - focal_error_px(camera, centroids.xy_px) ** 2
+                detections = self.detections(
+                    centroids, np.sqrt(noise_px2), star_search.WRONG_FOCAL
+                )
+            with_floor, floor_px2 = misfit.with_floor(
                 solution, detections, self.sky, searched_px, self.camera.focal_px
             )
-            variance = 1.0
-            sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
+            if noise_px2 is not None:
+                noise_px2 += floor_px2 - searched_px**2
+            else:
+                solution = with_floor
+                variance = 1.0
+                sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
             if solution.focal_ratio != 1:
                 camera = self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = rotation_of(solution.cam_from_ref_xyzw)
@@ -707,8 +719,10 @@ class StarTracker(FrameTracker):
                 cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
                 covariance_rad2 = covariance(rays, sigma_rad, solver)
             seen_cam = cam_from_ref.apply(vectors)
+            if noise_px2 is not None:
+                noise_px2 = noise_px2[solution.observed]
             covariance_rad2, common_rad2 = with_focal_error(
-                covariance_rad2, camera, xy_px, seen_cam, sigma_rad
+                covariance_rad2, camera, xy_px, seen_cam, sigma_rad, noise_px2
             )
         v_mag = self.stars.v_mag[solution.star]
         match = StarMatch(

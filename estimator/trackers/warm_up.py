@@ -89,7 +89,8 @@ def run(
     square[y - 5 : y + 5, x - 5 : x + 5] = BRIGHT
     few = draw(camera, xy_px[:2], DIM * light[:2], kind, STREAK_PX)
     mirrored = np.ascontiguousarray(dim[:, ::-1])
-    for image in (dim, bright, few, smeared, mirrored):
+    two_skies = np.maximum(dim, mirrored)
+    for image in (dim, bright, few, smeared, mirrored, two_skies):
         look(image, None)
     look(square, (0.0, 0.0))
     look(smeared, STREAK_PX)

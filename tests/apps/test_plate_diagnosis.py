@@ -352,7 +352,7 @@ def test_a_refusal_is_printed_with_detections_and_attempts(
     terminal.print_solutions([found], tmp_path)
     printed = capsys.readouterr().out.splitlines()
     assert printed[-5:-1] == [
-        f"{tmp_path / 'x.png'}: no identification beyond chance: too many false lights",
+        f"{tmp_path / 'x.png'}: no identification beyond chance: the budget of the search is used up",
         f"  seen:   {found['lights']} lights, the brightest pixel {image.max()} DN, the background"
         f" {np.median(image):g} DN",
         "  tried:  fields 14.1° to 15.72° wide, stars to V 8",

@@ -375,7 +375,7 @@ def test_python_gets_detections_and_attempts(gray: NDArray, tmp_path: Path) -> N
     )  # as stored it is upright: seen, it is mirrored
     found = package.solve(path, fov_deg=FOV_DEG)
     assert (found.status, found.ra_deg, found.matches) == (
-        "no identification beyond chance: too many false lights",
+        "no identification beyond chance: the budget of the search is used up",
         None,
         0,
     )

@@ -32,7 +32,7 @@ def noisy_truth(
     flown: Flight, watch: Progress | None
 ) -> list[tuple[float, Rotation, Floats, Floats]]:
     """Attitudes with 10 arcsec of noise at 2 Hz instead of solved frames, without common errors."""
-    log = flown.simulate_motion(watch).telemetry()
+    log = flown.simulate_motion().telemetry()
     rng = random_stream(flown.lab.scene.seed, 999)
     every = round(0.5 / log.period_s)
     turned = Rotation.from_rotvec(SIGMA_RAD * rng.standard_normal((len(log.t_s[::every]), 3)))

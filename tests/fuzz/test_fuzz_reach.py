@@ -42,6 +42,7 @@ GUARDED = "runs in a child process with limits, whose end of any kind is an erro
 SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
     "estimator.catalog.catalog.StarCatalog.read": "hands the file on to the module's `read`",
+    "estimator.catalog.index_file.read": "a file of ours with a checksum, whose law reads damaged ones",
     "skysim.apps.cli.commands.camera.CameraGroup.parse_args": "words of the command line",
     "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
@@ -76,7 +77,7 @@ OUT_OF_REACH = {
     "skysim.core.images.LiveCamera.__init__": "a device, decoded by OpenCV",
     "skysim.experiments.balance_flight.parse_uncertainty": "words of the command line",
     "skysim.experiments.balance_procedure.parse_bars": "words of the command line",
-    "skysim.experiments.balance_report.write_all": "takes a picture of ours into a page",
+    "skysim.experiments.dome_survey.survey_report.survey_figure": "takes a picture of ours into a page",
     "skysim.experiments.characterize.frame_files.read_frames": "hands the files on to `read_picture`, `read_settings`",
     "skysim.experiments.characterize.frame_files.read_stack": "takes the frames of `read_frames`",
     "skysim.experiments.characterize.characterize_camera.read_camera": "hands the file on to `loader`",

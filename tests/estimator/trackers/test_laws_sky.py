@@ -287,7 +287,7 @@ def test_stars_beside_detections_reveal_a_wrong_camera(
     matched = np.flatnonzero(~moved if aside else moved | ~moved)
     solution = solution_of(truth, matched, rows)
     weight = eye.detections(centroids, np.full(count, 0.1)).weight
-    near, by_chance = matcher.near_misses(CAMERA, solution, centroids)
+    near, by_chance = matcher.near_misses(CAMERA, solution, centroids)[0]
     assert near >= moved.sum() * aside
     assert by_chance < 0.2 * max(count, 1)
     if count >= 8:

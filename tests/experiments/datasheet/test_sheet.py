@@ -35,7 +35,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
     monkeypatch.setattr(cells, "FAINTER", (-1.0,))
     monkeypatch.setattr(cells, "TRACKED_STREAKS_PX", (1.0,))
-    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 24.0))
+    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 120.0))
     monkeypatch.setattr(performance, "TIMED", 3)
 
 
@@ -73,7 +73,7 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
     assert min(whole.times_s) > 0
     assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"][
         "below"
-    ] == pytest.approx(54)
+    ] == pytest.approx(270)
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
@@ -106,7 +106,7 @@ def test_rates_double_until_most_fields_fail_and_are_kept(
     Nothing is drawn again: the same rows as before.
     """
     monkeypatch.setattr(cells, "MOST_FAIL", 0.5)
-    monkeypatch.setattr(cells, "side_px", lambda scene: 4)
+    monkeypatch.setattr(cells.scene_changes, "side_px", lambda scene: 4)
     first = measured(tmp_path)
     rates = first.levels("rate", "rate_deg_s")
     assert [rate / rates[0] for rate in rates] == [1, 2, 4]
@@ -118,7 +118,7 @@ def test_rates_double_until_most_fields_fail_and_are_kept(
     assert more.columns["x_arcsec"][:, :12].tobytes() == first.columns["x_arcsec"].tobytes()
     # Fewer than half of them right at the last rate: no faster one.
     last = first.rows("rate", rate_deg_s=rates[-1])
-    monkeypatch.setattr(cells, "side_px", lambda scene: 1000)
+    monkeypatch.setattr(cells.scene_changes, "side_px", lambda scene: 1000)
     assert "rate" in first.solved_at_all_rates()
     first.columns["solved"][last[0], :7] = 0
     assert "rate" not in first.solved_at_all_rates()

@@ -295,7 +295,7 @@ def test_a_frame_of_a_stop_shows_the_vehicle_at_rest(lab: Lab) -> None:
 def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
     prior = survey_prior.calibration_prior(lab)
-    sigmas = replace(UNCERTAINTY, lever_sigma_m=0.0)
+    sigmas = UNCERTAINTY._replace(lever_sigma_m=0.0)
     predicted_px, _ = survey_frames.prediction_sigmas_px(prior, sigmas)
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
     center = np.argsort(
@@ -491,7 +491,7 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
         )
     lever_z_m = []
     for fits in (False, True):
-        known = replace(UNCERTAINTY, fit_distortion=fits)
+        known = UNCERTAINTY._replace(fit_distortion=fits)
         run = adjust.run_survey(frames, prior, known)
         planned = survey_prior.survey_model(prior, known, NOISE_PX)
         predicted = survey_plan.predict(planned, held, planned.visible(held))
