@@ -97,7 +97,7 @@ def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [29, 32, 36])
+@pytest.mark.parametrize("number", [29, 36])
 def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number: int) -> None:
     """For trails that are detected in pieces, this more than doubles the number of correct centroids."""
     rng = np.random.default_rng([25, number])
