@@ -147,7 +147,7 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
                 20.0,
                 r"^no cause found: no field of 2° to 100° fits, nor the mirrored picture; [^-]*$",
             ),
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
     ],
     ids=[
@@ -200,7 +200,7 @@ def test_a_mirrored_sky_is_named_with_the_field_unknown() -> None:
     assert hint(mirror(photograph()), None).startswith("perhaps mirrored: ")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unsolved_unknown_field_gets_the_advice_for_a_narrow_one() -> None:
     deeper = "; if the field is below 4°, give it and take the catalog gaia_v10.0, after"
     assert deeper in hint(dots(photograph()), None)

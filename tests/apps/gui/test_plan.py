@@ -156,7 +156,7 @@ def flight_of(worker: Worker, overrides: dict[str, str]) -> None:
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_survey_continues_with_the_frames_flown() -> None:
     """Frames are at the planned attitudes; more frames measure more LEDs with the estimated errors."""
     worker = Worker()

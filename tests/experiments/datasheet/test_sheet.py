@@ -139,7 +139,7 @@ def test_chosen_rates_are_measured(small: None, tmp_path: Path) -> None:
     assert sheet.levels("boresight", "rate_deg_s") == [0.2, 0.5]
 
 
-@pytest.mark.parametrize("solved", [0, 6])
+@pytest.mark.parametrize("solved", [0, pytest.param(6, marks=pytest.mark.long)])
 def test_what_was_measured_is_written_without_the_terms(
     small: None, tmp_path: Path, solved: int
 ) -> None:
