@@ -35,7 +35,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
     monkeypatch.setattr(cells, "FAINTER", (-1.0,))
     monkeypatch.setattr(cells, "TRACKED_STREAKS_PX", (1.0,))
-    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 120.0))
+    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 24.0))
     monkeypatch.setattr(performance, "TIMED", 3)
 
 
@@ -71,9 +71,8 @@ def test_a_stopped_datasheet_resumes_with_the_same_result(
     whole = state(measured(tmp_path / "whole"))
     assert len(whole.times_s) == 3
     assert min(whole.times_s) > 0
-    assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"][
-        "below"
-    ] == pytest.approx(270)
+    # The prediction follows an acceleration that moves stars by three windows.
+    assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"]["below"] == np.inf
     with pytest.raises(KeyboardInterrupt):
         measured(tmp_path / "stopped", stop_after(4))
     again = state(measured(tmp_path / "stopped"))
