@@ -1,8 +1,8 @@
 """Fields of a camera whose model is wrong: pixels that are not square, shear, distortion, a focal length off bounds.
 
-The tracker is told a pinhole with square pixels, and its focal length exactly or to 5 %. A solution is wrong if it is
-more than 10' off, or more than 30" and five of its own standard deviations. A refusal should name the camera model.
-NEES is e' P^-1 e of the attitude error, 3 in the mean.
+The tracker assumes a pinhole with square pixels, and knows its focal length exactly or to 5 %. A solution is wrong if
+it is more than 10' off, or more than 30" and five of its own standard deviations. A refusal should name the camera
+model. NEES is e' P^-1 e of the attitude error, 3 in the mean.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ NAMED = "camera model"
 
 @dataclass(frozen=True)
 class Lens:
-    """What the tracker is not told of its camera.
+    """How the true camera differs from the one that the tracker assumes.
 
-    uncertainty : the relative uncertainty of the focal length that it is told; focal_error : the true error
+    uncertainty : relative uncertainty of the focal length in the settings; focal_error : the true error
     aspect      : ratio of the focal lengths along y and along x
     row_shear   : displacement of the last row against the middle one, along x
     corner_px   : displacement of a corner by radial distortion with the power `power` of the radius
-    rate_deg_s, readout_s : rolling shutter that is told as global: rate about random axes, time from first to last row
+    rate_deg_s, readout_s : rolling shutter, taken for a global one: rate about random axes, time from first to last row
     bar         : least share that is solved, or refused by name; nees : greatest mean NEES
     """
 

@@ -111,7 +111,7 @@ def lights(
     own_px: float,
     rng: np.random.Generator,
 ) -> Field:
-    """The brightest stars of a random field that has as many, with noise that is told and a floor that is not."""
+    """The brightest stars of a random field that has as many, with known noise and an unknown floor."""
     inside = np.empty(0, int)
     while len(inside) < kept:
         truth = Rotation.random(rng=rng)

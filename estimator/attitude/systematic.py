@@ -178,10 +178,9 @@ def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
 def with_focal_error(
     covariance_rad2: Floats,
     camera: Camera,
-    xy_px: Floats,
     seen_cam: Floats,
     sigma_rad: Floats,
-    noise_px2: Floats | None = None,
+    noise_px2: Floats,
 ) -> tuple[Floats, Floats | None]:
     """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
 
@@ -191,18 +190,16 @@ def with_focal_error(
     ----------
     covariance_rad2
         (3, 3) covariance in which that error, `focal_error_px`, is independent from star to star
-    xy_px, seen_cam
-        (K, 2) centroids and (K, 3) unit vectors of their stars in camera axes
+    seen_cam
+        (K, 3) unit vectors of the stars in camera axes
     sigma_rad
         (K,) standard deviations on which the covariance is based
     noise_px2
-        (K,) variances of the frame's noise alone; None for sigma_rad without the focal length's part
+        (K,) variances of the frame's noise alone
     """
     if not camera.focal_sigma:
         return covariance_rad2, None
     view = geometry(seen_cam, seen_cam)
-    if noise_px2 is None:
-        noise_px2 = (sigma_rad * camera.focal_px) ** 2 - focal_error_px(camera, xy_px) ** 2
     # The limit guards against rounding.
     noise_rad2 = np.maximum(noise_px2 / camera.focal_px**2, (0.01 * sigma_rad) ** 2)
     noise = isotropic(np.sqrt(noise_rad2))

@@ -51,9 +51,7 @@ from estimator.identification.star_detections import (
     detections_of,
     flat_centroids,
 )
-from estimator.identification.star_evidence import (
-    Solution,
-)
+from estimator.identification.star_evidence import Solution
 from estimator.trackers.refinement import FieldMatcher
 
 LOG10_COMPARABLE = -3.0

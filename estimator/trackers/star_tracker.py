@@ -45,11 +45,11 @@ from estimator.identification.refusals import (
     advice,
 )
 from estimator.identification.star_detections import (
-    GATE_SIGMA,
     Detections,
     Sensor,
     detections_of,
     flat_centroids,
+    gates_of,
     lights_of,
 )
 from estimator.identification.star_evidence import Solution
@@ -243,6 +243,10 @@ class StarTracker(FrameTracker):
         """
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        # Every error model of the search
+        clean = Centroids(xy_px, np.full(len(xy_px), 0.1), light)
+        for effort in range(self.efforts):
+            self.solve_centroids(clean, effort=effort)
         # Residuals of two and of four standard deviations cause a new match and a new fit of the errors.
         for step_px in 0.2, 0.4:
             moved_px = xy_px + step_px * (-1.0) ** np.arange(len(xy_px))[:, None]
@@ -599,9 +603,8 @@ class StarTracker(FrameTracker):
             # The larger errors have found the attitude; the residuals tell the errors.
             claimed = self.detections(centroids, self.sigma_px(centroids))
             R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
-            gates = 1.5 * GATE_SIGMA * claimed.sigma
             found = star_evidence.evaluate(
-                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates, -np.inf
+                claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
             )
             solution = star_evidence.build_solution(claimed, self.sky, found)
             return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
@@ -686,24 +689,14 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _, detections = refitted
-        noise_px2 = None
-        if self.settings.centroid_sigma_px is None and detections is not None:
+        has_floor = self.settings.centroid_sigma_px is None and detections is not None
+        if has_floor and not camera.focal_sigma:
             searched_px = self.settings.searched_sigma_px
-            if camera.focal_sigma:
-                # The error of the focal length is common: an unknown of the residuals, not a noise.
-                noise_px2 = sigma_px**2 - focal_error_px(camera, centroids.xy_px) ** 2
-                detections = self.detections(
-                    centroids, np.sqrt(noise_px2), star_search.WRONG_FOCAL
-                )
-            with_floor, floor_px2 = misfit.with_floor(
+            solution, floor_px2 = misfit.with_floor(
                 solution, detections, self.sky, searched_px, self.camera.focal_px
             )
-            if noise_px2 is not None:
-                noise_px2 += floor_px2 - searched_px**2
-            else:
-                solution = with_floor
-                variance = 1.0
-                sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
+            variance = 1.0
+            sigma_px = np.sqrt(sigma_px**2 - searched_px**2 + floor_px2)
             if solution.focal_ratio != 1:
                 camera = self.camera.zoomed(solution.focal_ratio)
         cam_from_ref = rotation_of(solution.cam_from_ref_xyzw)
@@ -719,10 +712,14 @@ class StarTracker(FrameTracker):
                 cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
                 covariance_rad2 = covariance(rays, sigma_rad, solver)
             seen_cam = cam_from_ref.apply(vectors)
-            if noise_px2 is not None:
-                noise_px2 = noise_px2[solution.observed]
+            if has_floor:
+                noise_px2 = self._noise_px2(centroids, solution, sigma_px)
+            else:
+                noise_px2 = (
+                    variance * sigma_px**2 - focal_error_px(camera, centroids.xy_px) ** 2
+                )
             covariance_rad2, common_rad2 = with_focal_error(
-                covariance_rad2, camera, xy_px, seen_cam, sigma_rad, noise_px2
+                covariance_rad2, camera, seen_cam, sigma_rad, noise_px2[solution.observed]
             )
         v_mag = self.stars.v_mag[solution.star]
         match = StarMatch(
@@ -732,6 +729,21 @@ class StarTracker(FrameTracker):
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
         )
+
+    def _noise_px2(
+        self, centroids: Centroids, solution: Solution, sigma_px: Floats
+    ) -> Floats:
+        """Return the (N,) variances of the centroids' noise, with the floor that a solution's residuals imply.
+
+        The error of the focal length is common to all stars: an unknown of the residuals, not a noise.
+        """
+        noise_px2 = sigma_px**2 - focal_error_px(self.camera, centroids.xy_px) ** 2
+        searched_px = self.settings.searched_sigma_px
+        free = self.detections(centroids, np.sqrt(noise_px2), star_search.WRONG_FOCAL)
+        _, floor_px2 = misfit.with_floor(
+            solution, free, self.sky, searched_px, self.camera.focal_px
+        )
+        return noise_px2 + floor_px2 - searched_px**2
 
 
 def _published() -> Mapping[str, Callable[..., StarMatch | None]]:

@@ -1,6 +1,7 @@
 """Camera calibrations in OpenCV's YAML format: read them with checks, and write them for OpenCV."""
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,7 +71,7 @@ class OpencvCalibration:
 
 
 class Loader(StrictLoader):
-    """`StrictLoader` that reads OpenCV's matrices as mappings."""
+    """`StrictLoader` that reads OpenCV's matrices as mappings, and numbers such as 3e-09, texts in YAML 1.1."""
 
 
 def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
@@ -83,6 +84,9 @@ def matrix_node(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
 
 
 Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix_node)
+Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?\d+e[-+]?\d+$", re.ASCII), "-+0123456789"
+)
 
 
 def looks_like_calibration(path: Path) -> bool:
@@ -183,7 +187,7 @@ def matrix(
     if not isinstance(node, dict):
         raise InputError(path, f"{key}: missing", "a matrix with rows, cols and data")
     shape = (node.get("rows"), node.get("cols"))
-    data = node.get("data") or []
+    data = node.get("data")
     if shape not in shapes:
         raise InputError(
             path,
@@ -191,19 +195,14 @@ def matrix(
             ", ".join(f"{rows}x{cols}" for rows, cols in shapes),
         )
     count = shape[0] * shape[1]
-    try:
-        # OpenCV 5 writes 3e-09, which is a text for YAML 1.1.
-        values = [float(one) for one in data if type(one) in (int, float, str)]
-    except (TypeError, ValueError):
-        values = []
     # Below 1e12 excludes infinity and NaN.
     if (
         not isinstance(data, list)
-        or not len(data) == len(values) == count
-        or not all(abs(one) < 1e12 for one in values)
+        or len(data) != count
+        or not all(type(one) in (int, float) and abs(one) < 1e12 for one in data)
     ):
         raise InputError(path, f"{key}: other data", f"{count} finite numbers")
-    return values
+    return [float(value) for value in data]
 
 
 def text(calibration: OpencvCalibration) -> str:

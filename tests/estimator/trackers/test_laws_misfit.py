@@ -191,7 +191,7 @@ def test_the_floor_of_the_errors_has_the_restricted_likelihood(tracker: StarTrac
 
 @pytest.mark.parametrize("floor_px", [0.01, 0.1])
 def test_the_default_settings_claim_what_the_frame_shows(floor_px: float) -> None:
-    """An honest mean NEES where the errors have a floor that nobody told, below and at that of the search."""
+    """An honest mean NEES where the errors have an unknown floor, below and at that of the search."""
     stars = catalog.brighter_than(catalog.hipparcos(), 5.0)
     eye = StarTracker(CAMERA, stars, stars.vectors, Settings(zero_point_mag=0.0))
     nees = []
