@@ -711,16 +711,17 @@ class StarTracker(FrameTracker):
                 rays = camera.rays(xy_px)
                 cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
                 covariance_rad2 = covariance(rays, sigma_rad, solver)
-            seen_cam = cam_from_ref.apply(vectors)
-            if has_floor:
-                noise_px2 = self._noise_px2(centroids, solution, sigma_px)
-            else:
-                noise_px2 = (
-                    variance * sigma_px**2 - focal_error_px(camera, centroids.xy_px) ** 2
+            if camera.focal_sigma:
+                if has_floor:
+                    noise_px2 = self._noise_px2(centroids, solution, sigma_px)
+                else:
+                    focal_px2 = focal_error_px(camera, centroids.xy_px) ** 2
+                    noise_px2 = variance * sigma_px**2 - focal_px2
+                noise_px2 = noise_px2[solution.observed]
+                seen_cam = cam_from_ref.apply(vectors)
+                covariance_rad2, common_rad2 = with_focal_error(
+                    covariance_rad2, camera, seen_cam, sigma_rad, noise_px2
                 )
-            covariance_rad2, common_rad2 = with_focal_error(
-                covariance_rad2, camera, seen_cam, sigma_rad, noise_px2[solution.observed]
-            )
         v_mag = self.stars.v_mag[solution.star]
         match = StarMatch(
             solution.observed, solution.star, cam_from_ref, -solution.dex, v_mag
