@@ -159,7 +159,7 @@ def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(
     tmp_path: Path,
 ) -> None:
     command = [
-        "stream",
+        "live",
         "shefex2",
         "--folder",
         str(tmp_path),
@@ -173,7 +173,7 @@ def test_a_stream_without_room_names_the_file_and_counts_what_was_lost(
         done = CliRunner().invoke(main.app, [*command, "--json"])
     assert str(done.exception) == f"--folder: {tmp_path / 'frame_000000.png'}: File too large"
     report = json.loads(done.stdout)
-    assert report["sinks"]["folder"]["dropped"] == report["made"] >= 1
+    assert report["outputs"]["folder"]["dropped"]["frame"] == report["made"] >= 1
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,9 +6,14 @@
 2. Subtract the torque of the fans that dump momentum.
 3. Allocate the rest to the chosen actuators.
 4. Return the torque that they can give to the law, for its anti-windup.
+
+Another program may replace the law by a torque, or single motors' commands (`Commands`).
 """
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +36,25 @@ from skysim.scene.sections.motion import BUILT_IN_LAWS
 
 # Return rate of the controller over the gyros' rate limit (`assumed`)
 GYRO_RATE_FRACTION = 0.7
+
+
+class Commands(NamedTuple):
+    """What another program commands in place of the control law in one control period.
+
+    Attributes
+    ----------
+    torque_nm
+        (3,) torque in body axes, which the actuators of the control law give; None without
+    motors
+        Commands (n,) of the single motors by the key of their set in `vehicle`, in the units and the order of
+        `Actuators.command`; those of the law's own actuators replace the law
+    """
+
+    torque_nm: Floats | None = None
+    motors: Mapping[str, Floats] = MappingProxyType({})
+
+
+NO_COMMANDS = Commands()
 
 
 def authority_nm(actuators: Actuators) -> float:
@@ -157,7 +181,7 @@ class FlightComputer:
         inputs: ControlInput,
         lab_from_body_wxyz: Floats,
         momentum_nms: Floats,
-        torque_nm: Floats | None = None,
+        commands: Commands = NO_COMMANDS,
     ) -> Floats:
         """(nu,) controls for this period.
 
@@ -169,19 +193,26 @@ class FlightComputer:
             (4,) measured attitude
         momentum_nms
             (3,) momentum stored in wheels and CMGs, in body axes
-        torque_nm
-            (3,) torque in body axes that replaces that of the control law
+        commands
+            What replaces the control law
         """
         control = np.zeros(self.nu)
-        if self.config is None and torque_nm is None:
+        config = self.config
+        if config is None and commands.torque_nm is None and not commands.motors:
             return control
-        # 1. Control law, unless the caller gives a torque.
-        if torque_nm is None:
+        # 1. Control law, unless its torque or its actuators are commanded.
+        has_law = not (
+            config is None
+            or commands.torque_nm is not None
+            or config.actuators in commands.motors
+        )
+        self.control_torque_nm = (
+            np.zeros(3) if commands.torque_nm is None else commands.torque_nm
+        )
+        if has_law:
             self.control_torque_nm = self.law.torque_nm(
                 inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
             )
-        else:
-            self.control_torque_nm = torque_nm
         # 2. The actuators hold the body against the fans, which takes momentum out of them.
         dump_nm = np.zeros(3)
         if self.momentum_dump:
@@ -190,6 +221,8 @@ class FlightComputer:
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
         self.achieved_nm = achieved_nm + dump_nm
+        for key, motor_commands in commands.motors.items():
+            self.actuator_sets[key].command(control, motor_commands, inputs)
         if self.names:
             self.loads = np.abs(control[self.motors]) / self.limit
             if isinstance(self.actuator, WheelActuator):
@@ -199,7 +232,7 @@ class FlightComputer:
                     self.loads, speeds / self.actuator.model.speed_limit_rad_s
                 )
         # 4. Anti-windup.
-        if torque_nm is None:
+        if has_law:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
         return control
 

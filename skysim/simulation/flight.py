@@ -22,6 +22,7 @@ from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
 from skysim.dynamics import imu
+from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
 from skysim.scene.scene import Scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
@@ -51,8 +52,8 @@ class Shot:
 
     Attributes
     ----------
-    camera
-        Star camera
+    camera, window
+        Star camera, and its exposure window
     frame, truth
         Image and truth
     report
@@ -66,6 +67,7 @@ class Shot:
     """
 
     camera: StarCamera
+    window: Window
     frame: Frame
     truth: Truth
     report: Report | None
@@ -115,7 +117,9 @@ class Schedule:
     index
         Index of the next frame
     exposures_s
-        Exposure times of the frames exposed so far, by index
+        Exposure times of the frames exposed so far, by index; empty in an endless flight
+    triggers_s
+        Times at which triggered exposures open, by index; None: the scene's schedule
     """
 
     def __init__(self, camera: StarCamera, number: int, frames: float) -> None:
@@ -126,18 +130,36 @@ class Schedule:
         self.latency_s = camera.scene.filter.latency_s if camera.scene.filter else 0.0
         self.index = 0
         self.exposures_s: dict[int, float] = {}
+        self.triggers_s: dict[int, float] | None = None
 
     @property
     def is_over(self) -> bool:
         """Whether all frames were exposed."""
+        if self.triggers_s is not None:
+            return self.index not in self.triggers_s
         return self.index >= self.frames
+
+    def trigger(self, now_s: float) -> None:
+        """Open an exposure now, or at the end of those that were triggered before."""
+        waiting = {n: t_s for n, t_s in (self.triggers_s or {}).items() if n >= self.index}
+        open_s = now_s
+        if waiting:
+            rows = self.camera.scene.camera.height_px
+            last = timing.window_from(
+                self.camera.scene, max(waiting.values()), self.exposure_control.exposure_s
+            )
+            open_s = max(now_s, last.close_s(rows))
+        self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
     @property
     def window(self) -> Window:
         """Exposure window of the next frame."""
-        return timing.exposure_window(
-            self.camera.scene, self.index, self.exposure_control.exposure_s
-        )
+        exposure_s = self.exposure_control.exposure_s
+        if self.triggers_s is not None:
+            return timing.window_from(
+                self.camera.scene, self.triggers_s[self.index], exposure_s
+            )
+        return timing.exposure_window(self.camera.scene, self.index, exposure_s)
 
     @property
     def close_s(self) -> float:
@@ -238,7 +260,9 @@ class Flight:
             simulation.angles_rad[vehicle.gimbals.qpos],
         )
 
-    def step(self, torque_nm: Floats | None = None) -> list[Shot]:
+    def step(
+        self, torque_nm: Floats | None = None, motors: Mapping[str, Any] = NO_COMMANDS.motors
+    ) -> list[Shot]:
         """Simulate one control period. Returns the exposures that updated the filter in it; none without a filter.
 
         Parameters
@@ -246,28 +270,61 @@ class Flight:
         torque_nm
             (3,) torque in body axes that replaces that of the controller. The scene's actuators give it, or the
             ideal actuator if the scene has no controller
+        motors
+            Commands of single motors, as `commands` takes them
 
         Raises
         ------
         InputError
-            Inside a loop over `shots`, at the end of the motion, for a torque on a prescribed motion, and for a
-            torque that is not three finite numbers.
+            Inside a loop over `shots`, at the end of the motion, and for commands that `commands` refuses.
         """
         self.refuse_in_shots("step")
         if self.is_over:
             raise InputError(
                 "step", f"the motion has ended at {self.now_s:g} s", "more frames, or endless"
             )
-        if torque_nm is not None and self.lab.scene.motion.is_prescribed:
+        self.motion.advance(self.motion.period_steps, self.commands(torque_nm, motors))
+        return list(self.capture_due(self.filter_schedules))
+
+    def commands(
+        self, torque_nm: Any = None, motors: Mapping[str, Any] = NO_COMMANDS.motors
+    ) -> Commands:
+        """Commands for a control period, checked.
+
+        Parameters
+        ----------
+        torque_nm
+            (3,) torque in body axes; None without
+        motors
+            Commands (n,) of single motors by the key of their actuators: torques of `wheels` in N m, gimbal rates of
+            `cmgs` in rad/s, thrusts of `fans` in N. Those beyond a limit are clipped to it
+
+        Raises
+        ------
+        InputError
+            For commands to a prescribed motion, actuators that are off, and values that are not as many finite
+            numbers as there are motors.
+        """
+        if torque_nm is None and not motors:
+            return NO_COMMANDS
+        if self.lab.scene.motion.is_prescribed:
             raise InputError(
                 "step", "a prescribed motion takes no torque", "another motion.control.law"
             )
+        sets = self.motion.flight_computer.actuator_sets
+        unknown = [key for key in motors if key not in sets]
+        if unknown:
+            raise InputError(unknown[0], "no such actuators", ", ".join(sets))
         try:
-            torque = None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,))
+            return Commands(
+                None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,)),
+                {
+                    key: finite_array(values, key, sets[key].command_map()[0].shape[:1])
+                    for key, values in motors.items()
+                },
+            )
         except ValueError as error:
             raise InputError("step", error) from None
-        self.motion.advance(self.motion.period_steps, torque)
-        return list(self.capture_due(self.filter_schedules))
 
     def refuse_in_shots(self, name: str) -> None:
         """Raise InputError inside a loop over `shots`."""
@@ -291,6 +348,9 @@ class Flight:
         if motion.is_free:
             due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
             left_s = min(due_s, self.duration_s) - self.now_s
+            if motion.recorder is None:
+                # No more than there is room for.
+                left_s = min(left_s, history_s(self.lab))
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
         motion.advance(periods * motion.period_steps)
 
@@ -400,12 +460,13 @@ class Flight:
         solves: bool = False,
         selects: FrameSelector | None = None,
         late: bool = False,
+        updates_filter: bool = True,
     ) -> Iterator[Shot]:
         """Yield the exposures that are due and not yet rendered, in order; a filter is updated with each.
 
         Late ones ended within the motion but are due after its end; the filter is not updated.
         """
-        has_filter = bool(self.filter_schedules) and not late
+        has_filter = bool(self.filter_schedules) and updates_filter and not late
         while due := [
             one
             for one in schedules
@@ -419,7 +480,8 @@ class Flight:
             schedule.index += 1
             if selects and schedule.number == 0 and not selects(index, close_s):
                 continue
-            schedule.exposures_s[index] = window.exposure_s
+            if math.isfinite(schedule.frames):
+                schedule.exposures_s[index] = window.exposure_s
             shot = self.capture(schedule, index, window, solves or has_filter, has_filter)
             schedule.exposure_control.update(shot.frame)
             yield shot
@@ -479,7 +541,7 @@ class Flight:
             update_status = self.motion.navigation.update_filter(
                 frame.t_mid_s, report.attitude, schedule.number
             )
-        return Shot(camera, frame, truth, report, rate, update_status, clock.seconds)
+        return Shot(camera, window, frame, truth, report, rate, update_status, clock.seconds)
 
     def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
         """The tracker of a camera. A new one first solves the frame once, so later times contain no compilation.

@@ -27,7 +27,7 @@ from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
-from skysim.dynamics.flight_computer import FlightComputer, usage
+from skysim.dynamics.flight_computer import NO_COMMANDS, Commands, FlightComputer, usage
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
@@ -191,7 +191,7 @@ def shortfall(lab: Lab) -> str:
         # 2. Allocation and response.
         inputs = ControlInput(t, period_s, rate, angles, speeds)
         owed = (needed - given).sum(axis=0)
-        controls = computer.compute_controls(inputs, attitude, momentum, owed)
+        controls = computer.compute_controls(inputs, attitude, momentum, Commands(owed))
         given[k] = computer.achieved_nm
         angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
         for spun in (vehicle.wheels, vehicle.rotors):
@@ -485,15 +485,15 @@ class Motion:
         """Integration steps in a control period."""
         return round(self.flight_computer.period_s / self.simulation.step_s)
 
-    def advance(self, steps: int, torque_nm: Floats | None = None) -> None:
+    def advance(self, steps: int, commands: Commands = NO_COMMANDS) -> None:
         """Simulate some steps with controls that are held over them, by the steps of the module's docstring.
 
         Parameters
         ----------
         steps
             Number of integration steps: those of a control period, or more if nothing depends on the motion
-        torque_nm
-            (3,) torque in body axes that replaces that of the controller
+        commands
+            What replaces the control law
         """
         simulation = self.simulation
         flight_computer = self.flight_computer
@@ -515,7 +515,7 @@ class Motion:
         inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
         control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
         control[:] = flight_computer.compute_controls(
-            inputs, measured_attitude, momentum, torque_nm
+            inputs, measured_attitude, momentum, commands
         )
         # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
         mean_nm = np.zeros(3)

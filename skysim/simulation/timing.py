@@ -12,6 +12,9 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 
 MARGIN_S = 2e-3  # time that is simulated after the last exposure
+LONGEST_LIVE_S = (
+    1.0  # longest exposure that a client may set where the scene has none as long
+)
 HISTORY_MARGIN_S = 0.05  # duration of past states that is kept beyond the needs of a frame
 
 
@@ -59,6 +62,12 @@ def longest_exposure_s(scene: Scene) -> float:
     return control.longest_s if control else scene.exposure.time_s
 
 
+def longest_live_s(scene: Scene) -> float:
+    """The longest exposure that a client may set: the scene's longest, or a frame period up to LONGEST_LIVE_S."""
+    period_s = min(1 / scene.exposure.rate_hz, LONGEST_LIVE_S)
+    return max(longest_exposure_s(scene), period_s)
+
+
 def frame_end_s(scene: Scene, index: int, exposure_s: float | None = None) -> float:
     """Time until which a motion must last for a frame."""
     return (
@@ -82,7 +91,7 @@ def duration_s(scene: Scene) -> float:
 def history_s(scene: Scene) -> float:
     """Duration of past states that a frame needs when it is due: longest exposure, latency, two control periods."""
     latency_s = scene.filter.latency_s if scene.filter else 0.0
-    window = exposure_window(scene, 0, longest_exposure_s(scene))
+    window = exposure_window(scene, 0, longest_live_s(scene))
     return (
         window.close_s(scene.camera.height_px)
         - window.open_s

@@ -34,6 +34,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
     "docs/howto/export.md": "docs/test_formats.py",
     "docs/howto/external_tracker.md": "tracking/test_interface.py",
     "docs/howto/light.md": "simulation/test_lights.py",
+    "docs/howto/live.md": "apps/live/test_clients.py",
     "docs/findings/papers.md": "experiments/papers/test_reproduction.py",
     "docs/findings/studies.md": "docs/test_docs.py",
     "estimator/README.md": "docs/test_estimator_readme.py",
@@ -52,11 +53,10 @@ LONG = {
     "howto/thesis_tests.md",
     "howto/tracker.md",
     "explanation/error_budget.md",
-    "howto/stream.md",
 }
 NEEDS = {"howto/query_results.md": "duckdb"}  # of the extra that `make test-slow` installs
-# All that a page may have; the last four are not run.
-LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "math"}
+# All that a page may have; the last five are not run.
+LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "math", "c"}
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# ([\w.]+\.(?:py|yaml))\n")
 NUMBER = re.compile(r"[-+−]?\d[\d.,e+]*")

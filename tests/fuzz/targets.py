@@ -17,8 +17,8 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.live.packets import unpack
 from skysim.apps.plate_solver import picture
-from skysim.apps.stream import sinks
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader
 from skysim.core.errors import InputError
@@ -241,7 +241,7 @@ def torques(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
-    rejects(lambda: sinks.unpack(BytesIO(data)), InputError)
+    rejects(lambda: unpack(BytesIO(data)), InputError)
 
 
 def quantities(data: bytes) -> None:

@@ -31,7 +31,7 @@ from skysim.core import __version__, errors
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 # Commands by the job that they do, as `skysim --help` lists them.
 JOBS = {
-    "Simulate": (resources.new, run.run, run.render, serve.stream, serve.gui),
+    "Simulate": (resources.new, run.run, run.render, serve.live, serve.gui),
     "Plan": (
         validate.check,
         validate.validate,

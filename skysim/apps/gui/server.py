@@ -3,7 +3,6 @@
 import asyncio
 import ctypes
 import gc
-import hmac
 import re
 import secrets
 import signal
@@ -29,6 +28,7 @@ from starlette.responses import (
 )
 from starlette.routing import Route, Router
 
+from skysim.apps.access import LOOPBACK, same_site, token_matches
 from skysim.apps.gui.page.photo_panel import LIMIT_BYTES
 from skysim.apps.gui.page.tab import Tab
 from skysim.apps.gui.views.overlay import FRAMES, display_of
@@ -90,7 +90,6 @@ class ClosedPages:
         await asyncio.to_thread(release_memory)
 
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 # Only this server's own code runs in the page, and no other site may frame it. NiceGUI needs inline code and `eval`.
 PAGE_POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline';"
@@ -238,12 +237,9 @@ class Guard:
     def refusal(self, request: HTTPConnection) -> Response | None:
         """The response to a refused request; None if it is allowed."""
         headers = request.headers
-        host = headers.get("host", "")
-        origin = headers.get("origin", "")
-        if "*" not in self.hosts and host_of(host) not in self.hosts:
-            return PlainTextResponse("host name not allowed", 403)
-        if origin and origin.partition("://")[2] != host:
-            return PlainTextResponse("request of another site refused", 403)
+        refused = same_site(headers.get("host", ""), headers.get("origin", ""), self.hosts)
+        if refused:
+            return PlainTextResponse(refused, 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
             return PlainTextResponse("request too large; allowed: 64 MB", 413)
         # The token is removed from the address.
@@ -264,16 +260,6 @@ class Guard:
             "token missing or wrong; open the address that the server printed: /?token=...",
             401,
         )
-
-
-def token_matches(candidate: str, token: str) -> bool:
-    """Compare with the token in constant time, so that timing reveals nothing about it."""
-    return hmac.compare_digest(candidate.encode(), token.encode())
-
-
-def host_of(header: str) -> str:
-    """The host of a Host header, without the port."""
-    return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
 
 
 def with_policy(send: Any) -> Any:

@@ -45,6 +45,10 @@ class Actuators(Protocol):
         """Write the commands into control; return the torque (3,) that they will give."""
         ...
 
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
+        ...
+
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored angular momentum, in body axes."""
         ...

@@ -70,7 +70,10 @@ class IdealTorque:
         self.limit_nm = limit_nm
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        control[self.motor] = achieved_nm = np.clip(torque_nm, -self.limit_nm, self.limit_nm)
+        return self.command(control, torque_nm, inputs)
+
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        control[self.motor] = achieved_nm = np.clip(commands, -self.limit_nm, self.limit_nm)
         return achieved_nm
 
     def command_map(self) -> tuple[Floats, float]:

@@ -304,6 +304,12 @@ class CmgActuator:
             achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
         return achieved_nm
 
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        limit_rad_s = self.model.gimbal_rate_limit_rad_s
+        control[self.gimbals.motor] = rate = np.clip(commands, -limit_rad_s, limit_rad_s)
+        angle = inputs.angles_rad[self.gimbals.qpos]
+        return -self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof]) @ rate
+
     def command_map(self) -> tuple[Floats, float]:
         jacobian = self.model.jacobian(
             np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)

@@ -116,8 +116,11 @@ class FanActuator:
         self.model = FanSet(fans.axes, fans.positions_m, config.thrust_limit_n)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        thrust = self.model.drive(torque_nm)
-        control[self.motor] = thrust
+        return self.command(control, self.model.drive(torque_nm), inputs)
+
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        limit_n = self.model.thrust_limit_n
+        control[self.motor] = thrust = np.clip(commands, -limit_n, limit_n)
         return self.model.torque(thrust)
 
     def command_map(self) -> tuple[Floats, float]:

@@ -72,12 +72,17 @@ class WheelSet:
         1. The smallest torques that give it, u = -axes^+ T; if the axes do not span space (n < 3, or all in a plane),
            the nearest in least squares.
         2. One factor scales them to the torque limit, which keeps the direction of T.
-        3. Clip each to the torque that just reaches the speed limit within the period, by inertia d(speed)/dt = u
-           without the body's own acceleration. A wheel at its limit can only be braked. This may change the direction.
+        3. `within_limits`, which may change the direction.
         """
-        # 1. and 2. Minimum norm, torque limit.
         motor = scale_to_limit(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
-        # 3. Speed limit.
+        return self.within_limits(motor, speed_rad_s, period_s)
+
+    def within_limits(self, motor_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
+        """Motor torques (n,), each clipped to its limit and to what just reaches the speed limit within period_s.
+
+        By inertia d(speed)/dt = u, without the body's own acceleration. A wheel at its limit can only be braked.
+        """
+        motor = np.clip(motor_nm, -self.torque_limit_nm, self.torque_limit_nm)
         torque_per_speed = self.inertia_kg_m2 / period_s
         upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speed_rad_s), 0.0)
         lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speed_rad_s), 0.0)
@@ -99,6 +104,13 @@ class WheelActuator:
             torque_nm, inputs.speeds_rad_s[self.joints.dof], inputs.period_s
         )
         control[self.joints.motor] = motor
+        return -self.model.axes @ motor
+
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        speeds = inputs.speeds_rad_s[self.joints.dof]
+        control[self.joints.motor] = motor = self.model.within_limits(
+            commands, speeds, inputs.period_s
+        )
         return -self.model.axes @ motor
 
     def command_map(self) -> tuple[Floats, float]:

@@ -20,9 +20,10 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
+from skysim.apps.access import host_of
 from skysim.apps.gui import server
 from skysim.apps.gui.messages import LIGHT, Detection, TrackerResult
-from skysim.apps.gui.server import FILES, Guard, KeptFiles, host_of, report_path, user_of
+from skysim.apps.gui.server import FILES, Guard, KeptFiles, report_path, user_of
 from skysim.apps.gui.views import forms, keys, overlay
 from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
 from skysim.apps.gui.views.sensor import SensorView

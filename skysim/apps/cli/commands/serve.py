@@ -1,7 +1,8 @@
-"""Commands that serve frames: `skysim stream` to programs, `skysim gui` to a browser."""
+"""Commands that serve a flight: `skysim live` to programs, `skysim gui` to a browser."""
 
 from __future__ import annotations
 
+import secrets
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,42 +14,81 @@ from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, loa
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
-    from skysim.apps.stream.sinks import Sink
-    from skysim.simulation.flight import Flight
+    from skysim.apps.live.pacing import Live
+    from skysim.apps.live.sinks import Output
 
 
 HOST = "127.0.0.1"
+PORTS = {"min": 0, "max": 65535}
 
 
-def stream(
+def live(
     scene: SceneArg,
+    tcp: Annotated[
+        int | None,
+        typer.Option(
+            **PORTS,
+            help="Send packets to clients on this port, and take their commands; 0: any free port.",
+        ),
+    ] = None,
+    http: Annotated[
+        int | None,
+        typer.Option(**PORTS, help="Serve MJPEG and packets on this port; 0: any free port."),
+    ] = None,
     folder: Annotated[
         Path | None,
         typer.Option(
             help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
         ),
     ] = None,
-    http: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Serve MJPEG and packets on this port; 0: any free port."
-        ),
-    ] = None,
-    host: Annotated[
-        str, typer.Option(help="Address to serve on, without access control.")
-    ] = HOST,
     pipe: Annotated[
         str | None,
         typer.Option(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
         ),
     ] = None,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on; other than loopback with a token.")
+    ] = HOST,
+    token: Annotated[
+        str,
+        typer.Option(
+            help="Token that clients must send; default: none on loopback, else a random one, which is printed."
+        ),
+    ] = "",
+    truth: Annotated[
+        bool,
+        typer.Option("--truth", help="Let clients, folder and /truth.json have the truth."),
+    ] = False,
+    trigger: Annotated[
+        bool,
+        typer.Option(
+            "--trigger", help="Expose frames when a client triggers, not by the scene."
+        ),
+    ] = False,
+    client_tracker: Annotated[
+        bool,
+        typer.Option(
+            "--client-tracker",
+            help="The filter takes attitudes of clients, not of the scene's tracker.",
+        ),
+    ] = False,
+    command_timeout: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            metavar="SECONDS",
+            help="Time of the simulator after which a client's command of actuators ends.",
+        ),
+    ] = 0.5,
+    wait: Annotated[
+        bool,
+        typer.Option("--wait", help="Start when the first client of --tcp takes channels."),
+    ] = False,
     frames: Frames = None,
     endless: Annotated[
         bool,
-        typer.Option(
-            "--endless", help="Stream until Ctrl-C. Otherwise a stream lasts one day at most."
-        ),
+        typer.Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
     ] = False,
     speed: Annotated[
         float,
@@ -58,94 +98,165 @@ def stream(
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Stream a scene's frames in real time, for hardware or a processor in the loop."""
-    from skysim.apps.stream.sinks import READER_GONE
+    """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
+    from skysim.apps.live.commands import CommandState
+    from skysim.apps.live.pacing import Live, Pace
+    from skysim.apps.live.sinks import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
-    if folder is None and http is None and pipe is None:
-        raise InputError("", "no output", "--folder DIR, --http PORT or --pipe PATH")
-    if http is None and host != HOST:
-        raise InputError(
-            f"--host {host}", "has no effect without --http", f"--http PORT --host {host}"
-        )
+    check_outputs(
+        outputs={"--tcp": tcp, "--http": http, "--folder": folder, "--pipe": pipe},
+        needs_server={"--host": host != HOST, "--token": bool(token)},
+        needs_tcp={"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait},
+    )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(
         load(scene, frames, seed, set_), endless=endless, keeps_history=False
     )
-    sinks = open_sinks(folder, pipe)
-    statistics = send_all(flight, sinks, speed, http, host)
-    output = sys.stderr if pipe == "-" else sys.stdout
-    print(files.to_json(statistics) if json else summary(statistics), file=output)
-    for sink in sinks:
-        if sink.fault not in ("", READER_GONE):
-            raise InputError(f"--{sink.name}", sink.fault)
-
-
-def open_sinks(folder: Path | None, pipe: str | None) -> list[Sink]:
-    """Sinks for the folder and for the pipe, if they are given."""
-    from skysim.apps.stream.sinks import Sink, folder_writer, pipe_writer
-
-    sinks = []
-    if folder is not None:
-        sinks.append(Sink("folder", folder_writer(folder)))
-    if pipe is not None:
-        sinks.append(Sink("pipe", pipe_writer(pipe)))
-    return sinks
-
-
-def send_all(
-    flight: Flight, sinks: list[Sink], speed: float, port: int | None, host: str
-) -> dict[str, Any]:
-    """Send all frames of a flight, and return the counters of the sender and its receivers.
-
-    Ctrl-C ends the stream. Flight, sinks and server are closed at its end. Raises InputError if the port cannot be
-    served.
-    """
-    from skysim.apps.stream.http import FrameHub, start_server
-    from skysim.apps.stream.sender import Pace, Sender
-
-    sender = Sender(flight, Pace(speed, flight.lab.scene.exposure.rate_hz), sinks)
+    if client_tracker and not flight.lab.scene.filter:
+        raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
+    outputs: list[Output] = []
+    flown = Live(
+        flight,
+        Pace(speed, flight.lab.scene.exposure.rate_hz),
+        outputs,
+        CommandState(flight, command_timeout, trigger),
+        has_truth=truth,
+        solves_itself=not client_tracker,
+        may_solve=tcp is not None,
+    )
     with ExitStack() as stack:
-        hub = None
-        if port is not None:
-            hub = FrameHub(sender.statistics)
-            server = start_server(hub, host, port)
-            stack.callback(server.shutdown)
-            stack.callback(hub.finish)
-            address = f"http://{host}:{server.server_port}/"
-            print(f"skysim stream: {address}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
         try:
-            sender.run(hub.publish if hub else None)
+            open_outputs(
+                flown, stack, folder, pipe, tcp, http, host, token or new_token(host), wait
+            )
+            flown.run()
         except KeyboardInterrupt:
             print(file=sys.stderr)
         finally:
             flight.close()
-            for sink in sinks:
-                sink.close()
-    return sender.statistics() | (hub.counters() if hub else {})
+    statistics = flown.statistics()
+    print(
+        files.to_json(statistics) if json else summary(statistics),
+        file=sys.stderr if pipe == "-" else sys.stdout,
+    )
+    for output in outputs:
+        if output.fault not in ("", READER_GONE):
+            raise InputError(f"--{output.name}", output.fault)
+
+
+def check_outputs(
+    outputs: dict[str, Any], needs_server: dict[str, bool], needs_tcp: dict[str, bool]
+) -> None:
+    """Raise InputError if there is no output, or for an option that has no effect without another.
+
+    Parameters
+    ----------
+    outputs
+        Value of each output's option; None without it
+    needs_server, needs_tcp
+        Whether an option is used that needs a server, or the wire
+    """
+    if all(value is None for value in outputs.values()):
+        raise InputError("", "no output", ", ".join(outputs))
+    if outputs["--tcp"] is None and outputs["--http"] is None:
+        for option in (option for option, is_used in needs_server.items() if is_used):
+            raise InputError(option, "has no effect without --tcp or --http", "one of them")
+    if outputs["--tcp"] is None:
+        for option in (option for option, is_used in needs_tcp.items() if is_used):
+            raise InputError(option, "has no effect without --tcp", "--tcp PORT")
+
+
+def new_token(host: str) -> str:
+    """A random token where other machines can connect, else none."""
+    from skysim.apps.access import LOOPBACK
+
+    return "" if host in LOOPBACK else secrets.token_urlsafe(16)
+
+
+def open_outputs(
+    flown: Live,
+    stack: ExitStack,
+    folder: Path | None,
+    pipe: str | None,
+    tcp: int | None,
+    http: int | None,
+    host: str,
+    token: str,
+    wait: bool,
+) -> None:
+    """Open the outputs that are given, print the addresses of servers, and wait for a client if wanted.
+
+    The stack closes them. Raises InputError for a port that cannot be served, and for a folder or pipe that cannot be
+    used.
+    """
+    from skysim.apps.live.http import FrameHub, start_server
+    from skysim.apps.live.sinks import Sink, folder_writer, pipe_writer
+    from skysim.apps.live.wire import WireServer
+
+    def add(output: Output) -> None:
+        flown.outputs.append(output)
+        stack.callback(output.close)
+
+    def tell(text: str) -> None:
+        print(f"skysim live: {text}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
+
+    if folder is not None:
+        add(Sink("folder", folder_writer(folder)))
+    if pipe is not None:
+        add(Sink("pipe", pipe_writer(pipe)))
+    if http is not None:
+        hub = FrameHub(flown.statistics)
+        http_server = start_server(hub, host, http, token)
+        stack.callback(http_server.server_close)
+        stack.callback(http_server.shutdown)
+        add(hub)
+        query = f"?token={token}" if token else ""
+        tell(f"http://{host}:{http_server.server_port}/{query}")
+    if tcp is not None:
+        server = WireServer(host, tcp, token, flown.greeting, flown.inbox, flown.has_truth)
+        add(server)
+        tell(f"tcp {host}:{server.port}" + (f", token {token}" if token else ""))
+        while wait and not server.entered.wait(0.1):
+            pass
 
 
 def summary(statistics: dict[str, Any]) -> str:
-    """Text summary of the frames rendered, sent and dropped."""
+    """Text summary of the frames rendered, sent and dropped, and of the control periods."""
     lines = [
         f"{statistics['made']} frames rendered, {statistics['dropped']} dropped; delay: median"
         f" {statistics['late_ms_median']:.1f} ms, p99 {statistics['late_ms_p99']:.1f} ms,"
-        f" worst {statistics['late_ms_worst']:.1f} ms"
+        f" worst {statistics['late_ms_worst']:.1f} ms",
+        f"{statistics['periods']} control periods, {statistics['missed']} late by one or more",
     ]
-    for name, sink in statistics["sinks"].items():
-        lines.append(counts(name, sink) + (f"; {sink['fault']}" if sink["fault"] else ""))
-    earlier = statistics.get("earlier_clients", {"clients": 0})
-    if earlier["clients"]:
-        lines.append(counts(f"{earlier['clients']} earlier clients", earlier))
-    for number, client in enumerate(statistics.get("clients", []), earlier["clients"] + 1):
-        lines.append(counts(f"client {number}", client))
+    commands = statistics["commands"]
+    if commands["received"] or commands["refused"]:
+        lines.append(
+            f"commands: {commands['received']} taken, {commands['refused']} refused,"
+            f" {commands['timeouts']} timed out"
+        )
+        updates = [f"{number} {status}" for status, number in commands["updates"].items()]
+        if updates:
+            lines.append("attitudes of clients: " + ", ".join(updates))
+    for name, output in statistics["outputs"].items():
+        lines.append(counts(name, output))
     return "\n".join(lines)
 
 
 def counts(receiver: str, counters: dict[str, Any]) -> str:
-    return f"{receiver}: {counters['sent']} sent, {counters['dropped']} dropped"
+    """What an output has sent and dropped, by channel, and its fault."""
+    parts = []
+    if "clients" in counters:
+        parts.append(f"{counters['clients']} clients")
+    for word in ("sent", "dropped"):
+        numbers = [f"{number} {name}" for name, number in counters[word].items() if number]
+        if numbers or word == "sent":
+            parts.append(f"{word} {', '.join(numbers) or 'nothing'}")
+    if counters.get("fault"):
+        parts.append(counters["fault"])
+    return f"{receiver}: " + "; ".join(parts)
 
 
 # Command `skysim gui`.

@@ -25,9 +25,10 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.apps.stream import http, sender, sinks
-from skysim.apps.stream.sender import Pace
-from skysim.apps.stream.sinks import Packet, unpack
+from skysim.apps.live import http, sinks
+from skysim.apps.live.commands import CommandState
+from skysim.apps.live.pacing import Live, Pace
+from skysim.apps.live.packets import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight
@@ -46,7 +47,7 @@ def frames() -> list[np.ndarray]:
 
 
 def streamed_flight(*, endless: bool = False) -> Flight:
-    """A flight as `skysim stream` opens it."""
+    """A flight as `skysim live` opens it."""
     return open_flight(
         loader.load("shefex2", OVERRIDES), endless=endless, keeps_history=False
     )
@@ -55,11 +56,14 @@ def streamed_flight(*, endless: bool = False) -> Flight:
 def packet(index: int, dropped: int = 0, pixels: Any = None) -> Packet:
     pixels = np.arange(12, dtype="<u2").reshape(3, 4) if pixels is None else pixels
     shape = {"width": pixels.shape[1], "height": pixels.shape[0], "dtype": pixels.dtype.str}
-    return Packet(
-        {"index": index, "dropped": dropped, "t_s": 0.5, "due_unix_s": 1.0, **shape},
-        pixels,
-        {},
-    )
+    header = {
+        "channel": "frame",
+        "index": index,
+        "dropped": dropped,
+        "t_s": 0.5,
+        "due_unix_s": 1.0,
+    }
+    return Packet(header | shape, pixels, {"ids": [7]})
 
 
 @pytest.mark.parametrize("dtype", ["<u2", "<f8"])
@@ -90,7 +94,7 @@ def test_packets_round_trip_and_a_truncated_one_is_an_error(dtype: str) -> None:
     ],
 )
 def test_invalid_headers_are_rejected_before_the_pixels_are_read(line: bytes) -> None:
-    with pytest.raises(InputError, match="not a packet of skysim stream"):
+    with pytest.raises(InputError, match="not a packet of skysim live"):
         unpack(io.BytesIO(line + b"x" * 64))
 
 
@@ -114,7 +118,7 @@ def test_a_frame_is_sent_when_due_and_dropped_one_period_later(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = FakeClock()
-    monkeypatch.setattr("skysim.apps.stream.sender.time", clock)
+    monkeypatch.setattr("skysim.apps.live.pacing.time", clock)
     pace = Pace(2.0, 10.0)  # a period is 50 ms on the wall
     assert pace.is_on_time(0, 123.0)  # the clock has not started yet
     pace.start(0.3)
@@ -135,8 +139,11 @@ def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
         def is_on_time(self, index: int, t_s: float) -> bool:
             return index % 2 == 0
 
-    stats = sender.Sender(streamed_flight(), Slow(0.0, 10.0), [])
-    stats.run(packets.append)
+    sink = sinks.Sink("folder", packets.append)
+    flight = streamed_flight()
+    stats = Live(flight, Slow(0.0, 10.0), [sink], CommandState(flight, 0.5, False))
+    stats.run()
+    sink.close()
     assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
     assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
     # With the last, after which none came.
@@ -158,13 +165,14 @@ def test_a_slow_sink_delays_nothing_and_its_drops_are_counted() -> None:
         sink.offer(packet(index), patient=False)
     released.set()
     sink.close()
-    assert sink.sent == len(received)
-    assert sink.sent + sink.dropped == 20
-    assert sink.dropped >= 16  # one at hand, two waiting, one that came between
+    assert sink.sent["frame"] == len(received)
+    assert sink.sent["frame"] + sink.dropped["frame"] == 20
+    assert sink.dropped["frame"] >= 16  # one at hand, two waiting, one that came between
     sink = sinks.Sink("gone", lambda _: (_ for _ in ()).throw(BrokenPipeError))
     sink.offer(packet(0), patient=True)
     sink.close()
-    assert (sink.sent, sink.dropped, sink.fault) == (0, 1, "the reader has closed the pipe")
+    assert (sink.sent, sink.dropped) == ({}, {"frame": 1})
+    assert sink.fault == "the reader has closed the pipe"
 
 
 def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(
@@ -181,7 +189,7 @@ def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(
     for index in range(10):
         sink.offer(packet(index), patient=False)
     sink.close()
-    assert (sink.sent, sink.dropped) == (0, 10)
+    assert (sink.sent, sink.dropped) == ({}, {"frame": 10})
     released.set()
 
 
@@ -197,7 +205,8 @@ def test_a_failing_sink_reports_its_fault_and_is_not_waited_for() -> None:
     sending.join(10)
     assert not sending.is_alive()
     sink.close()
-    assert (sink.sent, sink.dropped, sink.fault) == (0, 5, "ValueError: no such thing")
+    assert (sink.sent, sink.dropped) == ({}, {"frame": 5})
+    assert sink.fault == "ValueError: no such thing"
 
 
 def test_a_folder_receives_every_frame_with_its_truth(
@@ -205,19 +214,20 @@ def test_a_folder_receives_every_frame_with_its_truth(
 ) -> None:
     sets = [word for key, value in OVERRIDES.items() for word in ("--set", f"{key}={value}")]
     command = [
-        "stream",
+        "live",
         "shefex2",
         "--folder",
         str(tmp_path),
         "--speed",
         "0",
         "--json",
+        "--truth",
         *sets,
     ]
     done = CliRunner().invoke(main.app, command)
-    assert json.loads(done.stdout)["sinks"]["folder"] == {
-        "sent": FRAMES,
-        "dropped": 0,
+    assert json.loads(done.stdout)["outputs"]["folder"] == {
+        "sent": {"frame": FRAMES},
+        "dropped": {},
         "fault": "",
     }
     for n, image in enumerate(frames):
@@ -229,7 +239,7 @@ def test_a_folder_receives_every_frame_with_its_truth(
             1, abs=1e-12
         )
         assert len(result["truth"]["ids"]) == len(result["truth"]["x_px"]) > 5
-    with pytest.raises(InputError, match="holds frames of an earlier stream"):
+    with pytest.raises(InputError, match="holds frames of an earlier flight"):
         sinks.folder_writer(tmp_path)
     with pytest.raises(InputError, match="not a named pipe"):
         sinks.pipe_writer(str(tmp_path / "none"))
@@ -240,9 +250,9 @@ def hub() -> Iterator[tuple[http.FrameHub, str]]:
     """A server with one packet posted."""
     hub = http.FrameHub(lambda: {"made": 1})
     server = http.start_server(hub, "127.0.0.1", 0)
-    hub.publish(packet(0))
+    hub.offer(packet(0), False)
     yield hub, f"http://127.0.0.1:{server.server_port}"
-    hub.finish()
+    hub.close()
     server.shutdown()
 
 
@@ -256,7 +266,7 @@ def test_the_newest_frame_and_the_counters_are_served(hub: tuple[http.FrameHub, 
     image = cv2.imdecode(np.frombuffer(received("/frame.png"), np.uint8), -1)
     np.testing.assert_array_equal(image, packet(0).pixels)
     assert json.loads(received("/truth.json"))["index"] == 0
-    assert json.loads(received("/status.json")) == {"made": 1} | hub[0].counters()
+    assert json.loads(received("/status.json")) == {"made": 1}
     assert b"/stream.mjpg" in received("/")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         received("/etc/passwd")
@@ -275,7 +285,7 @@ def test_streams_send_every_frame(hub: tuple[http.FrameHub, str]) -> None:
         data = movie.read(int(head["Content-Length"]))
         assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (3, 4)
         movie.readline()
-        hub[0].publish(packet(index + 1))
+        hub[0].offer(packet(index + 1), False)
     assert [client.dropped for client in hub[0].clients] == [0, 0]
 
 
@@ -285,21 +295,23 @@ def test_clients_receive_the_last_frame_before_the_stream_ends() -> None:
     raw = urllib.request.urlopen(
         f"http://127.0.0.1:{server.server_port}/stream.raw", timeout=10
     )
-    hub.publish(packet(0))
+    hub.offer(packet(0), False)
     assert unpack(raw) is not None
     late = threading.Timer(0.1, lambda: unpack(raw))
     late.start()
-    hub.publish(packet(1, pixels=np.zeros((3000, 3000), "<u2")))  # more than a socket holds
-    hub.finish()
+    hub.offer(
+        packet(1, pixels=np.zeros((3000, 3000), "<u2")), False
+    )  # more than a socket holds
+    hub.close()
     late.join()
-    assert hub.counters()["earlier_clients"] == {"clients": 1, "sent": 2, "dropped": 0}
+    assert hub.counters() == {"clients": 1, "sent": {"frame": 2}, "dropped": {"frame": 0}}
     server.shutdown()
 
 
 def test_a_client_that_disconnects_during_a_response_is_ignored(
     hub: tuple[http.FrameHub, str], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    hub[0].publish(packet(1, pixels=np.zeros((3000, 3000), "<u2")))
+    hub[0].offer(packet(1, pixels=np.zeros((3000, 3000), "<u2")), False)
     with socket.create_connection(
         ("127.0.0.1", int(hub[1].rpartition(":")[2])), 10
     ) as client:
@@ -326,14 +338,14 @@ def test_counters_of_disconnected_clients_are_bounded_and_summed(
     while hub[0].earlier["clients"] < 100:
         assert time.monotonic() < until
         index += 1
-        hub[0].publish(packet(index))
+        hub[0].offer(packet(index), False)
         while (found := unpack(stays)) and found[0]["index"] < index:
             pass
-    result = hub[0].counters()
-    assert result["earlier_clients"]["clients"] == 100
-    assert result["earlier_clients"]["sent"] >= 100
-    (stayed,) = result["clients"]
-    assert stayed["sent"] in (index, index + 1)
+    (stayed,) = hub[0].clients
+    assert stayed.sent in (index, index + 1)
+    assert hub[0].counters()["clients"] == 101
+    assert hub[0].counters()["sent"]["frame"] == hub[0].earlier["sent"] + stayed.sent
+    assert hub[0].earlier["sent"] >= 100
 
 
 @pytest.mark.parametrize(
@@ -386,7 +398,7 @@ def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(
         sys.executable,
         "-m",
         "skysim",
-        "stream",
+        "live",
         "shefex2",
         "--set",
         "light.limit_mag=5",
@@ -405,8 +417,8 @@ def test_an_endless_stream_ends_at_sigterm_with_complete_frames_and_counters(
     assert {path.name for path in tmp_path.iterdir()} == {
         f"{stem}.{end}" for stem in stems for end in ("png", "json")
     }
-    assert len(stems) == result["sinks"]["folder"]["sent"] >= 3
-    with pytest.raises(InputError, match="either --frames N or --endless"):
+    assert len(stems) == result["outputs"]["folder"]["sent"]["frame"] >= 3
+    with pytest.raises(InputError, match="--endless: has no effect with --frames"):
         CliRunner().invoke(
             main.app, [*command[3:], "--frames", "3", "--pipe", "-"], catch_exceptions=False
         )
@@ -418,7 +430,7 @@ def test_a_stream_ends_with_the_reader_of_its_pipe_and_at_sigterm(tmp_path: Path
         sys.executable,
         "-m",
         "skysim",
-        "stream",
+        "live",
         "shefex2",
         "--set",
         "light.limit_mag=5",
@@ -445,4 +457,4 @@ def test_a_stream_ends_with_the_reader_of_its_pipe_and_at_sigterm(tmp_path: Path
             pass
     result = json.loads(named.communicate(timeout=60)[0])
     assert named.returncode == 0
-    assert result["made"] >= result["sinks"]["pipe"]["sent"] >= 2
+    assert result["made"] >= result["outputs"]["pipe"]["sent"]["frame"] >= 2

@@ -1,4 +1,4 @@
-"""HTTP server of a stream: MJPEG for display, packets for a tracker; newest frame, truth and counters on request.
+"""HTTP server of a live flight: MJPEG for display, packets for a tracker; newest frame, truth and counters on request.
 
 The simulation thread posts each packet to the `FrameHub`; each client has a thread that waits on the hub's condition
 variable and takes the newest packet. A slow client skips packets and does not delay the simulation or other clients.
@@ -12,8 +12,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import parse_qs
 
-from skysim.apps.stream.sinks import Packet, encode_png
+from skysim.apps.access import LOOPBACK, same_site, token_matches
+from skysim.apps.live.packets import Packet
+from skysim.apps.live.sinks import encode_png
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.results.plots import jpeg, to_8bit
@@ -21,8 +24,9 @@ from skysim.results.plots import jpeg, to_8bit
 BOUNDARY = "frame"
 SOCKET_TIMEOUT_S = 10.0  # timeout of a client that stops reading
 FINISH_TIMEOUT_S = 5.0  # time for clients to take the last frame
-INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim stream</title>
-<body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img src="/stream.mjpg" style="width:100%">
+INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim live</title>
+<body style="margin:0;background:#0d1015;color:#8b95a5;font:13px system-ui"><img
+src="/stream.mjpgQUERY" style="width:100%">
 <p style="padding:0 12px">/stream.mjpg, /stream.raw, /frame.png, /frame.raw, /truth.json, /status.json</p>"""
 
 
@@ -35,20 +39,24 @@ class Client:
 
 
 class FrameHub:
-    """The newest packet, shared between the simulation thread and the clients' threads.
+    """The newest packet, shared between the simulation thread and the clients' threads. It is an `Output`.
 
     Attributes
     ----------
-    sender_status
-        Function that returns the sender's counters
+    status
+        Function that returns the counters of the flight
     clients
         Connected clients
     earlier
         Number of disconnected clients, and the sums of their counters
     """
 
-    def __init__(self, sender_status: Callable[[], dict[str, Any]]) -> None:
-        self.sender_status = sender_status
+    name = "http"
+    fault = ""
+    channels = ("frame",)
+
+    def __init__(self, status: Callable[[], dict[str, Any]]) -> None:
+        self.status = status
         self.newest: Packet | None = None
         self.ended = False
         self.changed = threading.Condition()
@@ -68,17 +76,24 @@ class FrameHub:
             self.changed.notify_all()
 
     def counters(self) -> dict[str, Any]:
-        """Counters of each client, and the sums of the earlier ones."""
+        """Sums over the clients of all time."""
         with self.changed:
-            clients = [asdict(client) for client in self.clients]
-            return {"clients": clients, "earlier_clients": dict(self.earlier)}
+            sums = Counter(self.earlier)
+            for client in self.clients:
+                sums.update(clients=1, **asdict(client))
+        return {
+            "clients": sums["clients"],
+            "sent": {"frame": sums["sent"]},
+            "dropped": {"frame": sums["dropped"]},
+        }
 
-    def publish(self, packet: Packet) -> None:
+    def offer(self, packet: Packet, patient: bool) -> None:
+        """Post a packet; a slow client skips it."""
         with self.changed:
             self.newest = packet
             self.changed.notify_all()
 
-    def finish(self) -> None:
+    def close(self) -> None:
         """End the stream; wait up to FINISH_TIMEOUT_S for the clients to take the last packet."""
         with self.changed:
             self.ended = True
@@ -99,16 +114,30 @@ class Handler(BaseHTTPRequestHandler):
     """Request handler of one client. A slow client skips frames; `dropped` in the header counts them."""
 
     hub: FrameHub
+    hosts: tuple[str, ...]
+    token: str
     timeout = SOCKET_TIMEOUT_S
+
+    def refusal(self) -> str:
+        """Why the request is refused; empty if it is allowed."""
+        headers = self.headers
+        query = parse_qs(self.path.partition("?")[2])
+        if self.token and not token_matches(query.get("token", [""])[0], self.token):
+            return "token missing or wrong; open the address that the server printed: /?token=..."
+        return same_site(headers.get("Host", ""), headers.get("Origin", ""), self.hosts)
 
     def do_GET(self) -> None:
         path = self.path.partition("?")[0]
         newest = self.hub.newest
-        if path == "/":
-            self.respond(INDEX, "text/html")
+        refusal = self.refusal()
+        if refusal:
+            self.send_error(403, refusal)
+        elif path == "/":
+            query = f"?token={self.token}" if self.token else ""
+            self.respond(INDEX.replace(b"QUERY", query.encode()), "text/html")
         elif path == "/status.json":
             self.respond(
-                files.to_json(self.hub.sender_status() | self.hub.counters()).encode(),
+                files.to_json(self.hub.status()).encode(),
                 "application/json",
             )
         elif path in ("/stream.mjpg", "/stream.raw"):
@@ -124,9 +153,11 @@ class Handler(BaseHTTPRequestHandler):
             self.respond(encode_png(newest), "image/png", newest.header)
         elif path == "/frame.raw":
             self.respond(newest.pack(), "application/octet-stream", newest.header)
+        elif not newest.truth:
+            self.send_error(404, "the truth is off; allowed: start with --truth")
         else:
             self.respond(
-                files.to_json({**newest.header, "truth": newest.truth}).encode(),
+                files.to_json({**newest.header, "truth": dict(newest.truth)}).encode(),
                 "application/json",
             )
 
@@ -193,9 +224,21 @@ def mjpeg_part(packet: Packet) -> bytes:
     return head.encode() + b"\r\n" + data + b"\r\n"
 
 
-def start_server(hub: FrameHub, host: str, port: int) -> ThreadingHTTPServer:
-    """Start a server in background threads and return it. Raises InputError if the address cannot be bound."""
-    handler = type("HubHandler", (Handler,), {"hub": hub})
+def start_server(hub: FrameHub, host: str, port: int, token: str = "") -> ThreadingHTTPServer:
+    """Start a server in background threads and return it.
+
+    Parameters
+    ----------
+    token
+        Token that each address must have, as `?token=...`; empty: none
+
+    Raises
+    ------
+    InputError
+        For an address that cannot be bound.
+    """
+    hosts = LOOPBACK if host in LOOPBACK else ("*",)
+    handler = type("HubHandler", (Handler,), {"hub": hub, "hosts": hosts, "token": token})
     try:
         server = ThreadingHTTPServer((host, port), handler)
     except OSError as error:

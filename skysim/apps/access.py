@@ -1,0 +1,31 @@
+"""Who may talk to a server of skysim: names of the host, and the token."""
+
+import hmac
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+
+
+def token_matches(candidate: str, token: str) -> bool:
+    """Compare with the token in constant time, so that timing reveals nothing about it."""
+    return hmac.compare_digest(candidate.encode(), token.encode())
+
+
+def host_of(header: str) -> str:
+    """The host of a Host header, without the port."""
+    return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
+
+
+def same_site(host: str, origin: str, hosts: tuple[str, ...]) -> str:
+    """Why a request by its headers Host and Origin is refused; empty if it is allowed.
+
+    Parameters
+    ----------
+    hosts
+        Allowed hosts ("*": any). This stops DNS rebinding: the name of another site that resolves to this server comes
+        with its own Host header
+    """
+    if "*" not in hosts and host_of(host) not in hosts:
+        return "host name not allowed"
+    if origin and origin.partition("://")[2] != host:
+        return "request of another site refused"
+    return ""

@@ -1,0 +1,1 @@
+"""A scene in real time, for flight software, trackers and cameras' clients in other programs or on other processors."""

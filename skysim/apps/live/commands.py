@@ -1,0 +1,199 @@
+"""Commands of clients: one JSON object a line, checked, and held until they time out.
+
+| key | value |
+|---|---|
+| `torque_nm` | (3,) torque in body axes, which the actuators of the scene's control law give |
+| `wheels`, `cmgs`, `fans`, `ideal`, ... | (n,) commands of the single motors, see `Flight.commands` |
+| `attitude` | a solution of the client's tracker: t_s (of the frame), cam_from_ref_xyzw, covariance_rad2 (3, 3) |
+| `exposure_s` | exposure time of the next frames |
+| `trigger` | true: expose a frame from now on, where frames are triggered |
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from estimator.core.types import Attitude
+from skysim.core.errors import InputError
+from skysim.core.plugins import finite_array
+from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
+from skysim.simulation.flight import Flight
+from skysim.simulation.timing import longest_live_s
+
+MOST_WAITING = 1000  # commands that wait for the next control period
+MOST_TRIGGERS = 100  # triggered exposures that wait
+QUATERNION_TOLERANCE = 1e-3  # of the length of a quaternion
+SOLUTION_KEYS = ("t_s", "cam_from_ref_xyzw", "covariance_rad2")
+
+Reply = Callable[[str], None]
+
+
+def parse(line: bytes) -> dict[str, Any]:
+    """The object in a line. Raises InputError for anything else."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(
+            "", f"not an object of JSON: {line[:40]!r}", '{"torque_nm": [0, 0, 0]}'
+        )
+    return found
+
+
+class Inbox:
+    """Commands that wait for the next control period, with the function that tells their client of an error."""
+
+    def __init__(self) -> None:
+        self.waiting: queue.Queue[tuple[dict[str, Any], Reply]] = queue.Queue(MOST_WAITING)
+
+    def put(self, command: dict[str, Any], reply: Reply) -> None:
+        """Add a command; refuse it where too many wait."""
+        try:
+            self.waiting.put_nowait((command, reply))
+        except queue.Full:
+            reply(f"more than {MOST_WAITING} commands in a control period")
+
+    def take(self) -> list[tuple[dict[str, Any], Reply]]:
+        """All that waits."""
+        return [self.waiting.get_nowait() for _ in range(self.waiting.qsize())]
+
+
+@dataclass
+class CommandState:
+    """The commands in force, and what clients have asked for.
+
+    Attributes
+    ----------
+    flight
+        Flight that is commanded
+    timeout_s
+        Time of the simulator after which a command of actuators ends
+    has_triggers
+        Whether frames are exposed at triggers
+    held
+        Value and time of each command of actuators, by its key
+    received, refused, timeouts
+        Numbers of commands that were taken and refused, and that have timed out
+    updates
+        Numbers of the filter's updates with clients' solutions, by their status
+    """
+
+    flight: Flight
+    timeout_s: float
+    has_triggers: bool
+    held: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    received: int = 0
+    refused: int = 0
+    timeouts: int = 0
+    updates: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        if self.has_triggers:
+            self.flight.schedules[0].triggers_s = {}
+
+    def receive(self, inbox: Inbox) -> None:
+        """Take what has arrived; a refused command changes nothing, and its client is told why."""
+        for command, reply in inbox.take():
+            try:
+                self.apply(command)
+                self.received += 1
+            except InputError as error:
+                self.refused += 1
+                reply(str(error))
+
+    def apply(self, command: dict[str, Any]) -> None:
+        """Check a command as a whole, then take it. Raises InputError."""
+        command = dict(command)
+        exposure_s = self.exposure_s(command.pop("exposure_s", None))
+        trigger = command.pop("trigger", False)
+        if trigger is not False:
+            self.check_trigger(trigger)
+        solution = command.pop("attitude", None)
+        attitude = None if solution is None else self.solution(solution)
+        # What is left are commands of actuators.
+        motors = dict(command)
+        self.flight.commands(motors.pop("torque_nm", None), motors)
+        now_s = self.flight.now_s
+        self.held |= {key: (value, now_s) for key, value in command.items()}
+        if exposure_s:
+            self.flight.schedules[0].exposure_control.exposure_s = exposure_s
+        if trigger:
+            self.flight.schedules[0].trigger(now_s)
+        if attitude and self.flight.motion.navigation:
+            status = self.flight.motion.navigation.update_filter(solution["t_s"], attitude)
+            self.updates[status] += 1
+
+    def check_trigger(self, value: Any) -> None:
+        """Raise InputError for a trigger that cannot be taken."""
+        if value is not True:
+            raise InputError("trigger", repr(value)[:40], "true")
+        if not self.has_triggers:
+            raise InputError(
+                "trigger", "the scene's schedule exposes the frames", "--trigger"
+            )
+        schedule = self.flight.schedules[0]
+        waiting = sum(index >= schedule.index for index in schedule.triggers_s or ())
+        if waiting >= MOST_TRIGGERS:
+            raise InputError("trigger", f"{MOST_TRIGGERS} exposures are waiting")
+
+    def exposure_s(self, value: Any) -> float | None:
+        """A commanded exposure time, checked."""
+        if value is None:
+            return None
+        longest_s = longest_live_s(self.flight.lab.scene)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float))
+            or not 0 < value <= longest_s
+        ):
+            raise InputError("exposure_s", repr(value)[:40], f"more than 0, to {longest_s:g}")
+        if self.flight.lab.scene.tracker.exposure_control:
+            raise InputError("exposure_s", "the scene's tracker.exposure_control sets it")
+        return float(value)
+
+    def solution(self, value: Any) -> Attitude:
+        """A client's solution for the filter, checked."""
+        if not self.flight.lab.scene.filter:
+            raise InputError(
+                "attitude", "the scene has no filter", "a scene with the section filter"
+            )
+        if not isinstance(value, dict) or set(value) != set(SOLUTION_KEYS):
+            raise InputError("attitude", repr(value)[:40], ", ".join(SOLUTION_KEYS))
+        try:
+            t_s = float(finite_array(value["t_s"], "t_s", ()))
+            quaternion = finite_array(value["cam_from_ref_xyzw"], "cam_from_ref_xyzw", (4,))
+            covariance = finite_array(value["covariance_rad2"], "covariance_rad2", (3, 3))
+        except ValueError as error:
+            raise InputError("attitude", error) from None
+        if abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
+            raise InputError("attitude", "cam_from_ref_xyzw is not a unit quaternion")
+        if (
+            not np.allclose(covariance, covariance.T)
+            or np.linalg.eigvalsh(covariance)[0] <= 0
+        ):
+            raise InputError("attitude", "covariance_rad2 is not positive and symmetric")
+        if not 0 <= t_s <= self.flight.now_s:
+            raise InputError(
+                "attitude", f"t_s {t_s:g}", f"0 to {self.flight.now_s:g}, the present"
+            )
+        return Attitude("solved", Rotation.from_quat(quaternion), covariance)
+
+    def in_force(self) -> Commands:
+        """The commands of the next control period: those that have not timed out."""
+        end_s = self.flight.now_s - self.timeout_s
+        kept = {key: held for key, held in self.held.items() if held[1] >= end_s}
+        self.timeouts += len(self.held) - len(kept)
+        self.held = kept
+        if not kept:
+            return NO_COMMANDS
+        values = {key: value for key, (value, _) in kept.items()}
+        return self.flight.commands(values.pop("torque_nm", None), values)

@@ -1,0 +1,250 @@
+"""A flight in real time. Every control period:
+
+1. `CommandState.receive`: the clients' commands are taken; those of actuators are held until they time out.
+2. The motion is simulated for one control period with them.
+3. The clock is waited for; a period that ends late by a period or more is a missed deadline.
+4. IMU samples, encoders, telemetry and truth are sent, as far as somebody takes them.
+5. Frames that are due are rendered, solved if somebody takes the solutions, and sent. One that is late by a frame
+   period or more before its rendering starts is dropped.
+"""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from skysim.apps.live.commands import CommandState, Inbox
+from skysim.apps.live.packets import (
+    PERIODIC,
+    Packet,
+    frame_packet,
+    period_values,
+    solution_packet,
+)
+from skysim.apps.live.sinks import Output
+from skysim.simulation.flight import Flight, Shot
+
+
+class Pace:
+    """Maps scene time to wall-clock time: t_wall = zero_s + t_scene / speed. A speed of 0 disables pacing.
+
+    The clock starts after the first rendering, so that compilation is not counted as delay. A frame that is late by a
+    frame period or more before rendering starts is dropped.
+    """
+
+    def __init__(self, speed: float, rate_hz: float) -> None:
+        self.speed = speed
+        self.rate_hz = rate_hz
+        self.zero_s: float | None = None  # monotonic time at which scene time is 0
+        self.offset_s = time.time() - time.monotonic()  # from monotonic to Unix time
+
+    def start(self, t_s: float) -> None:
+        """Start the clock: scene time is t_s now."""
+        self.zero_s = time.monotonic() - (t_s / self.speed if self.speed else 0.0)
+
+    def due_s(self, t_s: float) -> float:
+        """Monotonic time at which scene time is t_s; the present if the clock has not started or pacing is off."""
+        if self.zero_s is None or not self.speed:
+            return time.monotonic()
+        return self.zero_s + t_s / self.speed
+
+    def late_s(self, t_s: float) -> float:
+        """Delay: wall-clock seconds since scene time t_s; negative if t_s is still to come."""
+        return time.monotonic() - self.due_s(t_s)
+
+    def is_on_time(self, _: int, t_s: float) -> bool:
+        """Return True if a frame whose exposure ends at t_s is less than one frame period late, so worth rendering."""
+        return self.late_s(t_s) * self.speed * self.rate_hz < 1
+
+    def wait(self, t_s: float) -> None:
+        time.sleep(max(-self.late_s(t_s), 0.0))
+
+
+DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
+
+
+@dataclass
+class Live:
+    """A flight that is paced to the clock, and its counters.
+
+    Attributes
+    ----------
+    flight, pace, outputs
+        Flight without history, its clock, and where the packets go
+    commands
+        Commands of clients
+    inbox
+        Where they arrive
+    has_truth
+        Whether truth may be sent
+    solves_itself
+        Whether the filter takes the solutions of the scene's tracker, and not the clients'
+    may_solve
+        Whether somebody may take solutions
+    rendered, dropped
+        Numbers of rendered and of dropped frames
+    periods, missed
+        Numbers of control periods, and of those that ended late by a period or more
+    late_ms
+        Delays from the end of the exposure until the frame is ready, for the newest DELAY_WINDOW frames
+    """
+
+    flight: Flight
+    pace: Pace
+    outputs: list[Output]
+    commands: CommandState
+    inbox: Inbox = field(default_factory=Inbox)
+    has_truth: bool = False
+    solves_itself: bool = True
+    may_solve: bool = False
+    rendered: int = 0
+    dropped: int = 0
+    periods: int = 0
+    missed: int = 0
+    late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
+
+    @property
+    def greeting(self) -> dict[str, Any]:
+        """What a client is told first: the scene, control period, camera, and the actuators with their motors."""
+        flight = self.flight
+        scene = flight.lab.scene
+        sets = flight.motion.flight_computer.actuator_sets
+        return {
+            "scene": scene.name,
+            "period_s": flight.motion.flight_computer.period_s,
+            "width": scene.camera.width_px,
+            "height": scene.camera.height_px,
+            "rate_hz": scene.exposure.rate_hz,
+            "actuators": {
+                key: {"motors": len(command_map), "limit": limit}
+                for key, (command_map, limit) in (
+                    (key, one.command_map()) for key, one in sets.items()
+                )
+            },
+            "cam_from_body_xyzw": flight.lab.cameras[0]
+            .mount.cam_from_body.as_quat()
+            .tolist(),
+        }
+
+    def run(self) -> None:
+        """Fly until the end, or until all outputs have failed."""
+        self.warm_up()
+        self.pace.start(0.0)
+        while not self.flight.is_over and not self.is_abandoned:
+            self.advance()
+        for shot in self.shots("solution" in self.wanted, late=True):
+            self.send_shot(shot)
+        # With those after the last rendered one.
+        self.dropped = self.flight.schedules[0].index - self.rendered
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether all outputs have failed."""
+        return bool(self.outputs) and all(output.fault for output in self.outputs)
+
+    def warm_up(self) -> None:
+        """Render a frame that nobody gets, and solve it, which compiles what will run.
+
+        An external tracker gets only the frames of the flight, in order.
+        """
+        shot = self.flight.observe(solves=False)
+        if self.may_solve:
+            self.flight.tracker_of(self.flight.schedules[0], shot.frame)
+
+    @property
+    def wanted(self) -> set[str]:
+        """The channels that somebody takes."""
+        channels = {
+            name for output in self.outputs if not output.fault for name in output.channels
+        }
+        return channels if self.has_truth else channels - {"truth"}
+
+    def advance(self) -> None:
+        """Simulate one control period, and send what it gave."""
+        flight = self.flight
+        # 1. and 2. Commands and motion.
+        self.commands.receive(self.inbox)
+        flight.motion.advance(flight.motion.period_steps, self.commands.in_force())
+        # 3. Clock.
+        now_s = flight.now_s
+        self.pace.wait(now_s)
+        self.periods += 1
+        period_s = flight.motion.flight_computer.period_s
+        self.missed += self.pace.late_s(now_s) * self.pace.speed >= period_s
+        # 4. Values.
+        wanted = self.wanted
+        made_unix_s = time.monotonic() + self.pace.offset_s
+        for channel in PERIODIC:
+            values = period_values(flight, channel) if channel in wanted else {}
+            if values:
+                head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
+                self.send(Packet(head | values))
+        # 5. Frames.
+        for shot in self.shots("solution" in wanted):
+            self.send_shot(shot)
+
+    def shots(self, solves: bool, late: bool = False) -> Iterator[Shot]:
+        """The exposures of the main camera that are due; late ones are due only after the end.
+
+        Frames that a filter or a client that triggers waits for are not dropped.
+        """
+        flight = self.flight
+        updates = bool(flight.filter_schedules) and self.solves_itself
+        all_come = updates or self.commands.has_triggers
+        main = flight.schedules[0]
+        for shot in flight.capture_due(
+            flight.schedules if updates else [main],
+            solves,
+            None if all_come else self.pace.is_on_time,
+            late,
+            updates,
+        ):
+            if shot.camera is main.camera:
+                yield shot
+
+    def send_shot(self, shot: Shot) -> None:
+        """Send a frame, and its solution."""
+        pace = self.pace
+        rows = shot.camera.scene.camera.height_px
+        # With a rolling shutter, the end of the last row's exposure.
+        due_s = pace.due_s(shot.window.close_s(rows))
+        now_s = time.monotonic()
+        self.dropped = shot.frame.index - self.rendered
+        self.rendered += 1
+        self.late_ms.append(1e3 * (now_s - due_s))
+        packet = frame_packet(
+            shot, due_s + pace.offset_s, now_s + pace.offset_s, self.dropped
+        )
+        self.send(packet if self.has_truth else packet._replace(truth={}))
+        if shot.report is not None:
+            self.send(solution_packet(shot, time.monotonic() + pace.offset_s))
+
+    def send(self, packet: Packet) -> None:
+        """Offer a packet to everybody who takes its channel."""
+        for output in self.outputs:
+            if packet.channel in output.channels:
+                output.offer(packet, patient=not self.pace.speed)
+
+    def statistics(self) -> dict[str, Any]:
+        """Counts, delay statistics in ms, and the counters of each output."""
+        late = np.array(self.late_ms or [np.nan])
+        commands = self.commands
+        return {
+            "made": self.rendered,
+            "dropped": self.dropped,
+            "late_ms_median": float(np.quantile(late, 0.5)),
+            "late_ms_p99": float(np.quantile(late, 0.99)),
+            "late_ms_worst": float(late.max()),
+            "periods": self.periods,
+            "missed": self.missed,
+            "commands": {
+                "received": commands.received,
+                "refused": commands.refused,
+                "timeouts": commands.timeouts,
+                "updates": dict(commands.updates),
+            },
+            "outputs": {output.name: output.counters() for output in self.outputs},
+        }

@@ -1,0 +1,208 @@
+"""Packets of a live flight: a header as one line of JSON, then the pixels of a frame.
+
+| channel | once a | content |
+|---|---|---|
+| `frame` | exposure | pixels |
+| `solution` | exposure | attitude of the scene's tracker, or why there is none |
+| `imu` | control period | its samples |
+| `state` | control period | encoders: speeds of wheels, angles of gimbals, readings of other actuators |
+| `telemetry` | control period | what the flight computer commands and estimates |
+| `truth` | control period | true attitude and rate; beside them, the truth of each frame in its header |
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skysim.core.errors import InputError
+from skysim.core.types import Truth
+from skysim.simulation.flight import Flight, Shot
+
+CHANNELS = ("frame", "solution", "imu", "state", "telemetry", "truth")
+PERIODIC = ("imu", "state", "telemetry", "truth")
+
+# Limits for the reader.
+MAX_HEADER_BYTES = 1 << 16
+MAX_PIXELS = 1 << 28
+
+NO_PIXELS = np.empty((0, 0), np.uint8)
+
+
+class Packet(NamedTuple):
+    """What is sent: a frame, or the values of another channel.
+
+    Attributes
+    ----------
+    header
+        Data that a receiver may use. Of all channels: channel, t_s (time of the simulator, since the scene's start; of
+        a frame its middle), made_unix_s (wall clock), bytes (of the pixels that follow). Of frames: index, exposure_s,
+        width, height, dtype (numpy's, little-endian), due_unix_s (wall clock at which the exposure ended), dropped
+        (frames dropped before this one)
+    pixels
+        (H, W) pixels; (0, 0) of other channels
+    truth
+        Of a frame: cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px, y_px of the
+        lights on the detector
+    """
+
+    header: dict[str, Any]
+    pixels: NDArray[Any] = NO_PIXELS
+    truth: Mapping[str, Any] = MappingProxyType({})
+
+    @property
+    def channel(self) -> str:
+        return str(self.header["channel"])
+
+    @property
+    def number(self) -> int:
+        """Sequence number among the frames that were rendered."""
+        return int(self.header["index"] - self.header["dropped"])
+
+    def plus_dropped(self, missed: int) -> Packet:
+        """The same frame for a receiver that missed further ones: its header's `dropped` is that much larger."""
+        if not missed or self.channel != "frame":
+            return self
+        return self._replace(
+            header=self.header | {"dropped": self.header["dropped"] + missed}
+        )
+
+    def pack(self, has_truth: bool = False) -> bytes:
+        """Serialize: the header line, with the truth if wanted, then the pixels row by row from the top."""
+        header = self.header | {"bytes": self.pixels.nbytes}
+        if has_truth and self.truth:
+            header["truth"] = dict(self.truth)
+        return json.dumps(header).encode() + b"\n" + self.pixels.tobytes()
+
+
+def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
+    """Read the next header and its (H, W) pixels; None at the end. Raises InputError for malformed or cut-off data."""
+    line = stream.readline(MAX_HEADER_BYTES)
+    if not line:
+        return None
+    try:
+        header = json.loads(line)
+        if not header["bytes"]:
+            return header, NO_PIXELS
+        shape = (int(header["height"]), int(header["width"]))
+        dtype_name = header["dtype"]
+        if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", dtype_name):
+            raise ValueError(dtype_name)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise InputError("", f"not a packet of skysim live: {line[:40]!r}") from error
+    count = shape[0] * shape[1]
+    dtype = np.dtype(dtype_name)
+    if min(shape) < 1 or count > MAX_PIXELS:
+        raise InputError(
+            "", f"not a packet of skysim live: {shape[1]} x {shape[0]} pixels of {dtype}"
+        )
+    pixels = stream.read(count * dtype.itemsize)
+    if len(pixels) < count * dtype.itemsize:
+        raise InputError("", f"the stream ended within frame {header.get('index')}")
+    return header, np.frombuffer(pixels, dtype).reshape(shape)
+
+
+def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
+    """Packet of a shot's frame.
+
+    Parameters
+    ----------
+    due_unix_s, made_unix_s
+        Wall-clock times at which the exposure ended and the frame was ready
+    dropped
+        Number of frames dropped before it
+    """
+    frame = shot.frame
+    pixels = np.ascontiguousarray(frame.image_dn)
+    pixels = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
+    height, width = pixels.shape
+    header = {
+        "channel": "frame",
+        "index": frame.index,
+        "t_s": frame.t_mid_s,
+        "exposure_s": frame.exposure_s,
+        "width": width,
+        "height": height,
+        "dtype": pixels.dtype.str,
+        "bytes": pixels.nbytes,
+        "due_unix_s": due_unix_s,
+        "made_unix_s": made_unix_s,
+        "dropped": dropped,
+    }
+    return Packet(header, pixels, frame_truth(shot.truth))
+
+
+def frame_truth(truth: Truth) -> dict[str, Any]:
+    """The truth of a frame, as `Packet` has it."""
+    return {
+        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat().tolist(),
+        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat().tolist(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
+        "ids": truth.sources.id.tolist(),
+        "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),
+        "y_px": truth.sources.xy_px[:, 1].round(4).tolist(),
+    }
+
+
+def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
+    """Packet of a shot's solution, at mid-exposure: `covariance_rad2` is that of a small rotation in camera axes."""
+    assert shot.report is not None
+    solution = shot.report.attitude
+    header = {
+        "channel": "solution",
+        "index": shot.frame.index,
+        "t_s": shot.frame.t_mid_s,
+        "made_unix_s": made_unix_s,
+        "status": solution.status,
+    }
+    if solution.cam_from_ref is not None and solution.covariance_rad2 is not None:
+        header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat().tolist()
+        header["covariance_rad2"] = solution.covariance_rad2.tolist()
+    return Packet(header)
+
+
+def period_values(flight: Flight, channel: str) -> dict[str, Any]:
+    """The values of a periodic channel at the end of a control period."""
+    state = flight.state
+    motion = flight.motion
+    navigation = motion.navigation
+    if channel == "state":
+        return {
+            "wheel_rad_s": state.wheel_rad_s.tolist(),
+            "gimbal_rad": state.gimbal_rad.tolist(),
+        }
+    if channel == "truth":
+        return {
+            "lab_from_body_xyzw": state.lab_from_body.as_quat().tolist(),
+            "rate_body_rad_s": state.rate_body_rad_s.tolist(),
+        }
+    if channel == "imu":
+        since_s = flight.now_s - 0.5 * motion.flight_computer.period_s
+        samples = flight.imu_samples(since_s)
+        # A unit slower than the control has none in most periods.
+        if samples is None or not len(samples.t_s) or samples.t_s[-1] < since_s:
+            return {}
+        return {
+            "step_s": samples.step_s,
+            "times_s": samples.t_s.tolist(),
+            "angle_rad": samples.angle_rad.tolist(),
+            "velocity_m_s": samples.velocity_m_s.tolist(),
+        }
+    computer = motion.flight_computer
+    values = {
+        "torque_nm": computer.control_torque_nm.tolist(),
+        "loads": dict(zip(computer.names, computer.loads.tolist(), strict=True)),
+    }
+    if navigation:
+        values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1).tolist()
+        if navigation.filter:
+            attitude_wxyz = navigation.attitude_wxyz("filter")
+            values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1).tolist()
+            values["bias_rad_s"] = navigation.filter.state.bias_rad_s.tolist()
+    return values

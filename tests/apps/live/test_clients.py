@@ -1,0 +1,91 @@
+"""The two clients of docs/howto/live.md close the attitude loop over the wire, and the page's other blocks run."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from skysim.apps.cli import main
+from skysim.apps.live.commands import CommandState
+from skysim.apps.live.pacing import Live, Pace
+from skysim.apps.live.wire import WireServer
+from skysim.scene import loader
+from skysim.simulation.flight import open_flight
+from tests.docs.test_docs_blocks import blocks
+
+PAGE = Path(__file__).parents[3] / "docs/howto/live.md"
+SPEED = 4.0
+
+
+def block(language: str, first: str) -> str:
+    """The block of the page that begins so."""
+    (found,) = (
+        one.text for one in blocks(PAGE) if one.language == language and first in one.text
+    )
+    return found
+
+
+def client(language: str, folder: Path) -> list[str]:
+    """Command of a client of the page, without the port."""
+    if language == "python":
+        path = folder / "loop.py"
+        path.write_text(block("python", "# loop.py"))
+        return [sys.executable, str(path)]
+    path = folder / "loop.c"
+    path.write_text(block("c", "/* loop.c"))
+    program = str(folder / "loop")
+    subprocess.run(["gcc", "-O2", "-Wall", "-Werror", path, "-lm", "-o", program], check=True)
+    return [program]
+
+
+def lines_of_code(language: str, first: str) -> int:
+    return len([line for line in block(language, first).splitlines() if line.strip()])
+
+
+def test_the_clients_are_as_short_as_the_page_promises() -> None:
+    assert lines_of_code("python", "# loop.py") <= 24
+    assert lines_of_code("c", "/* loop.c") <= 62
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("language", ["python", "c"])
+def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path) -> None:
+    """By 5 degrees about its z axis, as it does with neither the scene's law nor its tracker's truth."""
+    flight = open_flight(
+        loader.load("simsat_bump", {"exposure.frames": "16"}), keeps_history=False
+    )
+    live = Live(
+        flight, Pace(SPEED, 2.0), [], CommandState(flight, 0.5, False), may_solve=True
+    )
+    server = WireServer("127.0.0.1", 0, "", live.greeting, live.inbox)
+    live.outputs.append(server)
+    start = flight.state.lab_from_body
+    live.warm_up()
+    with subprocess.Popen([*client(language, tmp_path), str(server.port)]) as process:
+        assert server.entered.wait(30)
+        live.pace.start(0.0)
+        while flight.now_s < 7.5:
+            live.advance()
+        server.close()
+        assert process.wait(10) in (0, 1)
+    turned_deg = np.degrees((start.inv() * flight.state.lab_from_body).as_rotvec())
+    # exp(-0.7 / s 7 s) of the turn is left. Across it gravity turns by m g offset / (J 1 / s^2).
+    gravity_deg = np.degrees(80 * 9.81 * 0.02e-3 / 6)
+    np.testing.assert_allclose(turned_deg[:2], 0, atol=gravity_deg + 0.03)
+    assert turned_deg[2] == pytest.approx(5, abs=0.07)
+    assert live.commands.refused == 0
+    assert live.commands.received > 500
+    assert server.counters()["dropped"] == {}
+
+
+def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for line in block("sh", "--tcp 8091").splitlines():
+        words = re.sub(r"8091", "0", line.partition("#")[0]).split()[1:]
+        done = CliRunner().invoke(main.app, [*words, "--speed", "2"], catch_exceptions=False)
+        assert re.search(r"\d frames rendered, 0 dropped", done.output)
+    exec(compile(block("python", "unpack"), "live.md", "exec"), {})
