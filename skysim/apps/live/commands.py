@@ -50,7 +50,7 @@ def parse(line: bytes) -> dict[str, Any]:
 
 
 class Inbox:
-    """Commands that wait for the next control period, with the function that tells their client of an error."""
+    """Commands that wait for the next control period, with the function that reports an error to their client."""
 
     def __init__(self) -> None:
         self.waiting: queue.Queue[tuple[dict[str, Any], Reply]] = queue.Queue(MOST_WAITING)
@@ -101,7 +101,7 @@ class CommandState:
             self.flight.schedules[0].triggers_s = {}
 
     def receive(self, inbox: Inbox) -> None:
-        """Take what has arrived; a refused command changes nothing, and its client is told why."""
+        """Take what has arrived; a refused command changes nothing, and its client gets the reason."""
         for command, reply in inbox.take():
             try:
                 self.apply(command)

@@ -3,8 +3,8 @@
 1. `CommandState.receive`: the clients' commands are taken; those of actuators are held until they time out.
 2. The motion is simulated for one control period with them.
 3. The clock is waited for; a period that ends late by a period or more is a missed deadline.
-4. IMU samples, encoders, telemetry and truth are sent, as far as somebody takes them.
-5. Frames that are due are rendered, solved if somebody takes the solutions, and sent. One that is late by a frame
+4. IMU samples, encoders, telemetry and truth are sent, as far as a client takes them.
+5. Frames that are due are rendered, solved if a client takes the solutions, and sent. One that is late by a frame
    period or more before its rendering starts is dropped.
 """
 
@@ -83,7 +83,7 @@ class Live:
     solves_itself
         Whether the filter takes the solutions of the scene's tracker, and not the clients'
     may_solve
-        Whether somebody may take solutions
+        Whether a client may take solutions
     rendered, dropped
         Numbers of rendered and of dropped frames
     periods, missed
@@ -108,7 +108,7 @@ class Live:
 
     @property
     def greeting(self) -> dict[str, Any]:
-        """What a client is told first: the scene, control period, camera, and the actuators with their motors."""
+        """What a client receives first: the scene, control period, camera, and the actuators with their motors."""
         flight = self.flight
         scene = flight.lab.scene
         sets = flight.motion.flight_computer.actuator_sets
@@ -146,7 +146,7 @@ class Live:
         return bool(self.outputs) and all(output.fault for output in self.outputs)
 
     def warm_up(self) -> None:
-        """Render a frame that nobody gets, and solve it, which compiles what will run.
+        """Render a frame that no one gets, and solve it, which compiles what will run.
 
         An external tracker gets only the frames of the flight, in order.
         """
@@ -156,7 +156,7 @@ class Live:
 
     @property
     def wanted(self) -> set[str]:
-        """The channels that somebody takes."""
+        """The channels that an output takes."""
         channels = {
             name for output in self.outputs if not output.fault for name in output.channels
         }
@@ -223,7 +223,7 @@ class Live:
             self.send(solution_packet(shot, time.monotonic() + pace.offset_s))
 
     def send(self, packet: Packet) -> None:
-        """Offer a packet to everybody who takes its channel."""
+        """Offer a packet to each output that takes its channel."""
         for output in self.outputs:
             if packet.channel in output.channels:
                 output.offer(packet, patient=not self.pace.speed)

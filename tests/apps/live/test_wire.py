@@ -21,7 +21,7 @@ FREE = {"exposure.frames": "20", "motion.maneuver": "[{kind: hold, duration: 20 
 
 
 def live_flight(scene: str = "simsat_bump", *, trigger: bool = False, **more: str) -> Live:
-    """A flight that nobody paces."""
+    """A flight that no clock paces."""
     flight = open_flight(loader.load(scene, FREE | more), keeps_history=False)
     return Live(flight, Pace(0.0, 2.0), [], CommandState(flight, 0.5, trigger))
 
@@ -57,8 +57,8 @@ def server_of(live: Live) -> WireServer:
     return server
 
 
-def told(live: Live, command: dict[str, Any]) -> str:
-    """What a client is told about a command; empty if it was taken."""
+def answer_to(live: Live, command: dict[str, Any]) -> str:
+    """What a client is answered to a command; empty if it was taken."""
     answers = list[str]()
     live.inbox.put(command, answers.append)
     live.commands.receive(live.inbox)
@@ -84,7 +84,7 @@ def test_a_refused_command_changes_nothing_and_says_why(
     command: dict[str, Any], problem: str
 ) -> None:
     live = live_flight()
-    answer = told(
+    answer = answer_to(
         live, command | {"ideal": [0.1, 0, 0]} if "wheels" not in command else command
     )
     with pytest.raises(InputError, match=problem):
@@ -111,7 +111,7 @@ def attitude(**changes: Any) -> dict[str, Any]:
     ],
 )
 def test_an_attitude_is_checked(changes: dict[str, Any], problem: str) -> None:
-    assert problem in told(live_flight(), {"attitude": attitude(**changes)})
+    assert problem in answer_to(live_flight(), {"attitude": attitude(**changes)})
 
 
 @pytest.mark.parametrize("line", [b"", b"[1]", b"\xff", b"[" * 100_000, b'{"a": }', b"nan"])
@@ -125,7 +125,7 @@ def test_a_torque_turns_as_newton_says_and_ends_at_its_timeout() -> None:
     live = live_flight(**{"vehicle.center_of_mass": "[0 mm, 0 mm, 0 mm]"})
     live.commands.timeout_s = 0.2
     before = live.flight.state.rate_body_rad_s
-    assert told(live, {"torque_nm": [0, 0, 0.9]}) == ""
+    assert answer_to(live, {"torque_nm": [0, 0, 0.9]}) == ""
     while live.commands.in_force().torque_nm is not None:
         live.advance()
     rate = live.flight.state.rate_body_rad_s - before
@@ -142,11 +142,11 @@ def test_a_torque_turns_as_newton_says_and_ends_at_its_timeout() -> None:
 def test_commands_of_motors_replace_the_law_only_if_they_are_its_own() -> None:
     live = live_flight("simsat_slew")
     computer = live.flight.motion.flight_computer
-    assert told(live, {"fans": [0.1] * 6}) == ""
+    assert answer_to(live, {"fans": [0.1] * 6}) == ""
     for _ in range(5):
         live.advance()
     assert np.any(computer.control_torque_nm)
-    assert told(live, {"wheels": [1e9] * 3}) == ""
+    assert answer_to(live, {"wheels": [1e9] * 3}) == ""
     live.advance()
     np.testing.assert_array_equal(computer.control_torque_nm, 0)
     # Clipped to the limit.
@@ -218,8 +218,8 @@ def test_a_trigger_exposes_from_now_on_one_after_another() -> None:
         live.advance()
     assert packets == []
     now_s = live.flight.now_s
-    assert told(live, {"exposure_s": 0.02, "trigger": True}) == ""
-    assert told(live, {"trigger": True}) == ""
+    assert answer_to(live, {"exposure_s": 0.02, "trigger": True}) == ""
+    assert answer_to(live, {"trigger": True}) == ""
     for _ in range(10):
         live.advance()
     frames = [one.header for one in packets if one.channel == "frame"]
@@ -245,7 +245,7 @@ def test_a_client_s_attitudes_update_the_filter() -> None:
     solution = attitude(
         t_s=flight.now_s, cam_from_ref_xyzw=(mount * lab_from_body.inv()).as_quat().tolist()
     )
-    assert told(live, {"attitude": solution}) == ""
+    assert answer_to(live, {"attitude": solution}) == ""
     assert dict(live.commands.updates) == {"used": 1}
     assert estimate_error_deg(live) < 0.1 * before
 
