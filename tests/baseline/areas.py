@@ -175,9 +175,9 @@ def run_session(lines: list[str], folder: Path) -> Entries:
             yield f"{line}: text", digest.sha(ran.out)
 
 
-def run_stream(scene: str, folder: Path) -> Entries:
+def run_live(scene: str, folder: Path) -> Entries:
     """Packets of a pipe, and files of a folder, of three frames as fast as possible."""
-    words = ("stream", scene, "--speed", "0", "--frames", "3", "--json")
+    words = ("live", scene, "--speed", "0", "--frames", "3", "--json")
     ran = succeed(folder, *words, "--pipe", "-")
     yield "statistics", json.dumps(digest.steady(json.loads(ran.err)))
     data = ran.out
@@ -241,8 +241,8 @@ AREAS: dict[str, Callable[[], dict[str, Case]]] = {
         name: partial(run_session, lines)
         for name, lines in CASES["contracts"]["sessions"].items()
     },
-    "streams": lambda: {
-        scene: partial(run_stream, scene)
+    "live": lambda: {
+        scene: partial(run_live, scene)
         for scene in ("shefex2", "afit_simsat", "simsat_bump")
     },
     "surveys": lambda: {

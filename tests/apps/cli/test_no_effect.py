@@ -49,8 +49,8 @@ STUDY = {
             "--workers 2: has no effect with --engine serial",
         ),
         (
-            "stream shefex2 --folder out --host ::1",
-            "--host ::1: has no effect without --http",
+            "live shefex2 --folder out --host ::1",
+            "--host ::1: has no effect without --tcp or --http",
         ),
         ("reproduce shefex-figs-4-5 --open", "--open: has no effect without --report"),
     ],
