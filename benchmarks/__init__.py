@@ -31,6 +31,7 @@ AREAS = {
     "identify": Area("star identification beside tetra3rs", WHOLE),
     "attitude": Area("attitude solvers beside scipy", WHOLE),
     "dynamics": Area("a vehicle's flight beside bare MuJoCo", WHOLE),
+    "live": Area("delay and jitter of frames over the wire", {"count": 30}),
     "start": Area("CPU time of the first commands", WHOLE),
     "footprint": Area("memory and time of the estimator on one core", WHOLE),
     "frames": Area("from image to attitude beside tetra3rs and cedar-solve", {"count": 10}),
