@@ -242,8 +242,7 @@ AREAS: dict[str, Callable[[], dict[str, Case]]] = {
         for name, lines in CASES["contracts"]["sessions"].items()
     },
     "live": lambda: {
-        scene: partial(run_live, scene)
-        for scene in ("shefex2", "afit_simsat", "simsat_bump")
+        scene: partial(run_live, scene) for scene in ("shefex2", "afit_simsat", "simsat_bump")
     },
     "surveys": lambda: {
         name: partial(run_survey, words) for name, words in CASES["surveys"].items()

@@ -458,3 +458,51 @@ def test_a_stream_ends_with_the_reader_of_its_pipe_and_at_sigterm(tmp_path: Path
     result = json.loads(named.communicate(timeout=60)[0])
     assert named.returncode == 0
     assert result["made"] >= result["outputs"]["pipe"]["sent"]["frame"] >= 2
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:1"}, 200),
+        ({"Host": "rebound.example"}, 403),
+        ({"Origin": "http://other.example"}, 403),
+        ({"Origin": "null"}, 403),
+    ],
+)
+@pytest.mark.parametrize("path", ["/", "/frame.png", "/stream.mjpg", "/truth.json"])
+def test_requests_that_a_browser_makes_for_another_site_are_refused(
+    hub: tuple[http.FrameHub, str], path: str, headers: dict[str, str], status: int
+) -> None:
+    request = urllib.request.Request(hub[1] + path, method="HEAD", headers=headers)
+    if status == 200:
+        assert urllib.request.urlopen(request, timeout=10).status == 200
+    else:
+        with pytest.raises(urllib.error.HTTPError, match=str(status)):
+            urllib.request.urlopen(request, timeout=10)
+
+
+def test_a_server_with_a_token_wants_it_in_every_address() -> None:
+    hub = http.FrameHub(dict)
+    server = http.start_server(hub, "127.0.0.1", 0, "secret")
+    hub.offer(packet(0), False)
+    address = f"http://127.0.0.1:{server.server_port}"
+    for query in ("", "?token=wrong", "?token=secre"):
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(f"{address}/frame.png{query}", timeout=10)
+    page = urllib.request.urlopen(f"{address}/?token=secret", timeout=10).read()
+    assert b"/stream.mjpg?token=secret" in page
+    hub.close()
+    server.shutdown()
+
+
+def test_the_truth_is_served_only_where_it_is_on() -> None:
+    hub = http.FrameHub(dict)
+    server = http.start_server(hub, "127.0.0.1", 0)
+    hub.offer(packet(0)._replace(truth={}), False)
+    with pytest.raises(urllib.error.HTTPError, match="start with --truth"):
+        urllib.request.urlopen(
+            f"http://127.0.0.1:{server.server_port}/truth.json", timeout=10
+        )
+    hub.close()
+    server.shutdown()
