@@ -1,0 +1,1 @@
+"""Real-time stream of a scene's frames, for trackers in other programs or on other processors."""
