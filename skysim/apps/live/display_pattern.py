@@ -10,7 +10,6 @@ the direction in which the simulated camera sees it:
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,8 +19,13 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.discs import centers_of
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats
-from skysim.scene.sections.layouts import LcdConfig, PixelsConfig, ProjectorConfig
-from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
+from skysim.scene.sections.layouts import (
+    LcdConfig,
+    LensDisplayConfig,
+    PixelsConfig,
+    ProjectorConfig,
+)
+from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.simulation.lights.light import Exposure, Lit, any_of, beam_of
@@ -31,8 +35,8 @@ from skysim.sources.dome.display import (
     own_from_lab,
     panel_surface,
 )
-from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
-from skysim.sources.dome.surface import Plane, Surface, build_surface
+from skysim.sources.dome.led import irradiance_e_s_m2
+from skysim.sources.dome.surface import Surface, build_surface
 
 PEAK = 0.75**2  # greatest share of a spot's light in one pixel
 GRAY_LEVELS = 256
@@ -72,16 +76,20 @@ class DisplayPattern:
     ----------
     camera
         Simulated camera, in flight
-    light
-        Section `light` of the bench
+    screen
+        Display of the bench
+    surface
+        The panel, or the wall of a projector; None behind a collimator
     lab_from_cam, camera_m
         Attitude of the bench's camera, and its (3,) entrance pupil, in the bench's lab
     white_e_s_m2
-        Irradiance of the brightest light that no pixel limits; `of_bench` has that of the flight's brightest star
+        Irradiance of the brightest light that white can show; `of_bench` has that of the flight's brightest star. With
+        less, faint stars are finer: sRGB's dark grays are coarse
     """
 
     camera: StarCamera
-    light: CollimatedDisplayConfig | DomeConfig
+    screen: PixelsConfig
+    surface: Surface | None
     lab_from_cam: Rotation
     camera_m: Floats
     white_e_s_m2: float
@@ -95,43 +103,29 @@ class DisplayPattern:
         InputError
             If the bench has no display, or one without 256 gray levels.
         """
-        light = bench.scene.light
-        screen = light.layout if isinstance(light, DomeConfig) else light
+        screen: object = bench.scene.light
+        surface = None
+        if isinstance(screen, DomeConfig):
+            surface = build_surface(screen.surface)
+            screen = screen.layout
+        if isinstance(screen, LcdConfig):
+            surface = panel_surface(screen, surface)
         if not isinstance(screen, PixelsConfig):
             raise InputError(
                 "light.kind", "no display", "collimated_display, or a layout lcd or projector"
             )
         if screen.gray_levels != GRAY_LEVELS:
             raise InputError("gray_levels", f"{screen.gray_levels}", f"{GRAY_LEVELS}")
-        assert isinstance(light, CollimatedDisplayConfig | DomeConfig)  # the others are none
         stands = expected_exposure(bench.camera, bench.start, np.zeros(3), 0.0)
         flies = expected_exposure(flown.camera, flown.start, np.zeros(3), 0.0)
         _, irradiance = lights_of(flown.camera.known.during(flies), flies)
         return cls(
             flown.camera,
-            light,
+            screen,
+            surface,
             stands.cam_from_lab.inv(),
             stands.camera_m,
             float(irradiance.max()),
-        )
-
-    @property
-    def screen(self) -> PixelsConfig:
-        """Pixels of the display."""
-        screen = self.light.layout if isinstance(self.light, DomeConfig) else self.light
-        assert isinstance(screen, PixelsConfig)  # see `of_bench`
-        return screen
-
-    @cached_property
-    def surface(self) -> Surface | None:
-        """The panel, or the wall of a projector; None behind a collimator."""
-        if isinstance(self.light, CollimatedDisplayConfig):
-            return None
-        surface = build_surface(self.light.surface)
-        return (
-            panel_surface(self.screen, surface)
-            if isinstance(self.screen, LcdConfig)
-            else surface
         )
 
     def picture(self, t_s: float, lab_from_body: Rotation) -> DisplayPicture:
@@ -171,19 +165,16 @@ class DisplayPattern:
     def places_px(self, toward_lab: Floats) -> tuple[Floats, Bools]:
         """(N, 2) column and row at directions (N, 3) in the bench's lab, and (N,) whether the display is there."""
         screen = self.screen
-        if isinstance(self.light, CollimatedDisplayConfig):
-            own_m, shown = on_chip_m(self.light, toward_lab)
-        else:
-            assert self.surface is not None  # there is a dome
-            place_m = self.surface.meet(self.camera_m, toward_lab)
+        surface = self.surface
+        own = toward_lab if surface is None else surface.meet(self.camera_m, toward_lab)
+        if isinstance(screen, LensDisplayConfig):
             if isinstance(screen, ProjectorConfig):
-                own = own_from_lab(screen).apply(place_m - screen.position_m)
-                own_m, shown = on_chip_m(screen, own)
-            else:
-                assert isinstance(self.surface, Plane)
-                own = self.surface.lab_from_own.inv().apply(place_m - self.surface.center_m)
-                own_m = own[:, :2]
-                shown = np.isfinite(own_m[:, 0])
+                own = own_from_lab(screen).apply(own - screen.position_m)
+            own_m, shown = on_chip_m(screen, own)
+        else:
+            assert surface is not None  # a panel
+            own_m = surface.lab_from_own.inv().apply(own - surface.center_m)[:, :2]
+            shown = np.isfinite(own_m[:, 0])
         return own_m / screen.pitch_m + (np.array(screen.pixels) - 1) / 2, shown
 
 
@@ -204,7 +195,7 @@ def lights_of(lit: Lit, exposure: Exposure) -> tuple[Floats, Floats]:
         direction = offset_m / distance_m[:, None]
         cos_out = -np.sum(direction * sources.normal, axis=1)
         near = irradiance_e_s_m2(
-            sources.strength, lit.emitter or Emitter(), cos_out, np.ones(1), distance_m
+            sources.strength, lit.emitter, cos_out, np.ones(1), distance_m
         )
         steady = np.where(sources.place[:, 3] > 0, near, sources.strength)
         toward.append(exposure.cam_from_lab.apply(direction))
