@@ -9,6 +9,7 @@ the direction in which the simulated camera sees it:
 4. The gray levels with this light, by the display's gamma.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, Self
 
@@ -39,7 +40,6 @@ from skysim.sources.dome.led import irradiance_e_s_m2
 from skysim.sources.dome.surface import Surface, build_surface
 
 PEAK = 0.75**2  # greatest share of a spot's light in one pixel
-GRAY_LEVELS = 256
 
 
 class DisplayPicture(NamedTuple):
@@ -114,11 +114,11 @@ class DisplayPattern:
             raise InputError(
                 "light.kind", "no display", "collimated_display, or a layout lcd or projector"
             )
-        if screen.gray_levels != GRAY_LEVELS:
-            raise InputError("gray_levels", f"{screen.gray_levels}", f"{GRAY_LEVELS}")
+        if screen.gray_levels != 256:
+            raise InputError("gray_levels", f"{screen.gray_levels}", "256")
         stands = expected_exposure(bench.camera, bench.start, np.zeros(3), 0.0)
         flies = expected_exposure(flown.camera, flown.start, np.zeros(3), 0.0)
-        _, irradiance = lights_of(flown.camera.known.during(flies), flies)
+        _, irradiance = lights_of([flown.camera.known.during(flies)], flies)
         return cls(
             flown.camera,
             screen,
@@ -136,11 +136,8 @@ class DisplayPattern:
         # 1. Lights.
         exposure = expected_exposure(self.camera, lab_from_body, np.zeros(3), t_s)
         beam = beam_of(self.camera.lights, exposure)
-        each = [
-            lights_of(lit._replace(hidden_by=beam.before(lit)), exposure) for lit in beam.lits
-        ]
-        toward_cam = np.concatenate([toward for toward, _ in each])
-        irradiance = np.concatenate([one for _, one in each])
+        lits = [lit._replace(hidden_by=beam.before(lit)) for lit in beam.lits]
+        toward_cam, irradiance = lights_of(lits, exposure)
         # 2. Places. A spot at the edge would be cut, and its centroid wrong.
         xy_px, shown = self.places_px(self.lab_from_cam.apply(toward_cam))
         shown &= np.all((xy_px > 0.5) & (xy_px < np.array(self.screen.pixels) - 1.5), axis=1)
@@ -178,28 +175,27 @@ class DisplayPattern:
         return own_m / screen.pitch_m + (np.array(screen.pixels) - 1) / 2, shown
 
 
-def lights_of(lit: Lit, exposure: Exposure) -> tuple[Floats, Floats]:
-    """Unit directions (N, 3) in camera axes and mean irradiances (N,), e- s^-1 m^-2, of what nothing hides of a light.
+def lights_of(lits: Iterable[Lit], exposure: Exposure) -> tuple[Floats, Floats]:
+    """Unit directions (N, 3) in camera axes and mean irradiances (N,), e- s^-1 m^-2, of what nothing hides of lights.
 
     Discs are points at their centers.
     """
-    hidden = any_of(lit.hidden_by)
     toward = [np.zeros((0, 3))]
     irradiance = [np.zeros(0)]
-    points = [] if lit.points is None else [lit.points]
-    for sources in [*points, centers_of(lit.discs)]:
-        if hidden is not None:
-            sources = sources.take(~hidden(sources.place))
-        offset_m = sources.place[:, :3] - sources.place[:, 3:] * exposure.camera_m
-        distance_m = np.linalg.norm(offset_m, axis=1)
-        direction = offset_m / distance_m[:, None]
-        cos_out = -np.sum(direction * sources.normal, axis=1)
-        near = irradiance_e_s_m2(
-            sources.strength, lit.emitter, cos_out, np.ones(1), distance_m
-        )
-        steady = np.where(sources.place[:, 3] > 0, near, sources.strength)
-        toward.append(exposure.cam_from_lab.apply(direction))
-        irradiance.append(steady * sources.on_s / sources.period_s)
+    for lit in lits:
+        hidden = any_of(lit.hidden_by)
+        for sources in filter(None, (lit.points, centers_of(lit.discs))):
+            seen = sources.take(~hidden(sources.place)) if hidden else sources
+            offset_m = seen.place[:, :3] - seen.place[:, 3:] * exposure.camera_m
+            distance_m = np.linalg.norm(offset_m, axis=1)
+            direction = offset_m / distance_m[:, None]
+            cos_out = -np.sum(direction * seen.normal, axis=1)
+            near = irradiance_e_s_m2(
+                seen.strength, lit.emitter, cos_out, np.ones(1), distance_m
+            )
+            lit_e_s_m2 = np.where(seen.place[:, 3] > 0, near, seen.strength)
+            toward.append(exposure.cam_from_lab.apply(direction))
+            irradiance.append(lit_e_s_m2 * seen.on_s / seen.period_s)
     return np.concatenate(toward), np.concatenate(irradiance)
 
 

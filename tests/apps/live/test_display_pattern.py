@@ -204,7 +204,7 @@ def test_lights_are_those_of_the_rendered_frame(name: str) -> None:
     lab_from_body = lab.start * Rotation.from_euler("xyz", [3, -2, 20], degrees=True)
     _, truth = render_at_rest(camera, lab_from_body)
     exposure = expected_exposure(camera, lab_from_body, np.zeros(3), truth.t_s)
-    toward, irradiance = lights_of(camera.known.during(exposure), exposure)
+    toward, irradiance = lights_of([camera.known.during(exposure)], exposure)
     ahead = toward[:, 2] > 0.9
     toward = toward[ahead]
     irradiance = irradiance[ahead]
