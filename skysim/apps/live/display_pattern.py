@@ -156,7 +156,7 @@ class DisplayPattern:
             gray.reshape(height, width),
             int(np.sum(peak > 0)),
             int(np.sum(peak == 0)),
-            int(np.sum(level > 1 + 1e-9)),
+            int(np.sum(level > 1)),
         )
 
     def places_px(self, toward_lab: Floats) -> tuple[Floats, Bools]:

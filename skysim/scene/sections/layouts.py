@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
@@ -463,8 +462,8 @@ class PixelsConfig(ConfigModel):
     block
         Side, in pixels, of the square of one gray that shows a star
     gray_levels, gamma
-        Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white. "srgb" is IEC 61966-2-1; a list is measured:
-        light above that of black at even grays from black, 0, to white, 1
+        Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white. "srgb" is IEC 61966-2-1; a list is
+        light as measured above that of black, at even grays from black, 0, to white, 1
     contrast
         White over black, which glows over the whole display; without it black is dark
     """
@@ -488,10 +487,9 @@ class PixelsConfig(ConfigModel):
 
     @model_validator(mode="after")
     def check_gamma(self) -> Self:
-        if isinstance(self.gamma, tuple) and (
-            (self.gamma[0], self.gamma[-1]) != (0, 1)
-            or any(a >= b for a, b in itertools.pairwise(self.gamma))
-        ):
+        gamma = self.gamma
+        # A rise from 0 to 1 is what a sorted set of it with both ends is.
+        if isinstance(gamma, tuple) and tuple(sorted({0.0, 1.0, *gamma})) != gamma:
             raise InputError("gamma", "not a rise from 0 to 1", "0 first, 1 last, increasing")
         return self
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.display_pattern import PEAK, DisplayPattern, lights_of, spots
 from skysim.core.errors import InputError
+from skysim.core.paths import DATA
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
 from skysim.scene.sections.layouts import PixelsConfig, ProjectorConfig
@@ -21,7 +23,9 @@ from skysim.sources.dome import display
 from skysim.sources.stars import steady_points
 from skysim.tracking.factory import solve_frame
 from tests.helpers.changed_light import with_sources
+from tests.helpers.labpage import CHROMIUM
 
+pytest_plugins = ["tests.helpers.labpage"]
 QUIET = {"camera.detector.noise": "false"}
 PITCH_M = 16.2e-6
 FOCAL_M = 45e-3
@@ -265,3 +269,36 @@ def test_a_bench_needs_a_display_of_8_bits(flown: Lab) -> None:
 def test_a_measured_gamma_rises_from_black_to_white() -> None:
     with pytest.raises(InputError, match=r"light\.gamma: not a rise from 0 to 1"):
         bench([0.0, 0.5, 0.4, 1.0])
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium")
+def test_the_page_shows_the_picture_pixel_by_pixel(flown: Lab, browser: Any) -> None:
+    """A screenshot of the page has the very gray levels; with scaled pixels the page says so."""
+    gray = DisplayPattern.of_bench(flown, bench()).picture(0.0, flown.start).gray
+    png = cv2.imencode(".png", gray)[1].tobytes()
+    html = (DATA / "display.html").read_text(encoding="utf-8")
+    for scale, told in ((1, False), (1.5, True)):
+        context = browser.new_context(
+            viewport={"width": 960, "height": 600}, device_scale_factor=scale
+        )
+        page = context.new_page()
+        page.route(
+            "**/display.png*", lambda route: route.fulfill(body=png, content_type="image/png")
+        )
+        page.route(
+            "**/display", lambda route: route.fulfill(body=html, content_type="text/html")
+        )
+        page.goto("http://skysim.invalid/display")
+        page.wait_for_function("document.getElementById('sky').naturalWidth > 0")
+        page.wait_for_function("document.getElementById('sky').style.width != ''")
+        note = page.locator("#note")
+        assert "Press any key for full screen." in note.inner_text()
+        assert ("scales pixels by 1.5" in note.inner_text()) == told
+        page.keyboard.press("f")
+        page.wait_for_function("document.fullscreenElement !== null")
+        if not told:
+            page.wait_for_function("document.getElementById('note').textContent === ''")
+            shot = cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+            np.testing.assert_array_equal(shot, np.repeat(gray[:, :, None], 3, axis=2))
+        context.close()
