@@ -21,8 +21,10 @@ from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
 from skysim.sources.dome.display import (
     black_transmission,
+    on_chip_m,
     panel_strength_e_s_sr,
     panel_surface,
+    pixel_sr,
     white_wall_per_m2,
 )
 from skysim.sources.dome.led import LOBES
@@ -152,20 +154,10 @@ def white_radiance(led: leds.LedConfig, cos_emission: Floats, band: Band) -> Flo
 def collimated_radiance_e_s_m2_sr(
     config: light.CollimatedDisplayConfig, toward_lab: Floats, band: Band
 ) -> Floats:
-    """(N,) radiance behind the collimator of a white display; each pixel spans (p / f)^2 cos^3 steradian.
-
-    0 for directions (N, 3) that miss it.
-    """
+    """(N,) radiance behind the collimator of a white display. 0 for directions (N, 3) that miss it."""
     # A star of brightest_mag is a block of white pixels, behind the collimator a parallel beam for
     # each.
     # Flux of one white pixel.
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band)) / config.block**2
-    cos_field = np.maximum(toward_lab[:, 2], 1e-9)
-    half_extent = np.array(config.pixels) * config.pitch_m / 2 / config.focal_length_m
-    within = np.all(np.abs(toward_lab[:, :2]) <= half_extent * cos_field[:, None], axis=1)
-    on_display = within & (toward_lab[:, 2] > 0)
-    return (
-        on_display
-        * white_e_s_m2
-        / ((config.pitch_m / config.focal_length_m) ** 2 * cos_field**3)
-    )
+    _, on_display = on_chip_m(config, toward_lab)
+    return on_display * white_e_s_m2 / pixel_sr(config, np.maximum(toward_lab[:, 2], 1e-9))

@@ -14,6 +14,7 @@ from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
     ConfigModel,
     Declination,
+    Fractions,
     Length,
     Magnitude,
     Number,
@@ -461,7 +462,8 @@ class PixelsConfig(ConfigModel):
     block
         Side, in pixels, of the square of one gray that shows a star
     gray_levels, gamma
-        Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white
+        Gray g = 0, 1, ... transmits (g / (gray_levels - 1))^gamma of white. "srgb" is IEC 61966-2-1; a list is
+        light as measured above that of black, at even grays from black, 0, to white, 1
     contrast
         White over black, which glows over the whole display; without it black is dark
     """
@@ -470,7 +472,7 @@ class PixelsConfig(ConfigModel):
     pitch_m: PositiveLength
     block: PositiveInt = 1
     gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
-    gamma: Annotated[Number, Field(gt=0, le=10)] = 2.2
+    gamma: Annotated[Number, Field(gt=0, le=10)] | Literal["srgb"] | Fractions = 2.2
     contrast: Annotated[Number, Field(ge=2)] | None = None
 
     @model_validator(mode="after")
@@ -480,6 +482,42 @@ class PixelsConfig(ConfigModel):
                 "block",
                 f"{self.block} is wider than the display",
                 f"up to {min(self.pixels)} pixels",
+            )
+        return self
+
+    @model_validator(mode="after")
+    def check_gamma(self) -> Self:
+        gamma = self.gamma
+        # A rise from 0 to 1 is what a sorted set of it with both ends is.
+        if isinstance(gamma, tuple) and tuple(sorted({0.0, 1.0, *gamma})) != gamma:
+            raise InputError("gamma", "not a rise from 0 to 1", "0 first, 1 last, increasing")
+        return self
+
+
+class LensDisplayConfig(PixelsConfig):
+    """A display behind a lens: a projector or a collimated micro-display.
+
+    Attributes
+    ----------
+    focal_length
+        Focal length f of the lens
+    distortion
+        Coefficient k of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the display. The
+        picture is corrected for it
+    """
+
+    focal_length_m: PositiveLength
+    distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+
+    @model_validator(mode="after")
+    def check_fold(self) -> Self:
+        corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
+        # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
+        if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
+            raise InputError(
+                "distortion",
+                f"{self.distortion:g} folds the picture's corners back",
+                "nearer to 0",
             )
         return self
 
@@ -496,7 +534,7 @@ class LcdConfig(PixelsConfig):
     points: Points
 
 
-class ProjectorConfig(PixelsConfig):
+class ProjectorConfig(LensDisplayConfig):
     """A projector in the dome that shows any layout of single LEDs on the matt inside, each on the nearest pixels.
 
     `led` is the light of one white pixel on the axis after reflection by the wall: the intensity along the normal of
@@ -513,13 +551,10 @@ class ProjectorConfig(PixelsConfig):
         Rotation of the picture about the axis; at 0 its rows are along the lab's +x, projected across the axis
     pitch
         Distance of the pixels on the projector's chip
-    focal_length, f_number
-        Focal length and f-number of the lens
+    f_number
+        F-number of the lens
     focus
         Distance along the axis at which the picture is sharp; that of `aim` if left out
-    distortion
-        Coefficient k of the lens: a direction at the tangent t from the axis is at f t (1 + k t^2) on the chip. The
-        picture is corrected for it
     falloff
         Exponent of the cosine of a pixel's angle from the axis, by which its light decreases; 4 is the natural
         vignetting of a lens
@@ -530,26 +565,16 @@ class ProjectorConfig(PixelsConfig):
     position_m: Position
     aim_m: Position
     rotation_deg: Number = 0.0
-    focal_length_m: PositiveLength
     f_number: Positive = 2.0
     focus_m: PositiveLength | None = None
-    distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
     @model_validator(mode="after")
-    def check_lens(self) -> ProjectorConfig:
+    def check_aim(self) -> ProjectorConfig:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
             raise InputError(
                 "aim", "straight along x from the position", "any other direction"
-            )
-        corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
-        # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
-        if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
-            raise InputError(
-                "distortion",
-                f"{self.distortion:g} folds the picture's corners back",
-                "nearer to 0",
             )
         return self
 

@@ -40,9 +40,9 @@ from skysim.core.units import (
 )
 from skysim.scene.sections.layouts import (
     Layout,
+    LensDisplayConfig,
     OnPoints,
     PatchBoardsConfig,
-    PixelsConfig,
     Points,
 )
 from skysim.scene.sections.leds import LedConfig
@@ -435,17 +435,15 @@ class StarsConfig(ConfigModel):
     occlusion: bool = True
 
 
-class CollimatedDisplayConfig(PixelsConfig):
+class CollimatedDisplayConfig(LensDisplayConfig):
     """A star simulator: a micro-display in the focus of a collimator, above the level camera.
 
     Its axis is the lab's zenith; the columns of the display are along the lab's x and its rows along y. The exit pupil
-    covers the lens at every attitude. Color and image errors of the collimator and the refresh of the display are
-    neglected.
+    covers the lens at every attitude. Color of the collimator, its other image errors and the refresh of the display
+    are neglected.
 
     Attributes
     ----------
-    focal_length
-        Focal length of the collimator
     catalog, limit_mag
         Catalog of the stars that are shown at the scene's start_time, and their faintest V (all if left out)
     axis_ra_deg, axis_dec_deg, roll_deg
@@ -458,7 +456,6 @@ class CollimatedDisplayConfig(PixelsConfig):
     """
 
     kind: Literal["collimated_display"]
-    focal_length_m: PositiveLength
     catalog: str = SKY
     limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
     axis_ra_deg: RightAscension

@@ -16,7 +16,7 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections import layouts, leds, light
-from skysim.scene.sections.layouts import ProjectorConfig
+from skysim.scene.sections.layouts import LensDisplayConfig, ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources import stars as star_sources
 from skysim.sources.catalog import Catalog
@@ -89,17 +89,39 @@ def black_transmission(config: layouts.PixelsConfig) -> float:
 
 
 def gray_transmission(config: layouts.PixelsConfig, level: Floats) -> Floats:
-    """(N,) transmission of the nearest gray level: (g / (G - 1))^gamma, g rounded from (G - 1) level^(1 / gamma).
+    """(N,) transmission of the nearest gray level: that of g / (G - 1), g as in `gray_number`."""
+    top = config.gray_levels - 1
+    return transmission(config, gray_number(config, level) / top)
+
+
+def gray_number(config: layouts.PixelsConfig, level: Floats) -> Floats:
+    """(N,) nearest gray levels g of levels 0 to 1, rounded from (G - 1) v, of which v has this transmission.
 
     Rounding is in g, as in a program that writes a picture, so steps are fine for faint stars.
     """
-    top = config.gray_levels - 1
-    return (np.rint(top * level ** (1 / config.gamma)) / top) ** config.gamma
+    gamma = config.gamma
+    if gamma == "srgb":
+        gray = np.where(level <= 0.0031308, 12.92 * level, 1.055 * level ** (1 / 2.4) - 0.055)
+    elif isinstance(gamma, tuple):
+        gray = np.interp(level, gamma, np.linspace(0, 1, len(gamma)))
+    else:
+        gray = level ** (1 / gamma)
+    return np.rint((config.gray_levels - 1) * gray)
+
+
+def transmission(config: layouts.PixelsConfig, gray: Floats) -> Floats:
+    """(N,) light above that of black of grays from black, 0, to white, 1, by the display's gamma."""
+    gamma = config.gamma
+    if gamma == "srgb":  # IEC 61966-2-1
+        return np.where(gray <= 0.04045, gray / 12.92, ((gray + 0.055) / 1.055) ** 2.4)
+    if isinstance(gamma, tuple):
+        return np.interp(gray, np.linspace(0, 1, len(gamma)), gamma)
+    return gray**gamma
 
 
 def min_level(config: layouts.PixelsConfig) -> float:
     """Level below which a star is black: half a step of gray."""
-    return float((0.5 / (config.gray_levels - 1)) ** config.gamma)
+    return float(transmission(config, np.array(0.5 / (config.gray_levels - 1))))
 
 
 def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
@@ -246,7 +268,7 @@ def display_sources(
 
     1. Apparent directions of the stars, and their places on the display.
     2. Round to pixels and gray levels.
-    3. The blocks as beams.
+    3. The blocks as beams, without the distortion for which the places were drawn.
 
     Returns Sources in lab axes: points at infinity, or, with config.conjugate_m = D, at D from the bearing's center, so
     that a camera off it by r sees them shifted by r / D. Strength is that of a star of config.brightest_mag and the
@@ -267,12 +289,7 @@ def display_sources(
     direction = np.zeros((0, 3))
     if len(stars):
         direction = lab_from_icrs(config).apply(star_sources.apparent(stars, time))
-    in_front = direction[:, 2] > 0
-    stars = stars.take(in_front)
-    direction = direction[in_front]
-    on_display_m = direction[:, :2] / direction[:, 2:] * config.focal_length_m
-    half_m = np.array(config.pixels) * config.pitch_m / 2
-    within = np.all(np.abs(on_display_m) <= half_m, axis=1)
+    on_display_m, within = on_chip_m(config, direction)
     stars = stars.take(within)
     on_display_m = on_display_m[within]
     if not len(stars):
@@ -292,9 +309,9 @@ def display_sources(
             f"to {darkest_mag:.3g}",
         )
     # 3.
-    beam = np.column_stack(
-        [blocks.center_px * config.pitch_m, np.full(len(blocks.star), config.focal_length_m)]
-    )
+    shown_m = blocks.center_px * config.pitch_m
+    shown_m *= undistortion(config, shown_m)[:, None]
+    beam = np.column_stack([shown_m, np.full(len(shown_m), config.focal_length_m)])
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))
     beams = beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
     b_v, v_i = (np.full(len(beam), color) for color in SUN)
@@ -346,8 +363,8 @@ def own_from_lab(config: ProjectorConfig) -> Rotation:
     return Rotation.from_matrix(np.array([right, np.cross(axis, right), axis]))
 
 
-def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, Bools]:
-    """(N, 2) places on the chip of directions (N, 3) in the projector's axes, and (N,) whether they are on its pixels.
+def on_chip_m(config: LensDisplayConfig, own: Floats) -> tuple[Floats, Bools]:
+    """(N, 2) places on the chip of directions (N, 3) in the lens's axes, and (N,) whether they are on its pixels.
 
     A direction beyond the fold of the distortion, where 1 + 3 k t^2 = 0, is not on them.
     """
@@ -360,14 +377,19 @@ def on_chip_m(config: ProjectorConfig, own: Floats) -> tuple[Floats, Bools]:
     return chip_m, np.asarray(in_front & unfolded & np.all(np.abs(chip_m) <= half_m, axis=1))
 
 
-def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
-    """(N, 3) unit rays in the lab through places (N, 2) on the chip; Newton's method inverts the distortion."""
+def undistortion(config: LensDisplayConfig, chip_m: Floats) -> Floats:
+    """(N,) factors from places (N, 2) on the chip to those without distortion, by Newton's method."""
     radius = np.linalg.norm(chip_m, axis=1) / config.focal_length_m
     tangent = radius
     for _ in range(NEWTON_STEPS if config.distortion else 0):
         excess = tangent * (1 + config.distortion * tangent**2) - radius
         tangent = tangent - excess / (1 + 3 * config.distortion * tangent**2)
-    stretch = np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
+    return np.divide(tangent, radius, out=np.ones_like(radius), where=radius > 0)
+
+
+def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
+    """(N, 3) unit rays in the lab through places (N, 2) on the chip."""
+    stretch = undistortion(config, chip_m)
     own = np.column_stack(
         [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
     )
@@ -375,7 +397,7 @@ def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
     return own_from_lab(config).inv().apply(own)
 
 
-def pixel_sr(config: ProjectorConfig, cos_axis: Floats) -> Floats:
+def pixel_sr(config: LensDisplayConfig, cos_axis: Floats) -> Floats:
     """(N,) solid angles w of pixels at these cosines from the axis."""
     tangent2 = 1 / cos_axis**2 - 1
     stretch = (1 + config.distortion * tangent2) * (1 + 3 * config.distortion * tangent2)
