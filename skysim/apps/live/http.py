@@ -11,17 +11,24 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
+
+from scipy.spatial.transform import Rotation
 
 from skysim.apps.access import LOOPBACK, same_site, token_matches
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.sinks import encode_png
 from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.paths import DATA
 from skysim.results.plots import jpeg, to_8bit
 
+if TYPE_CHECKING:
+    from skysim.apps.live.display_pattern import DisplayPattern
+
 BOUNDARY = "frame"
+DISPLAY = ("/display", "/display.png")
 SOCKET_TIMEOUT_S = 10.0  # timeout of a client that stops reading
 FINISH_TIMEOUT_S = 5.0  # time for clients to take the last frame
 INDEX = b"""<!doctype html><meta charset="utf-8"><title>skysim live</title>
@@ -45,6 +52,8 @@ class FrameHub:
     ----------
     status
         Function that returns the counters of the flight
+    pattern, instant
+        Pattern of a display, and the function that returns the time and attitude which it shows; None without
     clients
         Connected clients
     earlier
@@ -58,6 +67,8 @@ class FrameHub:
     def __init__(self, status: Callable[[], dict[str, Any]]) -> None:
         self.status = status
         self.newest: Packet | None = None
+        self.pattern: DisplayPattern | None = None
+        self.instant: Callable[[], tuple[float, Rotation]] | None = None
         self.ended = False
         self.changed = threading.Condition()
         self.clients: list[Client] = []
@@ -140,6 +151,12 @@ class Handler(BaseHTTPRequestHandler):
                 files.to_json(self.hub.status()).encode(),
                 "application/json",
             )
+        elif path in DISPLAY and self.hub.pattern and self.hub.instant:
+            if path.endswith(".png"):
+                picture = self.hub.pattern.picture(*self.hub.instant())
+                self.respond(encode_png(picture.gray), "image/png")
+            else:
+                self.respond((DATA / "display.html").read_bytes(), "text/html")
         elif path in ("/stream.mjpg", "/stream.raw"):
             self.stream(path.endswith("raw"))
         elif path not in ("/frame.png", "/frame.raw", "/truth.json"):
@@ -150,7 +167,7 @@ class Handler(BaseHTTPRequestHandler):
         elif newest is None:
             self.send_error(503, "no frame has been rendered yet")
         elif path == "/frame.png":
-            self.respond(encode_png(newest), "image/png", newest.header)
+            self.respond(encode_png(newest.pixels), "image/png", newest.header)
         elif path == "/frame.raw":
             self.respond(newest.pack(), "application/octet-stream", newest.header)
         elif not newest.truth:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.commands import CommandState, Inbox
 from skysim.apps.live.packets import (
@@ -128,6 +129,11 @@ class Live:
             .mount.cam_from_body.as_quat()
             .tolist(),
         }
+
+    def instant(self) -> tuple[float, Rotation]:
+        """Time and lab_from_body at the end of the last control period."""
+        state = self.flight.state
+        return state.t_s, state.lab_from_body
 
     def run(self) -> None:
         """Fly until the end, or until all outputs have failed."""

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from skysim.apps.live.packets import Packet
 from skysim.core import files
@@ -166,7 +167,7 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
     def write(packet: Packet) -> None:
         stem = path / f"frame_{packet.header['index']:06d}"
         if packet.pixels.dtype == np.uint16:
-            files.write_bytes(stem.with_suffix(".png"), encode_png(packet))
+            files.write_bytes(stem.with_suffix(".png"), encode_png(packet.pixels))
         else:
             files.write_bytes(stem.with_suffix(".raw"), packet.pixels.tobytes())
         truth = {"truth": dict(packet.truth)} if packet.truth else {}
@@ -175,9 +176,9 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
     return write
 
 
-def encode_png(packet: Packet) -> bytes:
+def encode_png(pixels: NDArray[Any]) -> bytes:
     """Encode the pixels as PNG at the lowest compression level, for speed."""
-    return bytes(cv2.imencode(".png", packet.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+    return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 
 
 def pipe_writer(path: str) -> Callable[[Packet], None]:

@@ -84,7 +84,8 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
 
 def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for line in block("sh", "--tcp 8091").splitlines():
+    lines = block("sh", "--tcp 8091") + block("sh", "--display")
+    for line in lines.splitlines():
         words = re.sub(r"8091", "0", line.partition("#")[0]).split()[1:]
         done = CliRunner().invoke(main.app, [*words, "--speed", "2"], catch_exceptions=False)
         assert re.search(r"\d frames rendered, 0 dropped", done.output)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import urllib.error
+import urllib.request
 from typing import Any
 
 import cv2
@@ -11,6 +13,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from skysim.apps.live import http
 from skysim.apps.live.display_pattern import PEAK, DisplayPattern, lights_of, spots
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
@@ -269,6 +272,22 @@ def test_a_bench_needs_a_display_of_8_bits(flown: Lab) -> None:
 def test_a_measured_gamma_rises_from_black_to_white() -> None:
     with pytest.raises(InputError, match=r"light\.gamma: not a rise from 0 to 1"):
         bench([0.0, 0.5, 0.4, 1.0])
+
+
+def test_the_server_shows_the_flight_s_instant(flown: Lab) -> None:
+    hub = http.FrameHub(dict)
+    server = http.start_server(hub, "127.0.0.1", 0)
+    address = f"http://127.0.0.1:{server.server_port}"
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(f"{address}/display", timeout=10)
+    hub.pattern = DisplayPattern.of_bench(flown, bench())
+    hub.instant = lambda: (0.0, flown.start)
+    assert b"/display.png" in urllib.request.urlopen(f"{address}/display", timeout=10).read()
+    png = urllib.request.urlopen(f"{address}/display.png?&7", timeout=10).read()
+    gray = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(gray, hub.pattern.picture(0.0, flown.start).gray)
+    hub.close()
+    server.shutdown()
 
 
 @pytest.mark.browser

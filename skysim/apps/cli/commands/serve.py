@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import secrets
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -39,6 +40,13 @@ def live(
         Path | None,
         typer.Option(
             help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
+        ),
+    ] = None,
+    display: Annotated[
+        str | None,
+        typer.Option(
+            metavar="BENCH",
+            help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
         ),
     ] = None,
     pipe: Annotated[
@@ -105,11 +113,24 @@ def live(
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
-    check_outputs(
-        outputs={"--tcp": tcp, "--http": http, "--folder": folder, "--pipe": pipe},
-        needs_server={"--host": host != HOST, "--token": bool(token)},
-        needs_tcp={"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait},
-    )
+    outputs = {
+        "folder": folder,
+        "pipe": pipe,
+        "http": http,
+        "display": display,
+        "tcp": tcp,
+    }
+    chosen = {name: value for name, value in outputs.items() if value is not None}
+    if not chosen:
+        raise InputError("", "no output", ", ".join(f"--{name}" for name in outputs))
+    needs_server = {
+        "--host": host != HOST,
+        "--token": bool(token),
+        "--display": bool(display),
+    }
+    check_needed(needs_server, chosen, SERVERS)
+    needs_tcp = {"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait}
+    check_needed(needs_tcp, chosen, ("tcp",))
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(
@@ -117,21 +138,20 @@ def live(
     )
     if client_tracker and not flight.lab.scene.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
-    outputs: list[Output] = []
     flown = Live(
         flight,
         Pace(speed, flight.lab.scene.exposure.rate_hz),
-        outputs,
+        [],
         CommandState(flight, command_timeout, trigger),
         has_truth=truth,
         solves_itself=not client_tracker,
         may_solve=tcp is not None,
     )
     with ExitStack() as stack:
+        opening = Opening(flown, stack, host, token or new_token(host), wait)
         try:
-            open_outputs(
-                flown, stack, folder, pipe, tcp, http, host, token or new_token(host), wait
-            )
+            for name, value in chosen.items():
+                OPENERS[name](opening, value)
             flown.run()
         except KeyboardInterrupt:
             print(file=sys.stderr)
@@ -142,31 +162,17 @@ def live(
         files.to_json(statistics) if json else summary(statistics),
         file=sys.stderr if pipe == "-" else sys.stdout,
     )
-    for output in outputs:
+    for output in flown.outputs:
         if output.fault not in ("", READER_GONE):
             raise InputError(f"--{output.name}", output.fault)
 
 
-def check_outputs(
-    outputs: dict[str, Any], needs_server: dict[str, bool], needs_tcp: dict[str, bool]
-) -> None:
-    """Raise InputError if there is no output, or for an option that has no effect without another.
-
-    Parameters
-    ----------
-    outputs
-        Value of each output's option; None without it
-    needs_server, needs_tcp
-        Whether an option is used that needs a server, or the wire
-    """
-    if all(value is None for value in outputs.values()):
-        raise InputError("", "no output", ", ".join(outputs))
-    if outputs["--tcp"] is None and outputs["--http"] is None:
-        for option in (option for option, is_used in needs_server.items() if is_used):
-            raise InputError(option, "has no effect without --tcp or --http", "one of them")
-    if outputs["--tcp"] is None:
-        for option in (option for option, is_used in needs_tcp.items() if is_used):
-            raise InputError(option, "has no effect without --tcp", "--tcp PORT")
+def check_needed(used: dict[str, bool], chosen: dict[str, Any], needs: Sequence[str]) -> None:
+    """Raise InputError for an option that is used without one of the outputs that it needs."""
+    if not chosen.keys() & set(needs):
+        for option in (option for option, is_used in used.items() if is_used):
+            names = " or ".join(f"--{name}" for name in needs)
+            raise InputError(option, f"has no effect without {names}", f"with {names}")
 
 
 def new_token(host: str) -> str:
@@ -176,51 +182,90 @@ def new_token(host: str) -> str:
     return "" if host in LOOPBACK else secrets.token_urlsafe(16)
 
 
-def open_outputs(
-    flown: Live,
-    stack: ExitStack,
-    folder: Path | None,
-    pipe: str | None,
-    tcp: int | None,
-    http: int | None,
-    host: str,
-    token: str,
-    wait: bool,
-) -> None:
-    """Open the outputs that are given, print the addresses of servers, and wait for a client if wanted.
+class Opening(NamedTuple):
+    """What the outputs of a flight share: the flight, what closes them, and who may connect."""
 
-    The stack closes them. Raises InputError for a port that cannot be served, and for a folder or pipe that cannot be
-    used.
-    """
-    from skysim.apps.live.http import FrameHub, start_server
-    from skysim.apps.live.sinks import Sink, folder_writer, pipe_writer
-    from skysim.apps.live.wire import WireServer
+    live: Live
+    stack: ExitStack
+    host: str
+    token: str
+    waits: bool
 
-    def add(output: Output) -> None:
-        flown.outputs.append(output)
-        stack.callback(output.close)
+    def add(self, output: Output) -> None:
+        """Send the flight's packets to an output, which the stack closes."""
+        self.live.outputs.append(output)
+        self.stack.callback(output.close)
 
-    def tell(text: str) -> None:
+    def say(self, text: str) -> None:
         print(f"skysim live: {text}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
 
-    if folder is not None:
-        add(Sink("folder", folder_writer(folder)))
-    if pipe is not None:
-        add(Sink("pipe", pipe_writer(pipe)))
-    if http is not None:
-        hub = FrameHub(flown.statistics)
-        http_server = start_server(hub, host, http, token)
-        stack.callback(http_server.server_close)
-        stack.callback(http_server.shutdown)
-        add(hub)
-        query = f"?token={token}" if token else ""
-        tell(f"http://{host}:{http_server.server_port}/{query}")
-    if tcp is not None:
-        server = WireServer(host, tcp, token, flown.greeting, flown.inbox, flown.has_truth)
-        add(server)
-        tell(f"tcp {host}:{server.port}" + (f", token {token}" if token else ""))
-        while wait and not server.entered.wait(0.1):
-            pass
+
+def open_folder(opening: Opening, path: Path) -> None:
+    from skysim.apps.live.sinks import Sink, folder_writer
+
+    opening.add(Sink("folder", folder_writer(path)))
+
+
+def open_pipe(opening: Opening, path: str) -> None:
+    from skysim.apps.live.sinks import Sink, pipe_writer
+
+    opening.add(Sink("pipe", pipe_writer(path)))
+
+
+def open_http(opening: Opening, port: int) -> None:
+    from skysim.apps.live.http import FrameHub, start_server
+
+    hub = FrameHub(opening.live.statistics)
+    server = start_server(hub, opening.host, port, opening.token)
+    opening.stack.callback(server.server_close)
+    opening.stack.callback(server.shutdown)
+    opening.add(hub)
+    query = f"?token={opening.token}" if opening.token else ""
+    opening.say(f"http://{opening.host}:{server.server_port}/{query}")
+
+
+def open_display(opening: Opening, bench: str) -> None:
+    """Serve pictures for the display of a bench by the HTTP server."""
+    from skysim.apps.live.display_pattern import DisplayPattern
+    from skysim.apps.live.http import FrameHub
+    from skysim.scene.loader import load as load_scene
+    from skysim.simulation.lab import build_lab
+
+    live = opening.live
+    (hub,) = (output for output in live.outputs if isinstance(output, FrameHub))
+    # A lab of its own: the server's threads draw beside the flight.
+    lab = build_lab(live.flight.lab.scene)
+    hub.pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
+    hub.instant = live.instant
+    picture = hub.pattern.picture(*live.instant())
+    opening.say(
+        f"/display shows {picture.shown} lights at the start;"
+        f" {picture.faint} are too faint for its gray levels"
+    )
+
+
+def open_tcp(opening: Opening, port: int) -> None:
+    """Serve the wire, and wait for its first client if wanted."""
+    from skysim.apps.live.wire import WireServer
+
+    live = opening.live
+    token = opening.token
+    server = WireServer(opening.host, port, token, live.greeting, live.inbox, live.has_truth)
+    opening.add(server)
+    opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
+    while opening.waits and not server.entered.wait(0.1):
+        pass
+
+
+# By the option's name; the wire, which may wait for its client, comes last.
+OPENERS: dict[str, Callable[[Opening, Any], None]] = {
+    "folder": open_folder,
+    "pipe": open_pipe,
+    "http": open_http,
+    "display": open_display,
+    "tcp": open_tcp,
+}
+SERVERS = ("tcp", "http")
 
 
 def summary(statistics: dict[str, Any]) -> str:
