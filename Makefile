@@ -26,7 +26,7 @@ extras: $(READY)
 	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
 	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
 
-.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
+.PHONY: compile extras baseline bench accept demo test test-slow test-both test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -44,9 +44,12 @@ PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(B
 test: $(READY)
 	$(PYTEST) -m "not slow and not compiles and not long and not browser"
 
-# The tests that CI runs beside those of `make test`.
 test-slow: $(READY) $(EXTRA)s3+query
 	$(PYTEST) -m "(slow or compiles) and not long and not browser"
+
+# Those of the two in one run, as CI has them: what both ask for is made once.
+test-both: $(READY) $(EXTRA)s3+query
+	$(PYTEST) -m "not long and not browser"
 
 test-long: $(READY)
 	$(PYTEST) -m long

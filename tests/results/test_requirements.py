@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 from scipy import stats
 
 from skysim import load_scene
+from skysim.apps.cli import main
 from skysim.core.errors import InputError
 from skysim.results import metrics
 from skysim.results.metrics import Summary
@@ -148,18 +148,23 @@ def test_what_trials_cannot_show_is_refused(name: str, limit: float, match: str)
 @pytest.mark.slow
 @pytest.mark.parametrize(("limit", "code"), [(1e-6, 1), (1e6, 0)])
 def test_a_run_ends_with_code_1_if_a_requirement_is_not_met(
-    tmp_path: Path, limit: float, code: int
+    tmp_path: Path,
+    limit: float,
+    code: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """One frame of one beyond a quantile of 99 %: that has a probability of 1 %, below 5 %."""
     require = f"require={{cross_arcsec_p99: {limit}, wrong: 0.001}}"
     words = ["run", "shefex2", "--frames", "1", "--out", tmp_path, "--set", require]
-    done = subprocess.run(
-        [sys.executable, "-m", "skysim", *map(str, words)], capture_output=True, text=True
-    )
-    assert done.returncode == code, done.stderr
-    assert "not shown yet, needs 2,995 draws" in done.stdout
+    monkeypatch.setattr(sys, "argv", ["skysim", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+    assert ended.value.code == code
+    printed = capsys.readouterr().out
+    assert "not shown yet, needs 2,995 draws" in printed
     answer = "not met" if code else "not shown yet, needs 299 draws"
-    assert f"cross_arcsec_p99 ≤ {limit:g}: {answer}" in done.stdout
+    assert f"cross_arcsec_p99 ≤ {limit:g}: {answer}" in printed
     assert f"cross_arcsec_p99 ≤ {limit:g}: {answer}" in (tmp_path / "report.html").read_text()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -58,9 +59,10 @@ def fact(result: Check, name: str) -> Fact:
     return found
 
 
-@pytest.fixture(scope="module")
-def afit() -> Check:
-    return check(lab_of("afit_simsat"))
+@cache
+def shipped(name: str) -> Check:
+    """The check of a scene as it is shipped; it takes half a second."""
+    return check(lab_of(name))
 
 
 def plan_of(lab: Lab) -> Plan:
@@ -134,9 +136,9 @@ def test_a_tilt_beyond_the_stop_is_refused_as_by_a_run(
 
 
 @pytest.mark.slow
-def test_field_and_pixel_scale_are_those_of_a_pinhole(afit: Check) -> None:
+def test_field_and_pixel_scale_are_those_of_a_pinhole() -> None:
     """1600 pixels of 4 um, 36.53 mm behind the lens: 10.0 deg, as the scene says."""
-    field = fact(afit, "field of view").values
+    field = fact(shipped("afit_simsat"), "field of view").values
     assert field["field_deg"][0] == pytest.approx(
         2 * math.degrees(math.atan(800 * 4e-6 / 36.53e-3)), rel=1e-3
     )
@@ -175,15 +177,15 @@ def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
 
 
 @pytest.mark.slow
-def test_the_depth_of_focus_ends_where_defocus_is_a_pixel(afit: Check) -> None:
+def test_the_depth_of_focus_ends_where_defocus_is_a_pixel() -> None:
     """By similar triangles: a pupil of 35 / 8 mm, a chip 36.53 mm behind it focused at 33 in."""
-    values = fact(afit, "depth of focus").values
+    values = fact(shipped("afit_simsat"), "depth of focus").values
     for distance_m in (values["near_m"], values["far_m"]):
         image_m = 1 / (1 / 0.035 - 1 / distance_m)
         chip_m = 1 / (1 / 0.035 - 1 / (33 * 0.0254))
         assert 0.035 / 8 * abs(image_m - chip_m) / image_m == pytest.approx(4e-6, rel=1e-6)
     assert values["near_m"] < 33 * 0.0254 < values["far_m"]
-    assert fact(check(lab_of("shefex2")), "depth of focus").values["far_m"] == math.inf
+    assert fact(shipped("shefex2"), "depth of focus").values["far_m"] == math.inf
 
 
 @pytest.mark.slow
@@ -290,7 +292,7 @@ def test_the_tracker_s_knowledge_is_stated() -> None:
         "lever wrong by",
     ):
         assert words in lines
-    knowledge = " ".join(fact(check(lab_of("shefex2")), "tracker knows").lines)
+    knowledge = " ".join(fact(shipped("shefex2"), "tracker knows").lines)
     assert "of hipparcos_hp6.5, epoch J1991.25 moved to 2012-06-22" in knowledge
 
 
@@ -314,8 +316,8 @@ def test_the_meaning_of_cross_and_sigma_is_stated() -> None:
     over_surveys = (
         "of the survey: 1σ over surveys; one dome has one survey, whose error stays the same"
     )
-    surveyed = check(lab_of("afit_simsat"))
-    exact = check(lab_of("afit_simsat_ideal"))
+    surveyed = shipped("afit_simsat")
+    exact = shipped("afit_simsat_ideal")
     assert over_surveys in fact(surveyed, "expected error").lines
     assert over_surveys not in fact(exact, "expected error").lines
     assert [
@@ -539,7 +541,7 @@ def test_a_mistake_is_warned_of_with_its_key(
         for line in lines
         if words in line and re.search("; (change it to|leave it out|turn)", line)
     ]
-    assert not [line for line in check(lab_of(scene)).findings if words in line]
+    assert not [line for line in shipped(scene).findings if words in line]
 
 
 @pytest.mark.slow
@@ -620,14 +622,14 @@ def test_using_the_brightest_hundred_of_many_lights_is_not_warned_of() -> None:
 
 
 @pytest.mark.slow
-def test_only_an_led_s_image_size_includes_the_led_s_diameter(afit: Check) -> None:
-    assert ", LED 2" in fact(afit, "image size").lines[0]
-    assert "LED" not in fact(check(lab_of("shefex2")), "image size").lines[0]
+def test_only_an_led_s_image_size_includes_the_led_s_diameter() -> None:
+    assert ", LED 2" in fact(shipped("afit_simsat"), "image size").lines[0]
+    assert "LED" not in fact(shipped("shefex2"), "image size").lines[0]
 
 
 @pytest.mark.slow
 def test_the_rate_at_which_smear_equals_image_width_is_stated() -> None:
-    result = check(lab_of("shefex2"))
+    result = shipped("shefex2")
     rate_deg_s = fact(result, "smear").values["width_rate_deg_s"]
     width_px = fact(result, "image size").values["width_px"]
     camera = loader.load("shefex2").camera

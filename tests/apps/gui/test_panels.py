@@ -18,11 +18,16 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from nicegui import core
+from nicegui.client import Client
+from nicegui.page import page as page_at
+
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.access import host_of
 from skysim.apps.gui import server
 from skysim.apps.gui.messages import LIGHT, Detection, TrackerResult
+from skysim.apps.gui.page.tab import Tab
 from skysim.apps.gui.server import FILES, Guard, KeptFiles, report_path, user_of
 from skysim.apps.gui.views import forms, keys, overlay
 from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
@@ -265,6 +270,33 @@ def test_the_feedback_can_be_changed_for_both_forms_of_the_control_section() -> 
             == loader.load(name).motion.control.law
         )
         assert loader.load(name, forms.loop_overrides(name, {}, "")).motion.control is None
+
+
+def test_a_key_that_is_sought_before_the_form_is_filled_is_shown(tmp_path: Path) -> None:
+    """Its section opens once the fields are there, of another scene too, whose fields replace those of the first."""
+
+    async def story() -> None:
+        core.loop = asyncio.get_running_loop()
+        client = Client(page_at("/"))
+        with client:
+            tab = Tab("shefex2", tmp_path, tmp_path)
+            await tab.build()
+            panel = tab.scene_panel
+            panel.find.value = "exposure.frames"
+            for scene in ("shefex2", "afit_simsat"):
+                tab.set_state(scene=scene)
+                panel.form.hide_others(scene)
+                assert not panel.form.parts.visible
+                panel.set_scene(forms.fields(scene, {}))
+                assert panel.form.parts.visible
+                sections = panel.form.expansions.items()
+                assert [name for name, one in sections if one.value] == ["exposure"]
+                assert [name for name, one in sections if one.visible] == ["exposure"]
+            panel.form.hide_others(scene)  # it was opened again, with another value
+            assert panel.form.parts.visible
+        client.delete()
+
+    asyncio.run(story())
 
 
 def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,19 +24,33 @@ SMALL = Size(fields=12, units=1, states=2, attitudes=2, frames=2, draws=2, sky=2
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def small() -> Iterator[None]:
     """Few levels of every experiment."""
-    monkeypatch.setattr(cells, "QUICK", SMALL)
-    monkeypatch.setattr(cells, "STREAKS_PX", (1.0,))
-    monkeypatch.setattr(cells, "BORESIGHT_PX", (2.0,))
-    monkeypatch.setattr(cells, "MOST_FAIL", 2.0)
-    monkeypatch.setattr(cells, "SEQUENCE", (0, 1))
-    monkeypatch.setattr(cells, "BENDS_PX", (4.0,))
-    monkeypatch.setattr(cells, "FAINTER", (-1.0,))
-    monkeypatch.setattr(cells, "TRACKED_STREAKS_PX", (1.0,))
-    monkeypatch.setattr(cells, "MISSED_PX", (3.0, 24.0))
-    monkeypatch.setattr(performance, "TIMED", 3)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cells, "QUICK", SMALL)
+        patch.setattr(cells, "STREAKS_PX", (1.0,))
+        patch.setattr(cells, "BORESIGHT_PX", (2.0,))
+        patch.setattr(cells, "MOST_FAIL", 2.0)
+        patch.setattr(cells, "SEQUENCE", (0, 1))
+        patch.setattr(cells, "BENDS_PX", (4.0,))
+        patch.setattr(cells, "FAINTER", (-1.0,))
+        patch.setattr(cells, "TRACKED_STREAKS_PX", (1.0,))
+        patch.setattr(cells, "MISSED_PX", (3.0, 24.0))
+        patch.setattr(performance, "TIMED", 3)
+        yield
+
+
+@pytest.fixture(scope="module")
+def sheet(small: None, tmp_path_factory: pytest.TempPathFactory) -> cells.MeasuredFrames:
+    """A datasheet of all experiments, measured in one go; it takes half a minute."""
+    return measured(tmp_path_factory.mktemp("whole"))
+
+
+@pytest.fixture
+def rates_only(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all experiments only those at rates, for what is asked of these alone."""
+    monkeypatch.setattr(Designer, "cells", Designer.rates)
 
 
 def measured(
@@ -66,39 +80,39 @@ def untimed(statement: Statement) -> str:
 
 
 def test_a_stopped_datasheet_resumes_with_the_same_result(
-    small: None, tmp_path: Path
+    sheet: cells.MeasuredFrames, tmp_path: Path
 ) -> None:
-    whole = state(measured(tmp_path / "whole"))
+    whole = state(sheet)
     assert len(whole.times_s) == 3
     assert min(whole.times_s) > 0
     # The prediction follows an acceleration that moves stars by three windows.
     assert numbers(whole)["limits"]["tracking"]["acceleration_deg_s2"]["below"] == np.inf
     with pytest.raises(KeyboardInterrupt):
-        measured(tmp_path / "stopped", stop_after(4))
-    again = state(measured(tmp_path / "stopped"))
+        measured(tmp_path, stop_after(4))
+    again = state(measured(tmp_path))
     assert untimed(again) == untimed(whole)
     report = datasheet_report.datasheet_report(whole, ["--quick"])
-    paths = datasheet_report.write_all(tmp_path / "whole", whole, report)
+    paths = datasheet_report.write_all(tmp_path, whole, report)
     assert json.loads(paths["json"].read_text())["fields"] == 12
     text = paths["report"].read_text(encoding="utf-8")
     assert all(section.title in text for section in sections(whole))
     assert text.count("<img") == 6
     # And what is left out, and the second page.
     assert report.markdown().count("\n## ") == len(sections(whole)) + 2
-    assert len(list((tmp_path / "whole").glob("*.png"))) == 6
+    assert len(list(tmp_path.glob("*.png"))) == 6
     with pytest.raises(InputError, match="contains another study"):
         cells.measure(
             "shefex2",
             load("shefex2", {}),
             {"camera.f_number": "2"},
-            tmp_path / "whole",
+            tmp_path,
             quick=True,
             workers=1,
         )
 
 
 def test_rates_double_until_most_fields_fail_and_are_kept(
-    small: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rates_only: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To streaks of 4 px, the side of a field of that size; a second call finds the rates that the first one added.
 
@@ -123,9 +137,9 @@ def test_rates_double_until_most_fields_fail_and_are_kept(
     assert "rate" not in first.solved_at_all_rates()
 
 
-def test_chosen_rates_are_measured(small: None, tmp_path: Path) -> None:
+def test_chosen_rates_are_measured(rates_only: None, tmp_path: Path) -> None:
     rates_deg_s = [0.5, 0, 0.2]
-    sheet = cells.measure(
+    chosen = cells.measure(
         "shefex2",
         load("shefex2", {}),
         {},
@@ -134,17 +148,18 @@ def test_chosen_rates_are_measured(small: None, tmp_path: Path) -> None:
         rates_deg_s=rates_deg_s,
         workers=1,
     )
-    assert sheet.levels("rate", "rate_deg_s") == [0.2, 0.5]
-    assert sheet.levels("boresight", "rate_deg_s") == [0.2, 0.5]
+    assert chosen.levels("rate", "rate_deg_s") == [0.2, 0.5]
+    assert chosen.levels("boresight", "rate_deg_s") == [0.2, 0.5]
 
 
 @pytest.mark.parametrize("solved", [0, pytest.param(6, marks=pytest.mark.long)])
 def test_what_was_measured_is_written_without_the_terms(
-    small: None, tmp_path: Path, solved: int
+    sheet: cells.MeasuredFrames, tmp_path: Path, solved: int
 ) -> None:
     """With too few solved fields for the terms the page has all else, and says first what is missing."""
-    sheet = measured(tmp_path)
-    sheet.columns["solved"][:, solved:] = 0
+    few = sheet.columns["solved"].copy()
+    few[:, solved:] = 0
+    sheet = sheet._replace(columns=sheet.columns | {"solved": few})
     statement = state(sheet)
     assert statement.refusal
     report = datasheet_report.datasheet_report(statement, ["--quick"])

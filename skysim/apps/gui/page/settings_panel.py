@@ -87,6 +87,10 @@ class KeyForm:
         self.expansions: dict[str, ui.expansion] = {}
         self.scene = ""
 
+    def hide_others(self, scene: str) -> None:
+        """Hide the fields of another scene until those of this one are shown: what is typed there would be lost."""
+        self.parts.set_visibility(self.scene == scene)
+
     def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         """Show the fields of the current scene. Open groups stay open, and text being typed is kept."""
         shown = [field for fields in groups.values() for field in fields]
@@ -100,6 +104,7 @@ class KeyForm:
         else:
             self.build(groups)
         self.scene = scene
+        self.parts.set_visibility(True)
 
     def build(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
@@ -242,10 +247,10 @@ class ScenePanel:
             {name: [field for field in fields if field.section == name] for name in sections}
         )
         self.undo.set_visibility(bool(self.page.state.overrides))
-        self.filter()
+        self.search()
 
-    def filter(self) -> None:
-        """Show only keys that contain the search text, and sections with such keys."""
+    def search(self) -> None:
+        """Show only keys that contain the search text, and sections with such keys; open the first if none is open."""
         text = (self.find.value or "").lower()
         visible = set()
         for key, row in self.form.rows.items():
@@ -255,10 +260,6 @@ class ScenePanel:
         for section, expansion in self.form.expansions.items():
             expansion.set_visibility(section in visible)
         self.no_match.set_visibility(not visible)
-
-    def search(self) -> None:
-        """Filter, and open the first section with a matching key if none is open."""
-        self.filter()
         expansions = self.form.expansions.values()
         first = next((item for item in expansions if item.visible), None)
         if (

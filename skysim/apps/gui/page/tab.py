@@ -349,6 +349,8 @@ class Tab:
         self.scene_panel.shown = self.tracker_panel.shown = (
             None  # the file of this name may have changed
         )
+        for form in (self.scene_panel.form, self.tracker_panel.form):
+            form.hide_others(scene)
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
