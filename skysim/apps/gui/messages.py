@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Ints, Record
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
@@ -61,7 +60,7 @@ class Pixels:
     """
 
     data: bytes
-    fields: dict[str, Any]
+    fields: Record
     display: Display
     number: int
 
@@ -230,7 +229,7 @@ class SceneInfo:
     stages: dict[str, str]
     duration_s: float
     noise: bool
-    geometry: dict[str, Any]
+    geometry: Record
     lens: Lens
     surveyed: bool = False
 
@@ -305,8 +304,8 @@ class AmbiguityMap(NamedTuple):
         Two LEDs coincide if they are nearer than this
     """
 
-    ids: NDArray[np.int64]
-    others: NDArray[np.int64]
+    ids: Ints
+    others: Ints
     fraction: Floats
     least: float
     coincidence_mm: float
@@ -355,6 +354,6 @@ class SurveyFound(NamedTuple):
 
     statistics: Record
     faults: list[str]
-    ids: NDArray[np.int64]
+    ids: Ints
     known: Floats
     plan: SurveyPlan

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from skysim.apps.plate_solver.solver import KnownCamera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
+from skysim.core.types import Record
 
 if TYPE_CHECKING:
     from estimator.trackers.dome_tracker import DomeTracker
@@ -82,7 +83,7 @@ class DomeSolution:
     log10_chance: float | None = None
     matches: int = 0
     rms_px: float | None = None
-    leds: Sequence[dict[str, Any]] = ()
+    leds: Sequence[Record] = ()
     lights: int = 0
     brightest_dn: float | None = None
     background_dn: float | None = None
@@ -202,7 +203,7 @@ def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReadi
     return next((one for one in readings if one.report.attitude.solved), readings[0])
 
 
-def dome_fields(reading: DomeReading) -> dict[str, Any]:
+def dome_fields(reading: DomeReading) -> Record:
     """The fields of DomeSolution: image statistics, and solution or likely cause of the refusal."""
     from skysim.experiments.dome_survey.survey_findings import attitude_record
 

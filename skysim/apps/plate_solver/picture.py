@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ from skysim.apps.plate_solver.solver import (
 )
 from skysim.core import files, images
 from skysim.core.errors import InputError, printable
+from skysim.core.types import Record
 
 ANNOTATED = ".annotated.png"
 LIST_SUFFIXES = (".csv", ".ecsv")
@@ -204,7 +205,7 @@ def solve_file(
     solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """Solve one file, return the fields of `skysim solve --json`, and write the files of `outputs`.
 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
@@ -217,7 +218,7 @@ def solve_file(
         return blank_result(path, solver) | {"status": str(error), "bad_input": True}
 
 
-def blank_result(path: Path, solver: Solver | DomeSolver) -> dict[str, Any]:
+def blank_result(path: Path, solver: Solver | DomeSolver) -> Record:
     """The fields of a file that is not solved."""
     run = {"date_utc": None, "time_ms": None, "warning": ""}
     blank = DomeSolution() if isinstance(solver, DomeSolver) else PlateSolution()
@@ -229,7 +230,7 @@ def read_and_solve(
     solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """As `solve_file`, but raise InputError for an unreadable image."""
     result = blank_result(path, solver)
     begin = time.perf_counter()
@@ -267,7 +268,7 @@ def read_and_solve(
 
 
 def write_outputs(
-    outputs: Outputs, reading: SolvedReading | DomeReading, result: dict[str, Any]
+    outputs: Outputs, reading: SolvedReading | DomeReading, result: Record
 ) -> None:
     """Write the files of a picture; lights and header only if it is solved."""
     rows = result["leds"] if isinstance(reading, DomeReading) else result["stars"]
@@ -472,9 +473,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     ]
 
 
-def outcome_fields(
-    outcome: SolvedReading, date_utc: datetime.datetime | None
-) -> dict[str, Any]:
+def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -> Record:
     """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
     (pixels, solver, assumption, _) = outcome.hypothesis

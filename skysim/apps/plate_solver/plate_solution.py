@@ -13,6 +13,7 @@ from estimator.core.types import Attitude, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 
 NOTED_STRETCH = 0.002  # relative to square pixels
 
@@ -72,7 +73,7 @@ class PlateSolution:
     log10_chance: float | None = None
     matches: int = 0
     rms_arcsec: float | None = None
-    stars: tuple[dict[str, Any], ...] = ()
+    stars: tuple[Record, ...] = ()
     lights: int = 0
     brightest_dn: float | None = None
     background_dn: float | None = None
@@ -81,7 +82,7 @@ class PlateSolution:
     hint: str = ""
 
 
-def solution_fields(report: Report) -> dict[str, Any]:
+def solution_fields(report: Report) -> Record:
     """Pointing of a solved image; the angles are those of the image center."""
     attitude = report.attitude
     assert attitude.cam_from_ref is not None
@@ -101,9 +102,7 @@ def solution_fields(report: Report) -> dict[str, Any]:
     }
 
 
-def attitude_fields(
-    report: Report, tracker: StarTracker, stars: StarCatalog
-) -> dict[str, Any]:
+def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) -> Record:
     """Attitude, covariance, lens and stars of a solved image. stars : the catalog of the tracker, at its epoch"""
     attitude = report.attitude
     assert attitude.cam_from_ref is not None
@@ -205,7 +204,7 @@ def wcs_header(attitude: Attitude, flipped: bool) -> Any:
     return header
 
 
-def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
+def add_rates(results: list[Record], rate_hz: float | None) -> None:
     """Add to the results of one camera's images, in the order of time, `t_s` and the rate since the last solved one.
 
     The rate is the vector of the shortest rotation between the two, over their time, in camera axes.
@@ -227,7 +226,7 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
             "no date",
             "DATE-OBS in its header, or a frame rate",
         )
-    last: dict[str, Any] | None = None
+    last: Record | None = None
     for n, one in enumerate(results):
         if rate_hz is None:
             since = datetime.fromisoformat(dates[n]) - datetime.fromisoformat(dates[0])
@@ -251,12 +250,12 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
         last = one
 
 
-def quaternion_of(result: dict[str, Any]) -> Any:
+def quaternion_of(result: Record) -> Any:
     """The camera's attitude in the sky or in a dome, None of a refusal."""
     return result["cam_from_lab_xyzw" if "leds" in result else "cam_from_icrs_xyzw"]
 
 
-def sequence_summary(results: list[dict[str, Any]]) -> str:
+def sequence_summary(results: list[Record]) -> str:
     """A sentence on a sequence: solved images, gaps, rate."""
     solved = [quaternion_of(one) is not None for one in results]
     edges = np.flatnonzero(np.diff([True, *solved, True]))

@@ -41,6 +41,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
+from skysim.core.types import Bools
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -231,7 +232,7 @@ class Solver:
             return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
         return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
 
-    def within_reach(self, camera: Camera, vectors: Floats) -> NDArray[np.bool_]:
+    def within_reach(self, camera: Camera, vectors: Floats) -> Bools:
         """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
         if self.near_deg is None:
             return np.ones(len(vectors), bool)

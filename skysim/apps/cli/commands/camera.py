@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperGroup
 
 from skysim.apps.cli.options import (
@@ -26,6 +27,7 @@ from skysim.results.report import terminal_width
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
+    from skysim.core.types import Record
     from skysim.scene.opencv_calibration import OpencvCalibration
     from skysim.scene.sections.camera import CameraConfig
 
@@ -102,7 +104,7 @@ def preset_entry(path: Path) -> dict[str, str]:
 def camera_show(
     file: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="FILE",
             help="Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.",
             autocompletion=complete_camera,
@@ -110,9 +112,7 @@ def camera_show(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Also write the calibration to this file, in OpenCV's YAML format."
-        ),
+        Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
     ] = None,
     set_: Overrides = None,
     json: Json = False,
@@ -133,7 +133,7 @@ def camera_show(
     if lens is not None and out:
         write_file(out, opencv_calibration.text(lens))
     if json:
-        known: dict[str, Any] = {"width_px": chip.width_px, "height_px": chip.height_px}
+        known: Record = {"width_px": chip.width_px, "height_px": chip.height_px}
         if lens:
             known |= dataclasses.asdict(lens)
             known |= {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
@@ -201,7 +201,7 @@ def asking(command: Callable[..., None]) -> Callable[..., None]:
             default=None,
             annotation=Annotated[
                 str | None,
-                typer.Option(
+                Option(
                     OPTIONS[f"answers.{name}"],
                     metavar="TEXT",
                     help=f"{question.ask}: {question.where}.",
@@ -221,11 +221,11 @@ def camera_new(
     *,
     name: Annotated[
         str,
-        typer.Option(help="Name of camera, lens and data sheets, for the file's first line."),
+        Option(help="Name of camera, lens and data sheets, for the file's first line."),
     ] = "",
-    out: Annotated[
-        Path, typer.Option(help="The file to write, for the key camera.preset.")
-    ] = Path("camera.yaml"),
+    out: Annotated[Path, Option(help="The file to write, for the key camera.preset.")] = Path(
+        "camera.yaml"
+    ),
     json: Json = False,
     **answers: str | None,
 ) -> None:

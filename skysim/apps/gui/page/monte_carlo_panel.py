@@ -6,7 +6,6 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from nicegui import run, ui
@@ -25,6 +24,7 @@ from skysim.apps.gui.worker.study_process import (
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES, shipped_files, title_of
+from skysim.core.types import Record
 from skysim.experiments.study import study_file as loader
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.execution.store import STORE
@@ -242,7 +242,7 @@ class MonteCarloPanel:
         """
         if self.study_select.value:
             return STUDIES / f"{self.study_select.value}.yaml"
-        trial: dict[str, Any] = {"kind": self.kind.value}
+        trial: Record = {"kind": self.kind.value}
         if self.kind.value == "centroids":
             noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
             trial |= {
@@ -412,7 +412,7 @@ def format_interval(value: float, low: float, high: float) -> str:
     return text if math.isnan(low) or low == high else f"{text}   {low:.4g} .. {high:.4g}"
 
 
-def options() -> dict[str, Any]:
+def options() -> Record:
     """ECharts options of the histogram of the error angle."""
     text = {":color": style.chart_color("quiet"), "fontSize": 10}
     rule = {"lineStyle": {":color": style.chart_color("line")}}

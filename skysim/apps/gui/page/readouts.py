@@ -19,6 +19,7 @@ from skysim.apps.gui.views import context, overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
+from skysim.core.types import Record
 
 ANGLES_JS = (
     "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
@@ -178,7 +179,7 @@ def rows(
     lights: Lights,
     detections: Collection[Detection],
     name: Callable[[int], str],
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Record]:
     """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 
     Returns

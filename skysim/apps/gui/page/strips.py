@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from nicegui import ui
@@ -11,7 +10,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import Curves, FlightRow
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
@@ -221,7 +220,7 @@ class StripChart:
             self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
 
 
-def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
+def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> Record:
     """Data for strips.js: dots, names of their lights, and the place of their strip."""
     n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
     dots = drawn[n].dots if drawn else []
@@ -235,7 +234,7 @@ def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]
     return {"dots": dots, "names": names, "grid": n, "place": place, "color": CURVE_COLORS[0]}
 
 
-def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
+def options(drawn: list[Strip], end_s: float) -> Record:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
     text = {":color": chart_color("quiet"), "fontSize": 11}
     rule = {"lineStyle": {":color": chart_color("line")}}
@@ -251,7 +250,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     }
     grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
-    found: dict[str, list[dict[str, Any]]] = {
+    found: dict[str, list[Record]] = {
         name: [] for name in ("title", "legend", "grid", "xAxis", "yAxis", "series")
     }
     for n, strip in enumerate(drawn):
@@ -275,7 +274,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     }
 
 
-def y_axis(strip: Strip, n: int) -> dict[str, Any]:
+def y_axis(strip: Strip, n: int) -> Record:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
     if strip.dots:
         # The next greater of 1, 2, 5, 10 times a power of ten.
@@ -292,7 +291,7 @@ def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     return axis
 
 
-def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
+def series(curve: StripCurve, n: int, k: int) -> Record:
     """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
     is_band = curve.kind == "band"
     is_dots = curve.kind == "dots"

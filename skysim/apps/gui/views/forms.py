@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
+from skysim.core.types import Record
 from skysim.core.units import si_unit
 from skysim.core.yaml_reader import read_yaml
 from skysim.scene import unused
@@ -54,7 +55,7 @@ SECTIONS = (
 NO_SECTION = "none"  # the kind of a section that is left out
 # Values for the keys that a kind of section requires, when it is chosen. A kind without such values, for example one
 # that names a file, is not offered; nor is another kind of light, which requires another start of the motion.
-FIRST_VALUES: dict[str, Any] = {
+FIRST_VALUES: Record = {
     "row_time": "10 us",
     "fwhm_px": 2,
     "radius_px": 3,
@@ -221,7 +222,7 @@ def offered_kinds(annotation: Any) -> tuple[str, ...]:
 
 def first_section(
     model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None
-) -> dict[str, Any] | None:
+) -> Record | None:
     """A section of a kind with its required keys and with keys that are kept; None if required values are unknown."""
     required = [
         info.alias or name for name, info in model.model_fields.items() if info.is_required()

@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from nicegui import json
-from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import (
     LIMITS,
@@ -26,7 +25,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.core.yaml_reader import read_yaml
 from skysim.results.plots import CURVES
 
@@ -55,7 +54,7 @@ def marks(
     result: TrackerResult | None,
     shown: Collection[str],
     name: Callable[[int], str],
-) -> dict[str, Any]:
+) -> Record:
     """Return the marks for frame.js.
 
     Returns
@@ -105,7 +104,7 @@ def marks(
     }
 
 
-def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.bool_]) -> int:
+def bright_count(lights: Lights, identified: Collection[int], near: Bools) -> int:
     """Number of lights that are at least as bright as the faintest identified one, or else the faintest detected one.
 
     Detected ones alone are no measure: in a field of hundreds of faint stars, noise is detected beside some of them.

@@ -27,7 +27,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.views import live, overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
 
@@ -210,7 +210,7 @@ class SensorView:
     def address(self, number: int) -> str:
         return f"/frame/{self.id}/{number}"
 
-    def fields(self) -> dict[str, Any]:
+    def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
         view = {
             "pose": self.pose,

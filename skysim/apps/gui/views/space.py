@@ -9,15 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
-import numpy as np
 from nicegui import ui
-from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views import context, style
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.geometry import Grip
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -72,7 +70,7 @@ class Scene3D:
         fields = {"background": style.DARK["ground"], "prefix": scene_info.prefix}
         self.canvas.run_method("build", scene_info.geometry | fields)
 
-    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+    def color_lights(self, ids: Ints, values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""
         colors = (
             f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * style.color_scale(values)

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 from urllib.parse import parse_qsl, urlencode
 
 from skysim.apps.gui.messages import Triple
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 
 Kind = Literal["live", "flight", "replay", "photo"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -84,7 +85,7 @@ class PageView:
             For an address with other scenes or invalid values.
         """
         pairs = parse_qsl(query.removeprefix("?"))
-        one: dict[str, Any] = dict(pairs)
+        one: Record = dict(pairs)
         if "scene" not in one:
             return None
         if one["scene"] not in scenes:

@@ -4,7 +4,6 @@ import math
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.results import plots, scoring
@@ -51,7 +51,7 @@ class Photo:
     """
 
     result: TrackerResult
-    solution: dict[str, Any]
+    solution: Record
     statistics: plots.FrameStatistics
     pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
