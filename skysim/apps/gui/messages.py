@@ -267,6 +267,11 @@ class FlightRow(NamedTuple):
     innovation_arcsec: float
 
 
+Residual = tuple[
+    float, int, float
+]  # of an identified light: time, its number, residual in pixels
+
+
 @dataclass(frozen=True, slots=True)
 class FlightStep:
     """Progress of a flight that is being computed.
@@ -280,7 +285,7 @@ class FlightStep:
     log
         Curves of the motion so far, if there are new frames
     residuals
-        Residuals of the lights identified in these frames: time, number, residual in pixels
+        Residuals of the lights identified in these frames
     """
 
     is_done: bool
@@ -288,7 +293,7 @@ class FlightStep:
     duration_s: float
     rows: Sequence[FlightRow] = ()
     log: Curves | None = None
-    residuals: Sequence[tuple[float, int, float]] = ()
+    residuals: Sequence[Residual] = ()
 
 
 class AmbiguityMap(NamedTuple):

@@ -156,7 +156,7 @@ class PlanPanel:
                 ui.label(finding).classes("warn").style("overflow-wrap: anywhere")
             if not found.findings:
                 ui.label("No warnings.").classes("good")
-            with ui.element("div").classes("lab-facts"):
+            with widgets.div("lab-facts"):
                 for fact in found.facts:
                     widgets.quiet(fact.name)
                     ui.label("\n".join(fact.lines)).style(
@@ -239,7 +239,7 @@ class PlanPanel:
                 ui.label(line).style("overflow-wrap: anywhere")
             self.legends["survey"] = ui.label(COLORED)
             self.legends["survey"].set_visibility(False)
-            with ui.element("div").classes("lab-stops mono"):
+            with widgets.div("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
                 for number, (angles, leds) in enumerate(

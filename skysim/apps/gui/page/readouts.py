@@ -38,8 +38,8 @@ class AttitudeCard:
     def __init__(self, page: context.PageContext, contents: Contents) -> None:
         self.page = page
         self.contents = contents
-        with ui.element("div").classes("lab-card"):
-            with ui.element("div").classes("lab-grid"):
+        with widgets.div("lab-card"):
+            with widgets.div("lab-grid"):
                 widgets.quiet("attitude")
                 self.heads = [ui.label().classes("quiet num") for _ in range(3)]
                 widgets.quiet("true (F5)")

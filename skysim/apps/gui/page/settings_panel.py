@@ -221,7 +221,7 @@ class ScenePanel:
         self.saved = saved
         self.shown: tuple[str, Mapping[str, str]] | None = None
         with widgets.row().style("margin-bottom: 8px"):
-            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
+            self.find = ui.input(placeholder="find a key", on_change=self.search)
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
             self.name = ui.input(placeholder="new-name").props(
                 'dense outlined aria-label="Name of the new scene"'
@@ -259,14 +259,9 @@ class ScenePanel:
     def search(self) -> None:
         """Filter, and open the first section with a matching key if none is open."""
         self.filter()
-        expansions = self.form.expansions.values()
-        first = next((item for item in expansions if item.visible), None)
-        if (
-            self.find.value
-            and first
-            and not any(item.value and item.visible for item in expansions)
-        ):
-            first.open()
+        visible = [item for item in self.form.expansions.values() if item.visible]
+        if self.find.value and visible and not any(item.value for item in visible):
+            visible[0].open()
 
     async def save(self) -> None:
         name = (self.name.value or "").strip()
@@ -321,8 +316,5 @@ class TrackerPanel:
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()
-            row = self.form.rows.get(
-                f"tracker.{'detector' if group == SENSOR else 'identifier'}"
-            )
-            if row:
+            if row := self.form.rows.get(next(iter(NAMES[group]))):
                 ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)

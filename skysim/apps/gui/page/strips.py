@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Curves, FlightRow
+from skysim.apps.gui.messages import Curves, FlightRow, Residual
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
 from skysim.core.types import Floats, Record
@@ -101,9 +101,7 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 
 def strips(
-    rows: Sequence[FlightRow],
-    log: Curves,
-    residuals: Sequence[tuple[float, int, float]] = (),
+    rows: Sequence[FlightRow], log: Curves, residuals: Sequence[Residual]
 ) -> list[Strip]:
     """Return the strips for which a flight has data.
 
@@ -167,7 +165,7 @@ def point(t_s: float, value: float) -> list[float]:
     return [float(f"{t_s:.4f}"), float(f"{value:.5g}")]
 
 
-def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
+def thinned(residuals: Sequence[Residual]) -> Points:
     """The residuals as dots: of all frames or, if they are more than MAX_DOTS, of frames at equal steps."""
     times_s = sorted({t_s for t_s, _, _ in residuals})
     kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])

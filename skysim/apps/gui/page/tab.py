@@ -24,7 +24,7 @@ from skysim.apps.gui.page import (
     settings_panel,
 )
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style
+from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style, widgets
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
@@ -123,16 +123,16 @@ class Tab:
             dark=style.DARK["panel"],
             dark_page=style.DARK["ground"],
         )
-        with ui.element("div").classes("lab"):
+        with widgets.div("lab"):
             self.head = head.Head(self, self.contents, self.folder)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
-            with ui.element("div").classes("lab-side"):
+            with widgets.div("lab-side"):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = readouts.AttitudeCard(self, self.contents)
                 await self.build_panels()
-            with ui.element("div").classes("lab-keys").mark("keys"):
+            with widgets.div("lab-keys").mark("keys"):
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(
@@ -154,8 +154,8 @@ class Tab:
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
     async def build_panels(self) -> None:
-        with ui.element("div").classes("lab-panes"):
-            with ui.element("div").classes("lab-space-pane"):
+        with widgets.div("lab-panes"):
+            with widgets.div("lab-space-pane"):
                 self.scene_3d = space.Scene3D(self, self.sensor)
             head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(

@@ -87,16 +87,16 @@ class SensorView:
         self.size_px = (4, 3)
         self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
-        with ui.element("div").classes("lab-sensor"):
+        with widgets.div("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
                 self.hover = live.LiveText(contents).classes("mono").mark("hover")
             with (
                 self.canvas.add_slot("wait"),
-                ui.element("div").classes("lab-wait") as self.wait,
+                widgets.div("lab-wait") as self.wait,
             ):
                 # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
-                self.waited = ui.element("div").classes("lab-waited mono")
+                self.waited = widgets.div("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
@@ -114,7 +114,7 @@ class SensorView:
         self.waited.set_visibility(not in_vain)
 
     def build_controls(self) -> None:
-        with ui.element("div").classes("lab-bar"):
+        with widgets.div("lab-bar"):
             for kind in overlay.KINDS:
                 box = widgets.checkbox(kind, value=kind in self.shown)
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")

@@ -12,7 +12,7 @@ import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
 from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.views import context, style
+from skysim.apps.gui.views import context, style, widgets
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats, Ints
@@ -48,7 +48,7 @@ class Scene3D:
         self.newest_view: FrameView | None = None
         self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
-        with ui.element("div").classes("lab-looks"):
+        with widgets.div("lab-looks"):
             for name, text in VIEWS.items():
                 button = ui.button(
                     name, color=None, on_click=lambda name=name: self.look(name)
@@ -131,7 +131,7 @@ class PushControl:
         self.moved = moved
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
-        with ui.element("div").classes("lab-push") as self.bar:
+        with widgets.div("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
             ui.button("reset", color=None, on_click=self.reset).props(
                 'dense outline size=xs title="back to the attitude before the push"'
