@@ -2,7 +2,7 @@
 
 NiceGUI writes arrays as JSON, with null for NaN."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from skysim.results import plots
 from skysim.scene.scene import Scene
 
 Triple = tuple[float, float, float]
+LightName = Callable[[int], str]  # the name of a light by its number
 NAN = float("nan")
 # Limits of the display; the last ones are set in the browser.
 LIMITS = ("automatic", "zscale", "min to max", "manual")
@@ -43,8 +44,7 @@ class Display(NamedTuple):
 ALL_PIXELS = Display()
 
 
-@dataclass(frozen=True, slots=True)
-class Pixels:
+class Pixels(NamedTuple):
     """A frame's pixels for the browser, see `worker.pixels.pixels_for`.
 
     Attributes
@@ -158,8 +158,7 @@ class Pose:
     depth_m: Floats | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FrameView:
+class FrameView(NamedTuple):
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
     Attributes
@@ -195,8 +194,7 @@ class PushedView(NamedTuple):
     rate_deg_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class SceneInfo:
+class SceneInfo(NamedTuple):
     """Facts about a loaded scene that the page displays.
 
     Attributes
@@ -272,8 +270,7 @@ Residual = tuple[
 ]  # of an identified light: time, its number, residual in pixels
 
 
-@dataclass(frozen=True, slots=True)
-class FlightStep:
+class FlightStep(NamedTuple):
     """Progress of a flight that is being computed.
 
     Attributes
@@ -316,6 +313,10 @@ class AmbiguityMap(NamedTuple):
     coincidence_mm: float
 
 
+# Number of frames; number of LEDs measured and their rms error, mm, predicted after these (None if not determined).
+PlanStep = tuple[int, int, float | None]
+
+
 class SurveyPlan(NamedTuple):
     """Attitudes to hold for a survey of the dome.
 
@@ -328,14 +329,13 @@ class SurveyPlan(NamedTuple):
     leds
         Number of LEDs on the dome
     steps
-        Number of frames; number of LEDs measured and their rms error, mm, predicted after these
-        (None if not determined)
+        Predicted accuracies
     """
 
     angles_deg: Sequence[Sequence[float]]
     shown: Sequence[int]
     leds: int
-    steps: tuple[tuple[int, int, float | None], ...]
+    steps: tuple[PlanStep, ...]
 
 
 class SurveyFound(NamedTuple):

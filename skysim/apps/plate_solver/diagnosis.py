@@ -4,11 +4,11 @@ Causes are tested from the most certain to the vaguest. Two are tested by solvin
 view. Such a solution only shows the cause; it is never the answer.
 """
 
-import datetime
 import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Refusal:
     image: NDArray
     centroids: Centroids
     solvers: tuple[Solver, ...]
-    date_utc: datetime.datetime | None = None
+    date_utc: datetime | None = None
     row_order_known: bool = True
 
     @property

@@ -1,10 +1,10 @@
 """Load a picture in the orientation of viewing, solve the hypotheses about it, and diagnose a refusal."""
 
-import datetime
 import math
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,11 +29,13 @@ from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
     camera_notes,
+    picture_fields,
     solution_fields,
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
+    Circle,
     KnownCamera,
     Solver,
     kept_solver,
@@ -98,10 +100,10 @@ def solve(
     *,
     fov_deg: float | None = None,
     camera: str | Path | None = None,
-    time_utc: datetime.datetime | None = None,
+    time_utc: datetime | None = None,
     catalog: str | Path | None = None,
     size_px: tuple[int, int] | None = None,
-    near_deg: tuple[float, float, float] | None = None,
+    near_deg: Circle | None = None,
     dome: str | Path | None = None,
     map: str | Path | None = None,
 ) -> PlateSolution | DomeSolution:
@@ -398,7 +400,7 @@ def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
 
 
 def solve_picture(
-    picture: images.ViewedImage, solver: Solver, date_utc: datetime.datetime | None
+    picture: images.ViewedImage, solver: Solver, date_utc: datetime | None
 ) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
@@ -416,7 +418,7 @@ def solve_picture(
 
 
 def solve_again(
-    refused: list[SolvedReading], date_utc: datetime.datetime | None
+    refused: list[SolvedReading], date_utc: datetime | None
 ) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     camera = refused[0].hypothesis.solver.camera
@@ -473,17 +475,13 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     ]
 
 
-def outcome_fields(outcome: SolvedReading, date_utc: datetime.datetime | None) -> Record:
+def outcome_fields(outcome: SolvedReading, date_utc: datetime | None) -> Record:
     """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
     (pixels, solver, assumption, _) = outcome.hypothesis
     height_px, width_px = pixels.shape
     solvers = {one.solver.fov_deg: one.solver for one in outcome.tried}.values()
-    seen = {
-        "status": report.attitude.status,
-        "lights": len(report.centroids),
-        "brightest_dn": float(pixels.max()),
-        "background_dn": float(np.median(pixels)),
+    seen = picture_fields(report, pixels) | {
         "tried_fov_deg": [one.tried_fov_deg(width_px, height_px) for one in solvers],
         "catalog_limit_mag": round(float(solver.stars.v_mag[-1]), 1),
     }

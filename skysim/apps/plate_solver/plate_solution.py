@@ -1,10 +1,12 @@
 """What a solved plate says: pointing, attitude, lens, matched stars; as fields, as a table, and as a FITS header."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog.catalog import StarCatalog
@@ -13,9 +15,11 @@ from estimator.core.types import Attitude, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.types import Record
+from skysim.core.types import Floats, Record
 
 NOTED_STRETCH = 0.002  # relative to square pixels
+PIXEL_KEYS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
+STAR_KEYS = ("ra_deg", "dec_deg", "v_mag", *PIXEL_KEYS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +86,25 @@ class PlateSolution:
     hint: str = ""
 
 
+def picture_fields(report: Report, pixels: NDArray) -> Record:
+    """The status, the number of lights and the image statistics of a picture, solved or not."""
+    return {
+        "status": report.attitude.status,
+        "lights": len(report.centroids),
+        "brightest_dn": float(pixels.max()),
+        "background_dn": float(np.median(pixels)),
+    }
+
+
+def light_rows(names: Iterable[str], keys: Sequence[str], *columns: Floats) -> list[Record]:
+    """A row for each matched light: its name, and its numbers by their keys."""
+    rows = np.column_stack(columns).tolist()
+    return [
+        {"name": name} | dict(zip(keys, row, strict=True))
+        for name, row in zip(names, rows, strict=True)
+    ]
+
+
 def solution_fields(report: Report) -> Record:
     """Pointing of a solved image; the angles are those of the image center."""
     attitude = report.attitude
@@ -120,16 +143,12 @@ def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) ->
     x, y, z = stars.vectors[
         by_id[np.searchsorted(stars.id, tracker.stars.id[star], sorter=by_id)]
     ].T
-    columns = {
-        "name": map(star_name, tracker.stars.id[star].tolist()),
-        "ra_deg": (np.degrees(np.arctan2(y, x)) % 360).tolist(),
-        "dec_deg": np.degrees(np.arcsin(z)).tolist(),
-        "v_mag": tracker.stars.v_mag[star].tolist(),
-        "x_px": xy_px[:, 0].tolist(),
-        "y_px": xy_px[:, 1].tolist(),
-        "residual_x_px": residual_px[:, 0].tolist(),
-        "residual_y_px": residual_px[:, 1].tolist(),
-    }
+    sky = (
+        np.degrees(np.arctan2(y, x)) % 360,
+        np.degrees(np.arcsin(z)),
+        tracker.stars.v_mag[star],
+    )
+    names = map(star_name, tracker.stars.id[star].tolist())
     xyzw = attitude.cam_from_ref.as_quat(canonical=True)
     return {
         "cam_from_icrs_xyzw": tuple(xyzw.tolist()),
@@ -139,10 +158,7 @@ def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) ->
         "distortion": attitude.camera.distortion,
         "pixel_aspect": attitude.camera.aspect,
         "log10_chance": attitude.match.log10_chance,
-        "stars": tuple(
-            dict(zip(columns, row, strict=True))
-            for row in zip(*columns.values(), strict=True)
-        ),
+        "stars": tuple(light_rows(names, STAR_KEYS, *sky, xy_px, residual_px)),
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +22,7 @@ from skysim.apps.cli.options import (
 from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.core.paths import DATA, shipped_files
-from skysim.results.report import terminal_width
+from skysim.results.report import print_wrapped, terminal_width
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
@@ -253,16 +252,8 @@ def camera_new(
     width = min(max(terminal_width(), 40), 100)
     for one in filled.missing:
         name = one.name.replace("_", " ")
-        line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
-        print(
-            textwrap.fill(
-                line,
-                width,
-                initial_indent="  ",
-                subsequent_indent=" " * 21,
-                break_on_hyphens=False,
-            )
-        )
+        line = f"{one.assumed or 'left out'}: {one.consequence}"
+        print_wrapped(line, f"  {name:19s}", " " * 21, width)
     print(f"in a scene: camera: {{preset: {out}}}; skysim camera {out} shows it")
 
 

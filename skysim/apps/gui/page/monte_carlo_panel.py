@@ -409,7 +409,6 @@ def format_interval(value: float, low: float, high: float) -> str:
 def options() -> Record:
     """ECharts options of the histogram of the error angle."""
     text = {":color": style.chart_color("quiet"), "fontSize": 10}
-    rule = {"lineStyle": {":color": style.chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -418,7 +417,7 @@ def options() -> Record:
         "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
-        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": style.RULE},
         "tooltip": style.TOOLTIP,
         "series": [
             {

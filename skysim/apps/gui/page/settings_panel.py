@@ -219,7 +219,7 @@ class ScenePanel:
         self.page = page
         self.folder = folder
         self.saved = saved
-        self.shown: tuple[str, Mapping[str, str]] | None = None
+        self.shown: forms.Opened | None = None
         with widgets.row().style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=self.search)
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
@@ -297,7 +297,7 @@ class TrackerPanel:
     """
 
     def __init__(self, page: context.PageContext) -> None:
-        self.shown: tuple[str, Mapping[str, str]] | None = None
+        self.shown: forms.Opened | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
 

@@ -1,15 +1,15 @@
 """Strip charts of a flight: curves against a common time axis, one chart above the other, with a shared cursor."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Curves, FlightRow, Residual
+from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
+from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
 from skysim.core.types import Floats, Record
 
 BAND_COLOR = "#8b95a5"
@@ -195,7 +195,7 @@ class StripChart:
         self.chart.on("chart:finished", js_handler=CHART_JS % (self.chart.id, self.dots.id))
         self.chart.set_visibility(False)
 
-    def draw(self, drawn: list[Strip], end_s: float, name: Callable[[int], str]) -> None:
+    def draw(self, drawn: list[Strip], end_s: float, name: LightName) -> None:
         """Draw strips up to a time.
 
         Parameters
@@ -218,7 +218,7 @@ class StripChart:
             self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
 
 
-def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> Record:
+def dot_fields(drawn: list[Strip], name: LightName) -> Record:
     """Data for strips.js: dots, names of their lights, and the place of their strip."""
     n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
     dots = drawn[n].dots if drawn else []
@@ -235,7 +235,6 @@ def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> Record:
 def options(drawn: list[Strip], end_s: float) -> Record:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
     text = {":color": chart_color("quiet"), "fontSize": 11}
-    rule = {"lineStyle": {":color": chart_color("line")}}
     title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
     title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {
@@ -258,8 +257,8 @@ def options(drawn: list[Strip], end_s: float) -> Record:
         found["title"].append(title | {"text": strip.title, "top": top + 3})
         found["legend"].append(legend | {"top": top + 3, "data": names})
         found["grid"].append(grid | {"top": top + HEAD_PX})
-        found["xAxis"].append(x_axis | {"gridIndex": n, "axisLabel": label, "axisTick": rule})
-        found["yAxis"].append(y_axis(strip, n) | {"axisLabel": text, "splitLine": rule})
+        found["xAxis"].append(x_axis | {"gridIndex": n, "axisLabel": label, "axisTick": RULE})
+        found["yAxis"].append(y_axis(strip, n) | {"axisLabel": text, "splitLine": RULE})
         found["series"] += [series(curve, n, k) for k, curve in enumerate(strip.drawn)]
     return found | {
         "animation": False,

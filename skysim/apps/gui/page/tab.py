@@ -3,7 +3,7 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
+from skysim.core.yaml_reader import OverrideTexts
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
@@ -320,7 +321,7 @@ class Tab:
     async def open(
         self,
         scene: str,
-        overrides: Mapping[str, str] | None = None,
+        overrides: OverrideTexts | None = None,
         angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
@@ -364,7 +365,7 @@ class Tab:
         self.study_panel.set_scene()
 
     async def apply_overrides(
-        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+        self, overrides: OverrideTexts, dropped: Collection[str] = ()
     ) -> None:
         """Reopen the scene with further overrides and without some; concurrent edits are done one after another."""
         async with self.editing:
@@ -389,7 +390,7 @@ class Tab:
                     panel.shown = current
 
     @property
-    def opened(self) -> tuple[str, Mapping[str, str]]:
+    def opened(self) -> forms.Opened:
         """The open scene and its overrides."""
         return self.state.scene, self.state.overrides
 

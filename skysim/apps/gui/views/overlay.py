@@ -17,6 +17,7 @@ from nicegui import json
 from skysim.apps.gui.messages import (
     LIMITS,
     Display,
+    LightName,
     Lights,
     Pixels,
     TrackerResult,
@@ -53,7 +54,7 @@ def marks(
     lights: Lights,
     result: TrackerResult | None,
     shown: Collection[str],
-    name: Callable[[int], str],
+    name: LightName,
 ) -> Record:
     """Return the marks for frame.js.
 

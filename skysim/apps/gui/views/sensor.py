@@ -212,10 +212,7 @@ class SensorView:
 
     def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
-        view = {
-            "pose": self.pose,
-            "label": self.description(),
-        }
+        view = {"pose": self.pose, "label": self.description()}
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def description(self) -> str:
@@ -261,19 +258,19 @@ class SensorView:
         if light is not None:
             x, y = light.xy_px
             brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
-            lines += [f"truth      {x:8.2f} {y:8.2f}   {self.name(light.id)}"]
-            lines += [f"           {brightness}{light.electrons:.4g} e-"]
+            lines += [
+                f"truth      {x:8.2f} {y:8.2f}   {self.name(light.id)}",
+                f"           {brightness}{light.electrons:.4g} e-",
+            ]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            lines += [
-                f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"
-            ]
             residual = (
                 ""
                 if math.isnan(detection.residual_px)
                 else f"   residual {detection.residual_px:.3f} px"
             )
             lines += [
+                f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px",
                 f"           {identity}",
                 f"           flux {detection.flux:.4g}{residual}",
             ]

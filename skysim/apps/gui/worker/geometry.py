@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.apps.gui.messages import Lens, Pose
+from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats, Ints, Mount, Record, Sources, Trajectory, Truth
@@ -150,9 +150,7 @@ RANGES = {  # degrees
 }
 
 
-def from_angles(
-    scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]
-) -> Rotation:
+def from_angles(scene: Scene, mount: Mount, angles_deg: Triple) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises
@@ -218,8 +216,8 @@ MAX_ADVANCE_S = (
 class Grip(NamedTuple):
     """The held point of the vehicle in body axes, and the wanted place of this point in the lab frame; m."""
 
-    held_body_m: tuple[float, float, float]
-    wanted_m: tuple[float, float, float]
+    held_body_m: Triple
+    wanted_m: Triple
 
 
 class Push:

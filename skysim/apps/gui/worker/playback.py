@@ -5,7 +5,7 @@ import pickle
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -101,7 +101,7 @@ class Playback:
         view = bench.frame_view(shot.frame, shot.truth, shot.report, seconds)
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(
-            KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
+            KeptFrame(view._replace(t_s=t_s), shot.report, self.keep(shot.frame))
         )
 
     def keep(self, frame: Frame) -> int | None:
