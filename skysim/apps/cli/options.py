@@ -68,8 +68,7 @@ Out = Annotated[Path | None, Option(help="Output folder; default: out/NAME.")]
 Scene3d = Annotated[
     bool,
     Option(
-        "--scene-3d",
-        help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.",
+        "--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."
     ),
 ]
 Overrides = Annotated[
@@ -83,14 +82,12 @@ Overrides = Annotated[
 Detector = Annotated[str | None, Option(help="Detection algorithm, e.g. local.")]
 Centroider = Annotated[str | None, Option(help="Centroiding algorithm, e.g. gaussian_fit.")]
 Identifier = Annotated[str | None, Option(help="Identification algorithm, e.g. pyramid.")]
-SolverName = Annotated[str | None, Option("--solver", help="Attitude algorithm, e.g. quest.")]
+SolverName = Annotated[str | None, Option(help="Attitude algorithm, e.g. quest.")]
 TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
     Option(
-        "--program",
-        metavar="NAME=COMMAND",
-        help="External tracker or controller: a program; repeatable.",
+        metavar="NAME=COMMAND", help="External tracker or controller: a program; repeatable."
     ),
 ]
 OpenReport = Annotated[bool, Option("--open", help="Open the report when it is written.")]

@@ -57,11 +57,7 @@ def bar(*columns: ProgressColumn) -> Bar:
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(
-        what,
-        *columns,
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
+        what, *columns, console=console, transient=True, disable=not console.is_terminal
     )
 
 

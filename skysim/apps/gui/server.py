@@ -251,10 +251,7 @@ class Guard:
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            for name, value, age_s in (
-                (self.cookie, self.token, None),
-                (USER, user, YEAR_S),
-            ):
+            for name, value, age_s in ((self.cookie, self.token, None), (USER, user, YEAR_S)):
                 response.set_cookie(
                     name, value, age_s, path="/", httponly=True, samesite="strict"
                 )

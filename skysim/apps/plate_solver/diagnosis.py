@@ -19,12 +19,7 @@ from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import (
-    WIDEST_DEG,
-    Solver,
-    best_attitude,
-    solve_centroids,
-)
+from skysim.apps.plate_solver.solver import WIDEST_DEG, Solver, best_attitude, solve_centroids
 
 # Expected numbers of stars in a field: hardly solvable below the first, safe above the second.
 MIN_CATALOG_STARS = 6.0

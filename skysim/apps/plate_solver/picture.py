@@ -352,9 +352,7 @@ def read_lights(path: Path) -> Centroids:
 
 
 def load_picture(
-    path: Path,
-    camera: KnownCamera | None = None,
-    picture: images.ViewedImage | None = None,
+    path: Path, camera: KnownCamera | None = None, picture: images.ViewedImage | None = None
 ) -> images.ViewedImage:
     """Read a picture in monochrome, in the orientation in which it is viewed.
 
@@ -424,10 +422,8 @@ def solve_again(
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
         return None  # the camera is known with its saturation: its frames need no retries
-    by_rows: dict[bool, list[SolvedReading]] = {}
-    for refusal in refused:
-        by_rows.setdefault(refusal.hypothesis.flipped, []).append(refusal)
-    for readings in by_rows.values():
+    for flipped in dict.fromkeys(one.hypothesis.flipped for one in refused):
+        readings = [one for one in refused if one.hypothesis.flipped == flipped]
         pixels = readings[0].pixels
         settings = readings[0].hypothesis.solver.settings
         for retry in retries.retries(pixels, readings[0].report.centroids, settings):

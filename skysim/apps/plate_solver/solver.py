@@ -391,9 +391,7 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
         ) from None
 
 
-def validated_date(
-    date_utc: datetime | None,
-) -> tuple[datetime | None, str]:
+def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (check_year(date_utc) if date_utc else None), ""

@@ -153,10 +153,7 @@ def computed(
 
 
 def write_picture(
-    path: Path,
-    found: SkySamples,
-    exclusion: ExclusionConfig,
-    available: Bools,
+    path: Path, found: SkySamples, exclusion: ExclusionConfig, available: Bools
 ) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
     from skysim.core.files import write_bytes

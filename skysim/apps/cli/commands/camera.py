@@ -23,6 +23,7 @@ from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.core.paths import DATA, shipped_files
 from skysim.results.report import print_wrapped, terminal_width
+from skysim.scene import camera_sheet
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
@@ -219,8 +220,7 @@ def asking(command: Callable[..., None]) -> Callable[..., None]:
 def camera_new(
     *,
     name: Annotated[
-        str,
-        Option(help="Name of camera, lens and data sheets, for the file's first line."),
+        str, Option(help="Name of camera, lens and data sheets, for the file's first line.")
     ] = "",
     out: Annotated[Path, Option(help="The file to write, for the key camera.preset.")] = Path(
         "camera.yaml"
@@ -232,8 +232,6 @@ def camera_new(
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
     """
-    from skysim.scene import camera_sheet
-
     if out.suffix not in (".yaml", ".yml") or out.exists():
         raise InputError(
             f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
@@ -259,8 +257,6 @@ def camera_new(
 
 def ask_all() -> dict[str, str]:
     """Ask for each number of the data sheet. A wrong answer is asked again; an empty one leaves the number out."""
-    from skysim.scene import camera_sheet
-
     print(
         "Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated."
     )

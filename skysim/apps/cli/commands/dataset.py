@@ -18,8 +18,7 @@ from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
 OutputUrl = Annotated[
-    str,
-    Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder."),
+    str, Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
 ]
 Variations = Annotated[
     Path | None,
@@ -30,10 +29,7 @@ Variations = Annotated[
 ]
 Formats = Annotated[
     list[str] | None,
-    Option(
-        "--to",
-        help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.",
-    ),
+    Option(help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."),
 ]
 
 

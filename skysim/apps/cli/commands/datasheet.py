@@ -27,7 +27,7 @@ Quick = Annotated[
 FieldCount = Annotated[
     int | None,
     Option(
-        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.",
+        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more."
     ),
 ]
 Folder = Annotated[Path | None, Option(help="Output folder; default: out/NAME_datasheet.")]

@@ -56,8 +56,7 @@ OffsetBar = Annotated[
     ),
 ]
 InFlight = Annotated[
-    bool,
-    Option("--in-flight", help="Also run the filter in flight over the last flight."),
+    bool, Option("--in-flight", help="Also run the filter in flight over the last flight.")
 ]
 # The errors of the onboard model before the first flight.
 InertiaSigma = Annotated[str, Option(help="Standard error of the assumed inertia, a share.")]

@@ -22,13 +22,11 @@ def reproduce(
     ] = False,
     seed: Annotated[int, Option(help="Seed of all random streams.")] = 1,
     report: Annotated[
-        bool,
-        Option("--report", help="Also write an HTML page with the papers' figures."),
+        bool, Option("--report", help="Also write an HTML page with the papers' figures.")
     ] = False,
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
-        Path | None,
-        Option(help="Also write a Markdown page with its images beside it."),
+        Path | None, Option(help="Also write a Markdown page with its images beside it.")
     ] = None,
     open_: OpenReport = False,
     json: Json = False,

@@ -181,16 +181,11 @@ def new(
 
 def export(
     folder: Annotated[
-        Path,
-        Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`."),
+        Path, Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
     ],
     to: Annotated[
         list[str],
-        Option(
-            "--to",
-            metavar="FORMAT",
-            help="aem, ecsv, parquet, tiff, zarr or video; repeatable.",
-        ),
+        Option(metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
     ],
     out: Annotated[Path | None, Option(help="Output folder; default: FOLDER.")] = None,
     json: Json = False,

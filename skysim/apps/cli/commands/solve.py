@@ -88,16 +88,14 @@ Size = Annotated[
     Option(metavar="WxH", help="Size of the picture of a list of lights, in pixels."),
 ]
 WcsTo = Annotated[
-    Path | None,
-    Option(help="Also write the FITS header (TAN-SIP) of one image here."),
+    Path | None, Option(help="Also write the FITS header (TAN-SIP) of one image here.")
 ]
 TableTo = Annotated[
     Path | None,
     Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
 ]
 AnnotateTo = Annotated[
-    Path | None,
-    Option(help="File of the annotated image of one image, in place of OUT's."),
+    Path | None, Option(help="File of the annotated image of one image, in place of OUT's.")
 ]
 Sequence = Annotated[
     bool,
@@ -233,11 +231,7 @@ def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) ->
 
 
 def solve_all(
-    paths: list[Path],
-    solver: Solver | DomeSolver,
-    chosen: Outputs,
-    out: Path,
-    quiet: bool,
+    paths: list[Path], solver: Solver | DomeSolver, chosen: Outputs, out: Path, quiet: bool
 ) -> tuple[list[Record], list[str], bool]:
     """Solve the images. Returns their results, warnings followed by errors, and whether all images could be read."""
     from skysim.apps import plate_solver

@@ -17,12 +17,11 @@ if TYPE_CHECKING:
     from estimator.catalog.published_catalogs import OnBoard
 
 app = typer.Typer(
-    no_args_is_help=True,
-    help="Build, inspect, select and convert star catalogs.",
+    no_args_is_help=True, help="Build, inspect, select and convert star catalogs."
 )
 Source = Annotated[str, Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")]
 Limit = Annotated[float | None, Option(metavar="V", help="A visual magnitude; see above.")]
-CatFile = Annotated[Path, Option("--out", help="Output file, .cat.")]
+CatFile = Annotated[Path, Option(help="Output file, .cat.")]
 
 
 @app.command("build")
@@ -82,7 +81,7 @@ def catalog_select(
         Literal["uniform", "asymmetric", "chosen"],
         Option(help="Evenly spread; a limit for each hemisphere; both."),
     ],
-    out: Annotated[Path, Option("--out", help="Output file, .ecsv.")],
+    out: Annotated[Path, Option(help="Output file, .ecsv.")],
     count: Annotated[int | None, Option(min=1, help="Number of stars; 2023.")] = None,
     bright: Limit = None,
     faintest: Limit = None,

@@ -55,12 +55,9 @@ StudyArg = Annotated[
     ),
 ]
 Workers = Annotated[
-    int | None,
-    Option(min=1, help="Number of worker processes; default: number of cores."),
+    int | None, Option(min=1, help="Number of worker processes; default: number of cores.")
 ]
-EngineName = Annotated[
-    str, Option("--engine", help="How trials are run: pool, serial or dask.")
-]
+EngineName = Annotated[str, Option(help="How trials are run: pool, serial or dask.")]
 Scheduler = Annotated[str, Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
 
 
@@ -128,14 +125,7 @@ def resume(
     place, plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
     run_and_report(
-        plan,
-        place,
-        trial_engine,
-        overrides,
-        json,
-        open_,
-        resumed=True,
-        repeat_failed=failed,
+        plan, place, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed
     )
 
 

@@ -176,9 +176,7 @@ class LightsPanel:
 
 
 def rows(
-    lights: Lights,
-    detections: Collection[Detection],
-    name: LightName,
+    lights: Lights, detections: Collection[Detection], name: LightName
 ) -> Iterator[Record]:
     """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 

@@ -51,10 +51,7 @@ Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: Lights,
-    result: TrackerResult | None,
-    shown: Collection[str],
-    name: LightName,
+    lights: Lights, result: TrackerResult | None, shown: Collection[str], name: LightName
 ) -> Record:
     """Return the marks for frame.js.
 

@@ -91,10 +91,7 @@ class SensorView:
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
                 self.hover = live.LiveText(contents).classes("mono").mark("hover")
-            with (
-                self.canvas.add_slot("wait"),
-                widgets.div("lab-wait") as self.wait,
-            ):
+            with self.canvas.add_slot("wait"), widgets.div("lab-wait") as self.wait:
                 # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
                 self.waited = widgets.div("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
@@ -119,7 +116,7 @@ class SensorView:
                 box = widgets.checkbox(kind, value=kind in self.shown)
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
-            self.grid = widgets.checkbox("grid", value=False, on_change=self.update_display)
+            self.grid = widgets.checkbox("grid", on_change=self.update_display)
             self.grid.mark("grid")
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")

@@ -236,9 +236,4 @@ def histogram(integers: NDArray) -> Record:
     first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
-    return {
-        "range": (low, high),
-        "sky": float(sky),
-        "scatter": scatter,
-        "counts": counts,
-    }
+    return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts}
