@@ -434,9 +434,9 @@ def solve_again(
                     pixels, solver, date_utc, retry.centroids, retry.efforts
                 )
                 if report.attitude.solved:
-                    notes = [one.assumption] * bool(one.assumption) + [retry.note]
+                    notes = "; ".join(filter(None, (one.assumption, retry.note)))
                     return SolvedReading(
-                        one._replace(assumption="; ".join(notes)),
+                        one._replace(assumption=notes),
                         report,
                         tracker,
                         refused[0].tried,

@@ -128,14 +128,16 @@ def solution_fields(report: Report) -> Record:
 def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) -> Record:
     """Attitude, covariance, lens and stars of a solved image. stars : the catalog of the tracker, at its epoch"""
     attitude = report.attitude
+    match = attitude.match
+    camera = attitude.camera
     assert attitude.cam_from_ref is not None
     assert attitude.covariance_rad2 is not None
-    assert attitude.match is not None
-    assert attitude.camera is not None
-    star = attitude.match.star
-    xy_px = report.centroids.xy_px[attitude.match.observed]
+    assert match is not None
+    assert camera is not None
+    star = match.star
+    xy_px = report.centroids.xy_px[match.observed]
     # Measured minus expected.
-    residual_px = xy_px - attitude.camera.pixels(
+    residual_px = xy_px - camera.pixels(
         attitude.cam_from_ref.apply(tracker.stars.vectors[star])
     )
     # The tracker's directions are apparent; the table has the catalog's.
@@ -153,11 +155,11 @@ def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) ->
     return {
         "cam_from_icrs_xyzw": tuple(xyzw.tolist()),
         "covariance_rad2": tuple(map(tuple, attitude.covariance_rad2.tolist())),
-        "focal_px": attitude.camera.focal_px,
-        "center_px": attitude.camera.center_px,
-        "distortion": attitude.camera.distortion,
-        "pixel_aspect": attitude.camera.aspect,
-        "log10_chance": attitude.match.log10_chance,
+        "focal_px": camera.focal_px,
+        "center_px": camera.center_px,
+        "distortion": camera.distortion,
+        "pixel_aspect": camera.aspect,
+        "log10_chance": match.log10_chance,
         "stars": tuple(light_rows(names, STAR_KEYS, *sky, xy_px, residual_px)),
     }
 

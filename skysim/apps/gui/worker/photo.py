@@ -103,24 +103,25 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         segment = runner.segment_of(plan, stored, trial)
     (row,) = trials.run_block(plan.spec, segment)
     setup = setups.prepared_setup(plan.spec, segment.settings)
+    lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    result = workbench.tracker_result(setup.lab, setup.estimator, frame, truth, report)
+    result = workbench.tracker_result(lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(
             row.error.strip().splitlines()[-1], result.detections, result.ms
         )
-    scene = setup.lab.scene
+    scene = lab.scene
     photo = Photo(
         result,
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        angles_deg=scoring.true_angles_deg(setup.lab.camera, truth),
-        lights=workbench.true_lights(truth, workbench.magnitude_by_id(setup.lab)),
-        prefix=workbench.id_prefix(setup.lab),
+        angles_deg=scoring.true_angles_deg(lab.camera, truth),
+        lights=workbench.true_lights(truth, workbench.magnitude_by_id(lab)),
+        prefix=workbench.id_prefix(lab),
         saturation_dn=frame.saturation_dn,
-        lens=(lens := lenses.scene_lens(setup.lab)),
-        pose=lenses.scene_pose(setup.lab, lens, truth),
+        lens=(lens := lenses.scene_lens(lab)),
+        pose=lenses.scene_pose(lab, lens, truth),
     )
     return photo, frame.image_dn
 
