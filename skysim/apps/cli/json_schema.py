@@ -10,14 +10,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from skysim.core.types import Record
 from skysim.experiments.study.plan import Study
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CameraConfig
 
 KINDS: Mapping[str, type[BaseModel]] = {"scene": Scene, "study": Study}
-EXTRA_KEYS: Mapping[
-    str, dict[str, Any]
-] = {  # keys that the loader resolves before validation
+EXTRA_KEYS: Mapping[str, Record] = {  # keys that the loader resolves before validation
     Scene.__name__: {
         "base": {
             "type": "string",
@@ -45,7 +44,7 @@ BOUND_KEYWORDS = {
 }
 
 
-def json_schema(kind: str) -> dict[str, Any]:
+def json_schema(kind: str) -> Record:
     """The JSON Schema (draft 2020-12) of a kind of file."""
     model = KINDS[kind]
     schema = relaxed(model.model_json_schema(by_alias=True), model.__name__)
@@ -66,7 +65,7 @@ def relaxed(node: Any, name: str = "") -> Any:
         return [relaxed(item) for item in node]
     if not isinstance(node, dict):
         return node
-    relaxed_node: dict[str, Any] = {}
+    relaxed_node: Record = {}
     for key, value in node.items():
         if key == "properties":
             properties = {

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Argument, Option
 
 from skysim.core.errors import OVERRIDES, InputError, Where
 from skysim.core.paths import SCENES, STUDIES, shipped_files
@@ -51,58 +51,47 @@ def complete_yaml(folder: Path, incomplete: str) -> list[str]:
 
 SceneArg = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="SCENE",
         help="Scene file (.yaml), or name of a scene in scenes/.",
         autocompletion=complete_scene,
     ),
 ]
-Frames = Annotated[int | None, typer.Option(help="Number of frames; default: the scene's.")]
+Frames = Annotated[int | None, Option(help="Number of frames; default: the scene's.")]
 Seed = Annotated[
     int | None,
-    typer.Option(
+    Option(
         help="Seed of all noise, and of a survey's list, lever and focal length; default: the scene's."
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="Output folder; default: out/NAME.")]
+Out = Annotated[Path | None, Option(help="Output folder; default: out/NAME.")]
 Scene3d = Annotated[
     bool,
-    typer.Option(
-        "--scene-3d",
-        help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif.",
+    Option(
+        "--scene-3d", help="Write 3-D views of the laboratory: scene_3d.png and scene_3d.gif."
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set",
         metavar="KEY=VALUE",
         help="Override a key of the file: exposure.rate_hz=10; repeatable.",
     ),
 ]
-Detector = Annotated[str | None, typer.Option(help="Detection algorithm, e.g. local.")]
-Centroider = Annotated[
-    str | None, typer.Option(help="Centroiding algorithm, e.g. gaussian_fit.")
-]
-Identifier = Annotated[
-    str | None, typer.Option(help="Identification algorithm, e.g. pyramid.")
-]
-SolverName = Annotated[
-    str | None, typer.Option("--solver", help="Attitude algorithm, e.g. quest.")
-]
+Detector = Annotated[str | None, Option(help="Detection algorithm, e.g. local.")]
+Centroider = Annotated[str | None, Option(help="Centroiding algorithm, e.g. gaussian_fit.")]
+Identifier = Annotated[str | None, Option(help="Identification algorithm, e.g. pyramid.")]
+SolverName = Annotated[str | None, Option(help="Attitude algorithm, e.g. quest.")]
 TRACKER_HELP = "Tracker: own, or a name from `skysim trackers` or --program."
 Programs = Annotated[
     list[str] | None,
-    typer.Option(
-        "--program",
-        metavar="NAME=COMMAND",
-        help="External tracker or controller: a program; repeatable.",
+    Option(
+        metavar="NAME=COMMAND", help="External tracker or controller: a program; repeatable."
     ),
 ]
-OpenReport = Annotated[
-    bool, typer.Option("--open", help="Open the report when it is written.")
-]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
+OpenReport = Annotated[bool, Option("--open", help="Open the report when it is written.")]
+Json = Annotated[bool, Option("--json", help="Print JSON instead of text.")]
 
 
 def load(

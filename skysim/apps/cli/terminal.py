@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import ProgressColumn
 
-    from skysim.core.types import Telemetry
+    from skysim.core.types import Record, Telemetry
     from skysim.experiments.study.execution.runner import Progress
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
@@ -57,11 +57,7 @@ def bar(*columns: ProgressColumn) -> Bar:
     what = TextColumn("{task.description}", markup=False)  # a title may contain brackets
     columns = columns or (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     return Progress(
-        what,
-        *columns,
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
+        what, *columns, console=console, transient=True, disable=not console.is_terminal
     )
 
 
@@ -159,7 +155,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     print_wrapped(f"scoreboard.ecsv, solutions.NAME.ecsv and the frames are in {folder}")
 
 
-def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
+def print_solutions(solutions: list[Record], out: Path) -> None:
     """Print the attitudes of pictures of the sky, or of a dome's LEDs, with remarks."""
     columns = [Column("file", kind="text"), Column("status", kind="text")]
     if "leds" in solutions[0]:
@@ -183,7 +179,7 @@ def print_solutions(solutions: list[dict[str, Any]], out: Path) -> None:
     print(f"annotated images and solutions.json in {out}")
 
 
-def print_remarks(solution: dict[str, Any]) -> None:
+def print_remarks(solution: Record) -> None:
     """Print what `skysim solve` saw, tried and concluded for a refused image, or assumed for a solved one."""
     if not solution["hint"]:
         return
@@ -208,9 +204,7 @@ def print_json(data: Any) -> None:
     print(to_json(data))
 
 
-def print_list(
-    entries: list[dict[str, Any]], json: bool, line: Callable[[dict[str, Any]], str]
-) -> None:
+def print_list(entries: list[Record], json: bool, line: Callable[[Record], str]) -> None:
     """Print entries as JSON or, one per line, as text."""
     if json:
         print_json(entries)
@@ -219,7 +213,7 @@ def print_list(
         print(line(entry))
 
 
-def print_catalog(catalog: dict[str, Any], json: bool) -> None:
+def print_catalog(catalog: Record, json: bool) -> None:
     if json:
         print_json(catalog)
         return
@@ -296,7 +290,7 @@ REPLAYED = (
 )
 
 
-def study_status(plan: Plan, store: Store) -> dict[str, Any]:
+def study_status(plan: Plan, store: Store) -> Record:
     """Progress and provenance of a study: trial counts, code version, run time and store."""
     return {
         "study": plan.name,
@@ -309,7 +303,7 @@ def study_status(plan: Plan, store: Store) -> dict[str, Any]:
     }
 
 
-def print_study_status(status: dict[str, Any]) -> None:
+def print_study_status(status: Record) -> None:
     seconds = status["seconds"]
     speed = f"{seconds:.1f} s, {status['done'] / seconds:.2g} trials/s"
     print_wrapped(
@@ -348,7 +342,7 @@ def print_worst(
         print(f"   {repeat} {one.trial}")
 
 
-def print_replay(replay: dict[str, Any]) -> None:
+def print_replay(replay: Record) -> None:
     """Print the outcome of a repeated trial, and whether it differs from the stored one."""
     for name in REPLAYED:
         print(f"{name:12s} {replay[name]}")

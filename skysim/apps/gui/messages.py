@@ -2,18 +2,18 @@
 
 NiceGUI writes arrays as JSON, with null for NaN."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Ints, Record
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
 Triple = tuple[float, float, float]
+LightName = Callable[[int], str]  # the name of a light by its number
 NAN = float("nan")
 # Limits of the display; the last ones are set in the browser.
 LIMITS = ("automatic", "zscale", "min to max", "manual")
@@ -44,8 +44,7 @@ class Display(NamedTuple):
 ALL_PIXELS = Display()
 
 
-@dataclass(frozen=True, slots=True)
-class Pixels:
+class Pixels(NamedTuple):
     """A frame's pixels for the browser, see `worker.pixels.pixels_for`.
 
     Attributes
@@ -61,7 +60,7 @@ class Pixels:
     """
 
     data: bytes
-    fields: dict[str, Any]
+    fields: Record
     display: Display
     number: int
 
@@ -159,8 +158,7 @@ class Pose:
     depth_m: Floats | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FrameView:
+class FrameView(NamedTuple):
     """One rendered frame: image, true attitude, true lights, and the tracker's solution if the frame was solved.
 
     Attributes
@@ -196,8 +194,7 @@ class PushedView(NamedTuple):
     rate_deg_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class SceneInfo:
+class SceneInfo(NamedTuple):
     """Facts about a loaded scene that the page displays.
 
     Attributes
@@ -230,7 +227,7 @@ class SceneInfo:
     stages: dict[str, str]
     duration_s: float
     noise: bool
-    geometry: dict[str, Any]
+    geometry: Record
     lens: Lens
     surveyed: bool = False
 
@@ -268,8 +265,12 @@ class FlightRow(NamedTuple):
     innovation_arcsec: float
 
 
-@dataclass(frozen=True, slots=True)
-class FlightStep:
+Residual = tuple[
+    float, int, float
+]  # of an identified light: time, its number, residual in pixels
+
+
+class FlightStep(NamedTuple):
     """Progress of a flight that is being computed.
 
     Attributes
@@ -281,7 +282,7 @@ class FlightStep:
     log
         Curves of the motion so far, if there are new frames
     residuals
-        Residuals of the lights identified in these frames: time, number, residual in pixels
+        Residuals of the lights identified in these frames
     """
 
     is_done: bool
@@ -289,7 +290,7 @@ class FlightStep:
     duration_s: float
     rows: Sequence[FlightRow] = ()
     log: Curves | None = None
-    residuals: Sequence[tuple[float, int, float]] = ()
+    residuals: Sequence[Residual] = ()
 
 
 class AmbiguityMap(NamedTuple):
@@ -305,11 +306,15 @@ class AmbiguityMap(NamedTuple):
         Two LEDs coincide if they are nearer than this
     """
 
-    ids: NDArray[np.int64]
-    others: NDArray[np.int64]
+    ids: Ints
+    others: Ints
     fraction: Floats
     least: float
     coincidence_mm: float
+
+
+# Number of frames; number of LEDs measured and their rms error, mm, predicted after these (None if not determined).
+PlanStep = tuple[int, int, float | None]
 
 
 class SurveyPlan(NamedTuple):
@@ -324,14 +329,13 @@ class SurveyPlan(NamedTuple):
     leds
         Number of LEDs on the dome
     steps
-        Number of frames; number of LEDs measured and their rms error, mm, predicted after these
-        (None if not determined)
+        Predicted accuracies
     """
 
     angles_deg: Sequence[Sequence[float]]
     shown: Sequence[int]
     leds: int
-    steps: tuple[tuple[int, int, float | None], ...]
+    steps: tuple[PlanStep, ...]
 
 
 class SurveyFound(NamedTuple):
@@ -355,6 +359,6 @@ class SurveyFound(NamedTuple):
 
     statistics: Record
     faults: list[str]
-    ids: NDArray[np.int64]
+    ids: Ints
     known: Floats
     plan: SurveyPlan

@@ -35,6 +35,7 @@ from skysim.apps.gui.views.overlay import FRAMES, display_of
 from skysim.apps.gui.worker.session import Workers
 from skysim.apps.gui.worker.study_process import StudyProcess, is_shown
 from skysim.core.constants import DAY_S
+from skysim.core.types import Record
 from skysim.scene.loader import find
 
 # Garbage collection of the server, at times when no page gets a frame.
@@ -162,7 +163,7 @@ class KeptFiles:
 
     def __init__(self, app: Any) -> None:
         self.app = app
-        self.kept = dict[tuple[str, bool], list[dict[str, Any]]]()
+        self.kept = dict[tuple[str, bool], list[Record]]()
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if not is_plain_file(scope):
@@ -170,9 +171,9 @@ class KeptFiles:
             return
         encodings = dict(scope["headers"]).get(b"accept-encoding", b"")
         key = (scope["path"], b"gzip" in encodings)
-        messages: list[dict[str, Any]] = []
+        messages: list[Record] = []
 
-        async def keep(message: dict[str, Any]) -> None:
+        async def keep(message: Record) -> None:
             messages.append(dict(message))  # a copy, since layers further out add headers
             await send(message)
 
@@ -246,10 +247,7 @@ class Guard:
         if token_matches(request.query_params.get("token", ""), self.token):
             response = RedirectResponse("/", 303)
             user = user_of(request.cookies) or secrets.token_hex(USER_BYTES)
-            for name, value, age_s in (
-                (self.cookie, self.token, None),
-                (USER, user, YEAR_S),
-            ):
+            for name, value, age_s in ((self.cookie, self.token, None), (USER, user, YEAR_S)):
                 response.set_cookie(
                     name, value, age_s, path="/", httponly=True, samesite="strict"
                 )

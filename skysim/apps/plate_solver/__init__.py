@@ -5,11 +5,7 @@ A file is loaded as a picture in the orientation of viewing (`picture.py`) and s
 Pictures of a dome's LEDs are solved by the tracker of a scene (`dome_pictures.py`).
 """
 
-from skysim.apps.plate_solver.dome_pictures import (
-    DomeSolution,
-    DomeSolver,
-    make_dome_solver,
-)
+from skysim.apps.plate_solver.dome_pictures import DomeSolution, DomeSolver, make_dome_solver
 from skysim.apps.plate_solver.picture import (
     Outputs,
     annotated_paths,

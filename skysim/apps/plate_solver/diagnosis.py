@@ -4,11 +4,11 @@ Causes are tested from the most certain to the vaguest. Two are tested by solvin
 view. Such a solution only shows the cause; it is never the answer.
 """
 
-import datetime
 import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,7 @@ from estimator.detection.classify import streaks_px
 from estimator.detection.detect import DETECTORS
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock
-from skysim.apps.plate_solver.solver import (
-    WIDEST_DEG,
-    Solver,
-    best_attitude,
-    solve_centroids,
-)
+from skysim.apps.plate_solver.solver import WIDEST_DEG, Solver, best_attitude, solve_centroids
 
 # Expected numbers of stars in a field: hardly solvable below the first, safe above the second.
 MIN_CATALOG_STARS = 6.0
@@ -65,7 +60,7 @@ class Refusal:
     image: NDArray
     centroids: Centroids
     solvers: tuple[Solver, ...]
-    date_utc: datetime.datetime | None = None
+    date_utc: datetime | None = None
     row_order_known: bool = True
 
     @property

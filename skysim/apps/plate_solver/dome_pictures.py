@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,18 +22,17 @@ from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_EVIDENCE_MA
 from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Report
 from skysim.apps.plate_solver import diagnosis
+from skysim.apps.plate_solver.plate_solution import PIXEL_KEYS, light_rows, picture_fields
 from skysim.apps.plate_solver.solver import KnownCamera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
+from skysim.core.types import Record
 
 if TYPE_CHECKING:
     from estimator.trackers.dome_tracker import DomeTracker
 
-CALIBRATION_SIGMAS = (
-    3.0  # standard deviations in the uncertainty of a calibrated focal length
-)
-LED_KEYS = ("x_m", "y_m", "z_m", "x_px", "y_px", "residual_x_px", "residual_y_px")
+LED_KEYS = ("x_m", "y_m", "z_m", *PIXEL_KEYS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +81,7 @@ class DomeSolution:
     log10_chance: float | None = None
     matches: int = 0
     rms_px: float | None = None
-    leds: Sequence[dict[str, Any]] = ()
+    leds: Sequence[Record] = ()
     lights: int = 0
     brightest_dn: float | None = None
     background_dn: float | None = None
@@ -202,18 +201,13 @@ def solve_dome(source: ViewedImage | Centroids, solver: DomeSolver) -> DomeReadi
     return next((one for one in readings if one.report.attitude.solved), readings[0])
 
 
-def dome_fields(reading: DomeReading) -> dict[str, Any]:
+def dome_fields(reading: DomeReading) -> Record:
     """The fields of DomeSolution: image statistics, and solution or likely cause of the refusal."""
     from skysim.experiments.dome_survey.survey_findings import attitude_record
 
     report = reading.report
     attitude = report.attitude
-    seen = {
-        "status": attitude.status,
-        "lights": len(report.centroids),
-        "brightest_dn": float(reading.pixels.max()),
-        "background_dn": float(np.median(reading.pixels)),
-    }
+    seen = picture_fields(report, reading.pixels)
     match = attitude.match
     if match is None:
         return seen | {"hint": likely_cause(reading)}
@@ -227,7 +221,7 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
     xy_px = report.centroids.xy_px[match.observed]
     # Measured minus expected.
     residual_px = xy_px - project(body_from_lab, place_m, lever, attitude.camera)
-    numbers = np.hstack([place_m, xy_px, residual_px]).tolist()
+    names = (f"LED {led}" for led in leds.id[match.star])
     shared = attitude.systematic_rad2
     solved = attitude_record(body_from_lab, attitude.covariance_rad2, lever)
     return (
@@ -240,10 +234,7 @@ def dome_fields(reading: DomeReading) -> dict[str, Any]:
             "log10_chance": match.log10_chance,
             "matches": len(match.star),
             "rms_px": attitude.rms_px,
-            "leds": [
-                {"name": f"LED {led}"} | dict(zip(LED_KEYS, row, strict=True))
-                for led, row in zip(leds.id[match.star], numbers, strict=True)
-            ],
+            "leds": light_rows(names, LED_KEYS, place_m, xy_px, residual_px),
             "hint": reading.assumption,
         }
     )

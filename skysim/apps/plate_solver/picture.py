@@ -1,12 +1,12 @@
 """Load a picture in the orientation of viewing, solve the hypotheses about it, and diagnose a refusal."""
 
-import datetime
 import math
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, fields, replace
+from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,13 @@ from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
     camera_notes,
+    picture_fields,
     solution_fields,
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
     FOV_LIMITS_DEG,
+    Circle,
     KnownCamera,
     Solver,
     kept_solver,
@@ -44,6 +46,7 @@ from skysim.apps.plate_solver.solver import (
 )
 from skysim.core import files, images
 from skysim.core.errors import InputError, printable
+from skysim.core.types import Record
 
 ANNOTATED = ".annotated.png"
 LIST_SUFFIXES = (".csv", ".ecsv")
@@ -97,10 +100,10 @@ def solve(
     *,
     fov_deg: float | None = None,
     camera: str | Path | None = None,
-    time_utc: datetime.datetime | None = None,
+    time_utc: datetime | None = None,
     catalog: str | Path | None = None,
     size_px: tuple[int, int] | None = None,
-    near_deg: tuple[float, float, float] | None = None,
+    near_deg: Circle | None = None,
     dome: str | Path | None = None,
     map: str | Path | None = None,
 ) -> PlateSolution | DomeSolution:
@@ -204,7 +207,7 @@ def solve_file(
     solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """Solve one file, return the fields of `skysim solve --json`, and write the files of `outputs`.
 
     An unreadable image does not raise, so that the files after it are still solved: its error line becomes `status`,
@@ -217,7 +220,7 @@ def solve_file(
         return blank_result(path, solver) | {"status": str(error), "bad_input": True}
 
 
-def blank_result(path: Path, solver: Solver | DomeSolver) -> dict[str, Any]:
+def blank_result(path: Path, solver: Solver | DomeSolver) -> Record:
     """The fields of a file that is not solved."""
     run = {"date_utc": None, "time_ms": None, "warning": ""}
     blank = DomeSolution() if isinstance(solver, DomeSolver) else PlateSolution()
@@ -229,7 +232,7 @@ def read_and_solve(
     solver: Solver | DomeSolver,
     outputs: Outputs = NO_OUTPUTS,
     picture: images.ViewedImage | None = None,
-) -> dict[str, Any]:
+) -> Record:
     """As `solve_file`, but raise InputError for an unreadable image."""
     result = blank_result(path, solver)
     begin = time.perf_counter()
@@ -267,7 +270,7 @@ def read_and_solve(
 
 
 def write_outputs(
-    outputs: Outputs, reading: SolvedReading | DomeReading, result: dict[str, Any]
+    outputs: Outputs, reading: SolvedReading | DomeReading, result: Record
 ) -> None:
     """Write the files of a picture; lights and header only if it is solved."""
     rows = result["leds"] if isinstance(reading, DomeReading) else result["stars"]
@@ -349,9 +352,7 @@ def read_lights(path: Path) -> Centroids:
 
 
 def load_picture(
-    path: Path,
-    camera: KnownCamera | None = None,
-    picture: images.ViewedImage | None = None,
+    path: Path, camera: KnownCamera | None = None, picture: images.ViewedImage | None = None
 ) -> images.ViewedImage:
     """Read a picture in monochrome, in the orientation in which it is viewed.
 
@@ -397,7 +398,7 @@ def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
 
 
 def solve_picture(
-    picture: images.ViewedImage, solver: Solver, date_utc: datetime.datetime | None
+    picture: images.ViewedImage, solver: Solver, date_utc: datetime | None
 ) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
@@ -415,16 +416,14 @@ def solve_picture(
 
 
 def solve_again(
-    refused: list[SolvedReading], date_utc: datetime.datetime | None
+    refused: list[SolvedReading], date_utc: datetime | None
 ) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
         return None  # the camera is known with its saturation: its frames need no retries
-    by_rows: dict[bool, list[SolvedReading]] = {}
-    for refusal in refused:
-        by_rows.setdefault(refusal.hypothesis.flipped, []).append(refusal)
-    for readings in by_rows.values():
+    for flipped in dict.fromkeys(one.hypothesis.flipped for one in refused):
+        readings = [one for one in refused if one.hypothesis.flipped == flipped]
         pixels = readings[0].pixels
         settings = readings[0].hypothesis.solver.settings
         for retry in retries.retries(pixels, readings[0].report.centroids, settings):
@@ -435,9 +434,9 @@ def solve_again(
                     pixels, solver, date_utc, retry.centroids, retry.efforts
                 )
                 if report.attitude.solved:
-                    notes = [one.assumption] * bool(one.assumption) + [retry.note]
+                    notes = "; ".join(filter(None, (one.assumption, retry.note)))
                     return SolvedReading(
-                        one._replace(assumption="; ".join(notes)),
+                        one._replace(assumption=notes),
                         report,
                         tracker,
                         refused[0].tried,
@@ -472,19 +471,13 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     ]
 
 
-def outcome_fields(
-    outcome: SolvedReading, date_utc: datetime.datetime | None
-) -> dict[str, Any]:
+def outcome_fields(outcome: SolvedReading, date_utc: datetime | None) -> Record:
     """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
     (pixels, solver, assumption, _) = outcome.hypothesis
     height_px, width_px = pixels.shape
     solvers = {one.solver.fov_deg: one.solver for one in outcome.tried}.values()
-    seen = {
-        "status": report.attitude.status,
-        "lights": len(report.centroids),
-        "brightest_dn": float(pixels.max()),
-        "background_dn": float(np.median(pixels)),
+    seen = picture_fields(report, pixels) | {
         "tried_fov_deg": [one.tried_fov_deg(width_px, height_px) for one in solvers],
         "catalog_limit_mag": round(float(solver.stars.v_mag[-1]), 1),
     }

@@ -1,10 +1,12 @@
 """What a solved plate says: pointing, attitude, lens, matched stars; as fields, as a table, and as a FITS header."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog.catalog import StarCatalog
@@ -13,8 +15,11 @@ from estimator.core.types import Attitude, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
+from skysim.core.types import Floats, Record
 
 NOTED_STRETCH = 0.002  # relative to square pixels
+PIXEL_KEYS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
+STAR_KEYS = ("ra_deg", "dec_deg", "v_mag", *PIXEL_KEYS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ class PlateSolution:
     log10_chance: float | None = None
     matches: int = 0
     rms_arcsec: float | None = None
-    stars: tuple[dict[str, Any], ...] = ()
+    stars: tuple[Record, ...] = ()
     lights: int = 0
     brightest_dn: float | None = None
     background_dn: float | None = None
@@ -81,7 +86,26 @@ class PlateSolution:
     hint: str = ""
 
 
-def solution_fields(report: Report) -> dict[str, Any]:
+def picture_fields(report: Report, pixels: NDArray) -> Record:
+    """The status, the number of lights and the image statistics of a picture, solved or not."""
+    return {
+        "status": report.attitude.status,
+        "lights": len(report.centroids),
+        "brightest_dn": float(pixels.max()),
+        "background_dn": float(np.median(pixels)),
+    }
+
+
+def light_rows(names: Iterable[str], keys: Sequence[str], *columns: Floats) -> list[Record]:
+    """A row for each matched light: its name, and its numbers by their keys."""
+    rows = np.column_stack(columns).tolist()
+    return [
+        {"name": name} | dict(zip(keys, row, strict=True))
+        for name, row in zip(names, rows, strict=True)
+    ]
+
+
+def solution_fields(report: Report) -> Record:
     """Pointing of a solved image; the angles are those of the image center."""
     attitude = report.attitude
     assert attitude.cam_from_ref is not None
@@ -101,19 +125,19 @@ def solution_fields(report: Report) -> dict[str, Any]:
     }
 
 
-def attitude_fields(
-    report: Report, tracker: StarTracker, stars: StarCatalog
-) -> dict[str, Any]:
+def attitude_fields(report: Report, tracker: StarTracker, stars: StarCatalog) -> Record:
     """Attitude, covariance, lens and stars of a solved image. stars : the catalog of the tracker, at its epoch"""
     attitude = report.attitude
+    match = attitude.match
+    camera = attitude.camera
     assert attitude.cam_from_ref is not None
     assert attitude.covariance_rad2 is not None
-    assert attitude.match is not None
-    assert attitude.camera is not None
-    star = attitude.match.star
-    xy_px = report.centroids.xy_px[attitude.match.observed]
+    assert match is not None
+    assert camera is not None
+    star = match.star
+    xy_px = report.centroids.xy_px[match.observed]
     # Measured minus expected.
-    residual_px = xy_px - attitude.camera.pixels(
+    residual_px = xy_px - camera.pixels(
         attitude.cam_from_ref.apply(tracker.stars.vectors[star])
     )
     # The tracker's directions are apparent; the table has the catalog's.
@@ -121,29 +145,22 @@ def attitude_fields(
     x, y, z = stars.vectors[
         by_id[np.searchsorted(stars.id, tracker.stars.id[star], sorter=by_id)]
     ].T
-    columns = {
-        "name": map(star_name, tracker.stars.id[star].tolist()),
-        "ra_deg": (np.degrees(np.arctan2(y, x)) % 360).tolist(),
-        "dec_deg": np.degrees(np.arcsin(z)).tolist(),
-        "v_mag": tracker.stars.v_mag[star].tolist(),
-        "x_px": xy_px[:, 0].tolist(),
-        "y_px": xy_px[:, 1].tolist(),
-        "residual_x_px": residual_px[:, 0].tolist(),
-        "residual_y_px": residual_px[:, 1].tolist(),
-    }
+    sky = (
+        np.degrees(np.arctan2(y, x)) % 360,
+        np.degrees(np.arcsin(z)),
+        tracker.stars.v_mag[star],
+    )
+    names = map(star_name, tracker.stars.id[star].tolist())
     xyzw = attitude.cam_from_ref.as_quat(canonical=True)
     return {
         "cam_from_icrs_xyzw": tuple(xyzw.tolist()),
         "covariance_rad2": tuple(map(tuple, attitude.covariance_rad2.tolist())),
-        "focal_px": attitude.camera.focal_px,
-        "center_px": attitude.camera.center_px,
-        "distortion": attitude.camera.distortion,
-        "pixel_aspect": attitude.camera.aspect,
-        "log10_chance": attitude.match.log10_chance,
-        "stars": tuple(
-            dict(zip(columns, row, strict=True))
-            for row in zip(*columns.values(), strict=True)
-        ),
+        "focal_px": camera.focal_px,
+        "center_px": camera.center_px,
+        "distortion": camera.distortion,
+        "pixel_aspect": camera.aspect,
+        "log10_chance": match.log10_chance,
+        "stars": tuple(light_rows(names, STAR_KEYS, *sky, xy_px, residual_px)),
     }
 
 
@@ -205,7 +222,7 @@ def wcs_header(attitude: Attitude, flipped: bool) -> Any:
     return header
 
 
-def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
+def add_rates(results: list[Record], rate_hz: float | None) -> None:
     """Add to the results of one camera's images, in the order of time, `t_s` and the rate since the last solved one.
 
     The rate is the vector of the shortest rotation between the two, over their time, in camera axes.
@@ -227,7 +244,7 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
             "no date",
             "DATE-OBS in its header, or a frame rate",
         )
-    last: dict[str, Any] | None = None
+    last: Record | None = None
     for n, one in enumerate(results):
         if rate_hz is None:
             since = datetime.fromisoformat(dates[n]) - datetime.fromisoformat(dates[0])
@@ -251,12 +268,12 @@ def add_rates(results: list[dict[str, Any]], rate_hz: float | None) -> None:
         last = one
 
 
-def quaternion_of(result: dict[str, Any]) -> Any:
+def quaternion_of(result: Record) -> Any:
     """The camera's attitude in the sky or in a dome, None of a refusal."""
     return result["cam_from_lab_xyzw" if "leds" in result else "cam_from_icrs_xyzw"]
 
 
-def sequence_summary(results: list[dict[str, Any]]) -> str:
+def sequence_summary(results: list[Record]) -> str:
     """A sentence on a sequence: solved images, gaps, rate."""
     solved = [quaternion_of(one) is not None for one in results]
     edges = np.flatnonzero(np.diff([True, *solved, True]))

@@ -49,13 +49,7 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
             area_px = found.area_px[found.flag & NO_STAR == 0][:BRIGHTEST]
             if not len(area_px) or np.median(area_px) < MIN_AREA_PX:
                 continue
-            camera = camera_of(small)
-            yield (
-                factor,
-                enlarged(
-                    detect_and_centroid(small, camera, settings, Clock()), factor, settings
-                ),
-            )
+            yield factor, enlarged(centroids_of(small, settings), factor, settings)
         except ImageError:  # there are no lights, or thousands
             continue
 
@@ -84,9 +78,13 @@ def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids
     return out.take(out.sigma_px < MAX_SIGMA_PX)
 
 
-def camera_of(pixels: NDArray) -> Camera:
-    """A camera for the detection, which uses only its size."""
-    return Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)
+def centroids_of(
+    pixels: NDArray, settings: Settings, streak_px: tuple[float, float] | None = None
+) -> Centroids:
+    """The centroids of a picture, along a streak if one is given."""
+    # The detection uses only the camera's size.
+    camera = Camera.from_fov(pixels.shape[1], pixels.shape[0], 1.0)
+    return detect_and_centroid(pixels, camera, settings, Clock(), streak_px)
 
 
 EXTRA_TRIES = 1000
@@ -156,7 +154,6 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
     mean of n^2 pixels has n times the signal-to-noise ratio, so the trail is one piece there. With its streak the
     detector adds up the light along each trail in the original pixels.
     """
-    camera = camera_of(pixels)
     for factor in TRAIL_FACTORS:
         try:
             blobs = DETECTORS[settings.detector](
@@ -164,7 +161,7 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
             )
             x, y = factor * np.array(blobs.streak_px or ROUND)
             if hypot(x, y) >= MIN_TRAIL_PX:
-                yield detect_and_centroid(pixels, camera, settings, Clock(), (x, y))
+                yield centroids_of(pixels, settings, (x, y))
         except ImageError:
             continue
 
@@ -181,7 +178,7 @@ def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
     try:
         # The edges of trees add about as many lights as there are stars.
         more = replace(settings, max_blobs=2 * settings.max_blobs)
-        found = detect_and_centroid(flat, camera_of(pixels), more, Clock(), ROUND)
+        found = centroids_of(flat, more, ROUND)
         return replace(found, sigma_px=np.hypot(found.sigma_px, FLAT_SIGMA_PX))
     except ImageError:
         return Centroids.empty()

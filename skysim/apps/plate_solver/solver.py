@@ -13,7 +13,6 @@ as large (MARGIN_DEX). N includes the hypotheses about a picture (`picture.py`),
 
 from __future__ import annotations
 
-import datetime
 import functools
 import math
 import os
@@ -21,6 +20,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -41,6 +41,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
+from skysim.core.types import Bools
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -55,8 +56,11 @@ FOV_LIMITS_DEG = 1.0, 120.0
 CATALOG = CATALOGS / "gaia_v8.0.ecsv"
 PHOTOGRAPH = Settings(reject=NO_STAR)  # text and trees are no stars
 THREADS = min(os.cpu_count() or 1, 8)
-DEFAULT_EPOCH = datetime.datetime(2020, 1, 1, 12)
+DEFAULT_EPOCH = datetime(2020, 1, 1, 12)
 
+
+Circle = tuple[float, float, float]  # right ascension, declination and radius, degrees
+Solved = tuple[Attitude, StarTracker]  # an attitude and the tracker that found it, or refused
 
 # Limits of the horizontal fields of view that are searched if the field is unknown, and the one that is tried first.
 WIDEST_DEG = 100.0
@@ -155,12 +159,12 @@ class Solver:
     camera: KnownCamera | None
     stars: star_catalog.StarCatalog
     settings: Settings
-    time_utc: datetime.datetime | None = None
+    time_utc: datetime | None = None
     fov_uncertainty: float = FOV_UNCERTAINTY
     hypotheses: int = 1
     upper_half: bool = False
     size_px: tuple[int, int] | None = None
-    near_deg: tuple[float, float, float] | None = None
+    near_deg: Circle | None = None
     tracker_cache: dict[Any, dict[Any, StarTracker]] = field(
         default_factory=dict, compare=False, repr=False
     )
@@ -189,16 +193,15 @@ class Solver:
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
         cameras = self.candidate_cameras(width_px, height_px)
-        narrow_rad = min(
-            camera.zoomed(1 + uncertainty).fov_rad for camera, uncertainty in cameras
-        )
-        wide_rad = max(
-            camera.zoomed(1 - uncertainty).fov_rad for camera, uncertainty in cameras
-        )
-        return round(math.degrees(narrow_rad), 2), round(math.degrees(wide_rad), 2)
+        ends = [
+            round(math.degrees(camera.zoomed(1 + change).fov_rad), 2)
+            for camera, uncertainty in cameras
+            for change in (uncertainty, -uncertainty)
+        ]
+        return min(ends), max(ends)
 
     def trackers(
-        self, width_px: int, height_px: int, date_utc: datetime.datetime | None
+        self, width_px: int, height_px: int, date_utc: datetime | None
     ) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
 
@@ -225,13 +228,13 @@ class Solver:
             / (4 * math.pi)
         )
 
-    def vectors(self, date_utc: datetime.datetime | None) -> Floats:
+    def vectors(self, date_utc: datetime | None) -> Floats:
         """(N, 3) directions of the stars as seen from the Earth at a date, or at the default epoch."""
         if date_utc is None:
             return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
         return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
 
-    def within_reach(self, camera: Camera, vectors: Floats) -> NDArray[np.bool_]:
+    def within_reach(self, camera: Camera, vectors: Floats) -> Bools:
         """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
         if self.near_deg is None:
             return np.ones(len(vectors), bool)
@@ -262,11 +265,11 @@ class Solver:
 def make_solver(
     fov_deg: float | None,
     camera_file: Path | None,
-    time_utc: datetime.datetime | None = None,
+    time_utc: datetime | None = None,
     stages: Mapping[str, str] | None = None,
     catalog: str | None = None,
     size_px: tuple[int, int] | None = None,
-    near_deg: tuple[float, float, float] | None = None,
+    near_deg: Circle | None = None,
 ) -> Solver:
     """Build a Solver from user input. Raises InputError with one line.
 
@@ -310,7 +313,7 @@ def make_solver(
 @functools.lru_cache(maxsize=1)
 def kept_solver(
     fov_deg: float | None,
-    time_utc: datetime.datetime | None = None,
+    time_utc: datetime | None = None,
     stages: tuple[tuple[str, str], ...] = (),
 ) -> Solver:
     """The solver of `make_solver` with the shipped catalog, cached with its trackers for the next picture.
@@ -388,9 +391,7 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
         ) from None
 
 
-def validated_date(
-    date_utc: datetime.datetime | None,
-) -> tuple[datetime.datetime | None, str]:
+def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
     """Return (date in UTC, ""), or (None, reason) for a date outside the supported range; (None, "") without a date."""
     try:
         return (check_year(date_utc) if date_utc else None), ""
@@ -401,7 +402,7 @@ def validated_date(
 def solve_array(
     image: NDArray,
     solver: Solver,
-    date_utc: datetime.datetime | None,
+    date_utc: datetime | None,
     centroids: Centroids | None = None,
     efforts: int | None = None,
 ) -> tuple[Report, StarTracker]:
@@ -434,10 +435,10 @@ def solve_centroids(
     centroids: Centroids,
     solver: Solver,
     size_px: tuple[int, int],
-    date_utc: datetime.datetime | None,
+    date_utc: datetime | None,
     clock: Clock,
     efforts: int | None = None,
-) -> tuple[Attitude, StarTracker]:
+) -> Solved:
     """Solve the centroids of an image of (width, height) with every tracker of the solver, as `solve_array`.
 
     Parameters
@@ -470,13 +471,13 @@ def best_attitude(
     clock: Clock,
     effort: int,
     tries: int,
-) -> tuple[Attitude, StarTracker]:
+) -> Solved:
     """Return the most significant attitude among those of trackers with different fields of view, and its tracker.
 
     The accepted probability of chance is divided by the number of tries. The best attitude must also beat every
     different attitude by `margin_dex`; otherwise the result is NO_MATCH.
     """
-    solutions: list[tuple[Attitude, StarTracker]] = []
+    solutions: list[Solved] = []
     for attitude, tracker in attitudes(centroids, trackers, effort):
         clock.lap("identify")
         if attitude.log10_chance <= DECISIVE_LOG10_CHANCE:
@@ -502,7 +503,7 @@ def best_attitude(
 
 def attitudes(
     centroids: Centroids, trackers: Iterator[StarTracker], effort: int
-) -> Iterator[tuple[Attitude, StarTracker]]:
+) -> Iterator[Solved]:
     """Yield the attitudes of trackers in their order. THREADS of them solve at once: compiled code holds no GIL."""
     pool = ThreadPoolExecutor(THREADS)
     running: deque[tuple[Future[Attitude], StarTracker]] = deque()

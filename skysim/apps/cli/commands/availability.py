@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Option
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, load
 from skysim.apps.cli.terminal import print_json, progress_callback
@@ -16,9 +16,7 @@ from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from skysim.core.types import Bools
     from skysim.scene.scene import Scene
     from skysim.scene.sections.surroundings import ExclusionConfig
     from skysim.sources.orbit_availability import Pointing, SkySamples
@@ -30,23 +28,23 @@ def availability(
     scene: SceneArg,
     law: Annotated[
         Literal["inertial", "zenith"],
-        typer.Option(help="inertial: toward motion.start; zenith: at --off-deg from it."),
+        Option(help="inertial: toward motion.start; zenith: at --off-deg from it."),
     ] = "inertial",
     off_deg: Annotated[
-        float, typer.Option(help="Angle of the boresight from the zenith, 180 is nadir.")
+        float, Option(help="Angle of the boresight from the zenith, 180 is nadir.")
     ] = 0.0,
     around_deg: Annotated[
-        float, typer.Option(help="Its azimuth from the flight direction, left positive.")
+        float, Option(help="Its azimuth from the flight direction, left positive.")
     ] = 0.0,
     span: Annotated[
-        Literal["orbit", "day", "year"], typer.Option(help="From the scene's start_time.")
+        Literal["orbit", "day", "year"], Option(help="From the scene's start_time.")
     ] = "orbit",
     samples: Annotated[
-        int, typer.Option(min=10, max=10_000_000, help="Times that are computed.")
+        int, Option(min=10, max=10_000_000, help="Times that are computed.")
     ] = 20_000,
     overrides: Overrides = None,
     picture: Annotated[
-        Path | None, typer.Option(help="Also write a picture (.png) of the angles over time.")
+        Path | None, Option(help="Also write a picture (.png) of the angles over time.")
     ] = None,
     json: Json = False,
 ) -> None:
@@ -155,10 +153,7 @@ def computed(
 
 
 def write_picture(
-    path: Path,
-    found: SkySamples,
-    exclusion: ExclusionConfig,
-    available: NDArray[np.bool_],
+    path: Path, found: SkySamples, exclusion: ExclusionConfig, available: Bools
 ) -> None:
     """The angles over time with their limits, and the times at which the tracker is available."""
     from skysim.core.files import write_bytes

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import inspect
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 from typer.core import TyperGroup
 
 from skysim.apps.cli.options import (
@@ -22,10 +22,12 @@ from skysim.apps.cli.options import (
 from skysim.apps.cli.terminal import print_error, print_json, print_list
 from skysim.core.errors import InputError, printable, unknown_name
 from skysim.core.paths import DATA, shipped_files
-from skysim.results.report import terminal_width
+from skysim.results.report import print_wrapped, terminal_width
+from skysim.scene import camera_sheet
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, QUESTIONS
 
 if TYPE_CHECKING:
+    from skysim.core.types import Record
     from skysim.scene.opencv_calibration import OpencvCalibration
     from skysim.scene.sections.camera import CameraConfig
 
@@ -102,7 +104,7 @@ def preset_entry(path: Path) -> dict[str, str]:
 def camera_show(
     file: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="FILE",
             help="Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.",
             autocompletion=complete_camera,
@@ -110,9 +112,7 @@ def camera_show(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Also write the calibration to this file, in OpenCV's YAML format."
-        ),
+        Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
     ] = None,
     set_: Overrides = None,
     json: Json = False,
@@ -133,7 +133,7 @@ def camera_show(
     if lens is not None and out:
         write_file(out, opencv_calibration.text(lens))
     if json:
-        known: dict[str, Any] = {"width_px": chip.width_px, "height_px": chip.height_px}
+        known: Record = {"width_px": chip.width_px, "height_px": chip.height_px}
         if lens:
             known |= dataclasses.asdict(lens)
             known |= {"field_deg": lens.field_deg, "arcsec_px": lens.arcsec_px}
@@ -201,7 +201,7 @@ def asking(command: Callable[..., None]) -> Callable[..., None]:
             default=None,
             annotation=Annotated[
                 str | None,
-                typer.Option(
+                Option(
                     OPTIONS[f"answers.{name}"],
                     metavar="TEXT",
                     help=f"{question.ask}: {question.where}.",
@@ -220,12 +220,11 @@ def asking(command: Callable[..., None]) -> Callable[..., None]:
 def camera_new(
     *,
     name: Annotated[
-        str,
-        typer.Option(help="Name of camera, lens and data sheets, for the file's first line."),
+        str, Option(help="Name of camera, lens and data sheets, for the file's first line.")
     ] = "",
-    out: Annotated[
-        Path, typer.Option(help="The file to write, for the key camera.preset.")
-    ] = Path("camera.yaml"),
+    out: Annotated[Path, Option(help="The file to write, for the key camera.preset.")] = Path(
+        "camera.yaml"
+    ),
     json: Json = False,
     **answers: str | None,
 ) -> None:
@@ -233,8 +232,6 @@ def camera_new(
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
     """
-    from skysim.scene import camera_sheet
-
     if out.suffix not in (".yaml", ".yml") or out.exists():
         raise InputError(
             f"--out {out}", "exists" if out.exists() else "no .yaml file", "a new .yaml file"
@@ -253,23 +250,13 @@ def camera_new(
     width = min(max(terminal_width(), 40), 100)
     for one in filled.missing:
         name = one.name.replace("_", " ")
-        line = f"{name:19s}{one.assumed or 'left out'}: {one.consequence}"
-        print(
-            textwrap.fill(
-                line,
-                width,
-                initial_indent="  ",
-                subsequent_indent=" " * 21,
-                break_on_hyphens=False,
-            )
-        )
+        line = f"{one.assumed or 'left out'}: {one.consequence}"
+        print_wrapped(line, f"  {name:19s}", " " * 21, width)
     print(f"in a scene: camera: {{preset: {out}}}; skysim camera {out} shows it")
 
 
 def ask_all() -> dict[str, str]:
     """Ask for each number of the data sheet. A wrong answer is asked again; an empty one leaves the number out."""
-    from skysim.scene import camera_sheet
-
     print(
         "Numbers of the data sheets of camera and lens, with their units. Press Enter for what is not stated."
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Option
 
 from skysim.apps.cli.commands.study import (
     EngineName,
@@ -17,37 +18,31 @@ from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
 OutputUrl = Annotated[
-    str,
-    typer.Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder."),
+    str, Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
 ]
 Variations = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         metavar="FILE",
         help="Variations: YAML with the study's keys set, trial, factors, hardware.",
     ),
 ]
 Formats = Annotated[
     list[str] | None,
-    typer.Option(
-        "--to",
-        help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.",
-    ),
+    Option(help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."),
 ]
 
 
 def dataset(
     scene: SceneArg,
-    frames: Annotated[int, typer.Option(help="Number of frames.")],
+    frames: Annotated[int, Option(help="Number of frames.")],
     out: OutputUrl,
     vary: Variations = None,
     to: Formats = None,
-    shard_frames: Annotated[int, typer.Option(help="Frames of a shard.")] = 64,
+    shard_frames: Annotated[int, Option(help="Frames of a shard.")] = 64,
     compress: Annotated[
         bool,
-        typer.Option(
-            "--compress", help="Compress the images of the tars: .npz in place of .npy."
-        ),
+        Option("--compress", help="Compress the images of the tars: .npz in place of .npy."),
     ] = False,
     seed: Seed = None,
     set_: Overrides = None,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Option
 
 from skysim.apps.cli.commands.study import Workers
 from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
@@ -21,33 +22,31 @@ if TYPE_CHECKING:
 
 
 Quick = Annotated[
-    bool, typer.Option("--quick", help="Smaller experiments; the intervals are wider.")
+    bool, Option("--quick", help="Smaller experiments; the intervals are wider.")
 ]
 FieldCount = Annotated[
     int | None,
-    typer.Option(
-        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.",
+    Option(
+        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more."
     ),
 ]
-Folder = Annotated[
-    Path | None, typer.Option(help="Output folder; default: out/NAME_datasheet.")
-]
+Folder = Annotated[Path | None, Option(help="Output folder; default: out/NAME_datasheet.")]
 Rates = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Rates to measure, such as 0,1,2,5, deg/s; by default doubled until fewer than half of the fields"
         " are solved."
     ),
 ]
 ModelFolder = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
     ),
 ]
 AsFmu = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--fmu",
         help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
     ),
@@ -63,7 +62,7 @@ def datasheet(
     set_: Overrides = None,
     workers: Workers = None,
     out: Folder = None,
-    markdown: Annotated[Path | None, typer.Option(help="Also write a Markdown page.")] = None,
+    markdown: Annotated[Path | None, Option(help="Also write a Markdown page.")] = None,
     model: ModelFolder = None,
     fmu: AsFmu = False,
     open_: OpenReport = False,

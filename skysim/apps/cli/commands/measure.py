@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
+from typer import Option
 
 from skysim.apps.cli.commands.camera import complete_camera
 from skysim.apps.cli.options import (
@@ -23,6 +23,7 @@ from skysim.core.errors import InputError
 from skysim.results.report import print_wrapped
 
 if TYPE_CHECKING:
+    from skysim.core.types import Record
     from skysim.experiments.balance_flight import Uncertainty
     from skysim.experiments.balance_procedure import BalancePlan, Iteration
     from skysim.results.report import Report
@@ -31,54 +32,43 @@ if TYPE_CHECKING:
 
 ExcitedBy = Annotated[
     Literal["wheels", "swing"],
-    typer.Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
+    Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
 ]
 EstimateOnly = Annotated[
-    bool, typer.Option("--estimate-only", help="Estimate from one flight; move nothing.")
+    bool, Option("--estimate-only", help="Estimate from one flight; move nothing.")
 ]
-Tilt = Annotated[
-    float, typer.Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")
-]
+Tilt = Annotated[float, Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")]
 Longer = Annotated[
-    float, typer.Option(min=0.1, max=100, help="Length of a flight, times the usual one.")
+    float, Option(min=0.1, max=100, help="Length of a flight, times the usual one.")
 ]
 Torque = Annotated[
-    str, typer.Option(help="Residual gravity torque at which the vehicle is balanced.")
+    str, Option(help="Residual gravity torque at which the vehicle is balanced.")
 ]
-Flights = Annotated[
-    int | None, typer.Option(min=1, max=50, help="Flights at most; default: 6.")
-]
+Flights = Annotated[int | None, Option(min=1, max=50, help="Flights at most; default: 6.")]
 InertiaBar = Annotated[
     float,
-    typer.Option(
-        min=0.01, help="Standard deviation that moments of inertia must reach, percent."
-    ),
+    Option(min=0.01, help="Standard deviation that moments of inertia must reach, percent."),
 ]
 OffsetBar = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Standard deviation that the offset must reach; default: half of the torque over weight."
     ),
 ]
 InFlight = Annotated[
-    bool,
-    typer.Option("--in-flight", help="Also run the filter in flight over the last flight."),
+    bool, Option("--in-flight", help="Also run the filter in flight over the last flight.")
 ]
 # The errors of the onboard model before the first flight.
-InertiaSigma = Annotated[
-    str, typer.Option(help="Standard error of the assumed inertia, a share.")
-]
+InertiaSigma = Annotated[str, Option(help="Standard error of the assumed inertia, a share.")]
 OffsetSigma = Annotated[
-    str, typer.Option(help="Standard error of the assumed balance, along each axis.")
+    str, Option(help="Standard error of the assumed balance, along each axis.")
 ]
 WheelSigma = Annotated[
-    str, typer.Option(help="Standard error of a wheel's assumed inertia, a share.")
+    str, Option(help="Standard error of a wheel's assumed inertia, a share.")
 ]
-MountSigma = Annotated[
-    str, typer.Option(help="Standard error of the tracker's axes in the body.")
-]
+MountSigma = Annotated[str, Option(help="Standard error of the tracker's axes in the body.")]
 TachoSigma = Annotated[
-    float, typer.Option(help="Standard error of a reading of a wheel's speed, rpm.")
+    float, Option(help="Standard error of a reading of a wheel's speed, rpm.")
 ]
 
 
@@ -166,7 +156,7 @@ def fly(
     return flown
 
 
-def print_report(statistics: dict[str, Any], report: Report, json: bool) -> None:
+def print_report(statistics: Record, report: Report, json: bool) -> None:
     """Print a report and its path, or the statistics as JSON."""
     if json:
         print_json(statistics)
@@ -179,13 +169,11 @@ def calibrate(
     scene: SceneArg,
     images: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder of images with attitudes.csv of the IMU, in place of a flight."
-        ),
+        Option(help="Folder of images with attitudes.csv of the IMU, in place of a flight."),
     ] = None,
     clicks: Annotated[
         int,
-        typer.Option(
+        Option(
             min=0,
             help="LED spacings that set the scale in the first frame; 0 keeps the focal length.",
         ),
@@ -217,33 +205,31 @@ def calibrate(
 def characterize(
     camera: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Preset, camera file or scene: what frames do not tell, such as size, pixel pitch and bits.",
             autocompletion=complete_camera,
         ),
     ],
     darks: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Folder of darks, of two exposures or more; required without --frames-to."
         ),
     ] = None,
     flats: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Folder of flats: pairs at exposures up to saturation; required without --frames-to."
         ),
     ] = None,
     night: Annotated[
-        Path | None, typer.Option(help="Folder of frames of the night sky, stars at rest.")
+        Path | None, Option(help="Folder of frames of the night sky, stars at rest.")
     ] = None,
     frames_to: Annotated[
         Path | None,
-        typer.Option(
-            help="Measure nothing: write the darks and flats of --camera, simulated."
-        ),
+        Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
+    seed: Annotated[int, Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
     out: Out = None,
     json: Json = False,
 ) -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from skysim.apps.cli.options import Json, OpenReport
 from skysim.apps.cli.terminal import print_json, print_list, progress_callback
@@ -14,20 +15,18 @@ from skysim.results.report import page_path, print_blocks
 def reproduce(
     ids: Annotated[
         list[str] | None,
-        typer.Argument(metavar="ID|all", help="Experiments, or all; default: list them."),
+        Argument(metavar="ID|all", help="Experiments, or all; default: list them."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Run fewer trials; the intervals are wider.")
+        bool, Option("--quick", help="Run fewer trials; the intervals are wider.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of all random streams.")] = 1,
+    seed: Annotated[int, Option(help="Seed of all random streams.")] = 1,
     report: Annotated[
-        bool,
-        typer.Option("--report", help="Also write an HTML page with the papers' figures."),
+        bool, Option("--report", help="Also write an HTML page with the papers' figures.")
     ] = False,
-    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/reproduce"),
+    out: Annotated[Path, Option(help="Folder for the report.")] = Path("out/reproduce"),
     markdown: Annotated[
-        Path | None,
-        typer.Option(help="Also write a Markdown page with its images beside it."),
+        Path | None, Option(help="Also write a Markdown page with its images beside it.")
     ] = None,
     open_: OpenReport = False,
     json: Json = False,

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
@@ -49,13 +50,13 @@ def scenes_export(
     scene: SceneArg,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Output file, .xml; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj; default: out/SCENE.xml."
         ),
     ] = None,
     paper: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page)."
         ),
     ] = "a4",
@@ -101,12 +102,12 @@ def scenes_parts(
     scene: SceneArg,
     prices: Annotated[
         str,
-        typer.Option(
+        Option(
             metavar="FILE",
             help="Table of prices (.csv); `assumed` is the one that comes along.",
         ),
     ] = "assumed",
-    out: Annotated[Path | None, typer.Option(help="Also write the list as CSV.")] = None,
+    out: Annotated[Path | None, Option(help="Also write the list as CSV.")] = None,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
@@ -141,16 +142,16 @@ def scenes_parts(
 def new(
     kind: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="KIND",
             help=f"What to begin: {', '.join(KINDS)}.",
             autocompletion=lambda: list(KINDS),
         ),
     ],
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Name of the new file, without its ending.")
+        str, Argument(metavar="NAME", help="Name of the new file, without its ending.")
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the new file.")] = Path(),
+    out: Annotated[Path, Option(help="Folder of the new file.")] = Path(),
 ) -> None:
     """Begin a scene, vehicle, camera, study, controller or tracker: write a commented file that runs as it is.
 
@@ -180,18 +181,13 @@ def new(
 
 def export(
     folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`."),
+        Path, Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
     ],
     to: Annotated[
         list[str],
-        typer.Option(
-            "--to",
-            metavar="FORMAT",
-            help="aem, ecsv, parquet, tiff, zarr or video; repeatable.",
-        ),
+        Option(metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
     ],
-    out: Annotated[Path | None, typer.Option(help="Output folder; default: FOLDER.")] = None,
+    out: Annotated[Path | None, Option(help="Output folder; default: FOLDER.")] = None,
     json: Json = False,
 ) -> None:
     """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""

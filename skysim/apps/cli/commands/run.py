@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -34,7 +34,7 @@ from skysim.apps.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from skysim.core.types import FrameRow
+    from skysim.core.types import FrameRow, Record
     from skysim.results.report import Report
     from skysim.scene.scene import Scene
     from skysim.simulation.checks import Check
@@ -96,11 +96,11 @@ def run(
 
 def print_results(
     scene: Scene,
-    finished: list[tuple[dict[str, Any], Report]],
+    finished: list[tuple[Record, Report]],
     rows: list[FrameRow],
     plan: Check,
     json: bool,
-) -> dict[str, Any]:
+) -> Record:
     """Print the results of the main camera and of the further heads; return the main camera's statistics."""
     from skysim.results.report_blocks import Facts
     from skysim.simulation.checks.facts import TRACKER_KNOWS

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from skysim.apps.cli.options import (
     Centroider,
@@ -24,13 +25,14 @@ from skysim.core.errors import InputError
 if TYPE_CHECKING:
     from skysim.apps.plate_solver import DomeSolver, Outputs, Solver
     from skysim.core.images import ViewedImage
+    from skysim.core.types import Record
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
 Images = Annotated[
     list[Path] | None,
-    typer.Argument(
+    Argument(
         metavar="IMAGES",
         help="Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:"
         " x_px, y_px, flux).",
@@ -38,82 +40,74 @@ Images = Annotated[
 ]
 Fov = Annotated[
     float | None,
-    typer.Option(
+    Option(
         help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."
     ),
 ]
 CameraFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration."
     ),
 ]
 Dome = Annotated[
     str | None,
-    typer.Option(
-        help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."
-    ),
+    Option(help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."),
 ]
 MapFile = Annotated[
     Path | None,
-    typer.Option(
-        "--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."
-    ),
+    Option("--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."),
 ]
 Live = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Also solve a frame of a live camera: its index, a video file or an address."
     ),
 ]
 Time = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."
     ),
 ]
 Catalog = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."
     ),
 ]
 Near = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="RA,DEC,DEG",
         help="Circle of the sky in which the image center is sought, in degrees.",
     ),
 ]
 Size = Annotated[
     str | None,
-    typer.Option(metavar="WxH", help="Size of the picture of a list of lights, in pixels."),
+    Option(metavar="WxH", help="Size of the picture of a list of lights, in pixels."),
 ]
 WcsTo = Annotated[
-    Path | None,
-    typer.Option(help="Also write the FITS header (TAN-SIP) of one image here."),
+    Path | None, Option(help="Also write the FITS header (TAN-SIP) of one image here.")
 ]
 TableTo = Annotated[
     Path | None,
-    typer.Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
+    Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
 ]
 AnnotateTo = Annotated[
-    Path | None,
-    typer.Option(help="File of the annotated image of one image, in place of OUT's."),
+    Path | None, Option(help="File of the annotated image of one image, in place of OUT's.")
 ]
 Sequence = Annotated[
     bool,
-    typer.Option(
+    Option(
         help="The images are one camera's in the order of time: also print rates and gaps."
     ),
 ]
 Rate = Annotated[
     float | None,
-    typer.Option(
-        help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."
-    ),
+    Option(help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."),
 ]
-Folder = Annotated[Path, typer.Option(help="Folder for the annotated images.")]
+Folder = Annotated[Path, Option(help="Folder for the annotated images.")]
 
 
 def solve(
@@ -174,7 +168,7 @@ def solve(
 
 
 def solver_of(
-    sky: dict[str, Any], dome: str | None, map_: Path | None, stages: dict[str, str]
+    sky: Record, dome: str | None, map_: Path | None, stages: dict[str, str]
 ) -> Solver | DomeSolver:
     """The solver of the images; `sky` has the options that have no effect with a dome, by name. Raises InputError."""
     from skysim.apps import plate_solver
@@ -237,12 +231,8 @@ def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) ->
 
 
 def solve_all(
-    paths: list[Path],
-    solver: Solver | DomeSolver,
-    chosen: Outputs,
-    out: Path,
-    quiet: bool,
-) -> tuple[list[dict[str, Any]], list[str], bool]:
+    paths: list[Path], solver: Solver | DomeSolver, chosen: Outputs, out: Path, quiet: bool
+) -> tuple[list[Record], list[str], bool]:
     """Solve the images. Returns their results, warnings followed by errors, and whether all images could be read."""
     from skysim.apps import plate_solver
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from skysim.apps.cli.options import Json, write_file
 from skysim.apps.cli.terminal import print_catalog, print_json
@@ -16,35 +17,28 @@ if TYPE_CHECKING:
     from estimator.catalog.published_catalogs import OnBoard
 
 app = typer.Typer(
-    no_args_is_help=True,
-    help="Build, inspect, select and convert star catalogs.",
+    no_args_is_help=True, help="Build, inspect, select and convert star catalogs."
 )
-Source = Annotated[
-    str, typer.Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")
-]
-Limit = Annotated[
-    float | None, typer.Option(metavar="V", help="A visual magnitude; see above.")
-]
-CatFile = Annotated[Path, typer.Option("--out", help="Output file, .cat.")]
+Source = Annotated[str, Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")]
+Limit = Annotated[float | None, Option(metavar="V", help="A visual magnitude; see above.")]
+CatFile = Annotated[Path, Option(help="Output file, .cat.")]
 
 
 @app.command("build")
 def catalog_build(
     source: Annotated[
         Literal["hipparcos", "gaia"],
-        typer.Option(
+        Option(
             help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."
         ),
     ] = "hipparcos",
     limit: Annotated[
         float | None,
-        typer.Option(
-            help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."
-        ),
+        Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs."
         ),
     ] = None,
@@ -65,7 +59,7 @@ def catalog_build(
 @app.command("info")
 def catalog_info(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Name or file of a catalog.")
+        str, Argument(metavar="NAME", help="Name or file of a catalog.")
     ] = "gaia_v8.0",
     json: Json = False,
 ) -> None:
@@ -85,10 +79,10 @@ def catalog_select(
     source: Source,
     rule: Annotated[
         Literal["uniform", "asymmetric", "chosen"],
-        typer.Option(help="Evenly spread; a limit for each hemisphere; both."),
+        Option(help="Evenly spread; a limit for each hemisphere; both."),
     ],
-    out: Annotated[Path, typer.Option("--out", help="Output file, .ecsv.")],
-    count: Annotated[int | None, typer.Option(min=1, help="Number of stars; 2023.")] = None,
+    out: Annotated[Path, Option(help="Output file, .ecsv.")],
+    count: Annotated[int | None, Option(min=1, help="Number of stars; 2023.")] = None,
     bright: Limit = None,
     faintest: Limit = None,
     north: Limit = None,
@@ -134,18 +128,14 @@ def catalog_select(
 def catalog_readcat(
     source: Source,
     out: CatFile,
-    limit: Annotated[
-        float, typer.Option(metavar="V", help="Faintest visual magnitude.")
-    ] = 6.0,
+    limit: Annotated[float, Option(metavar="V", help="Faintest visual magnitude.")] = 6.0,
     epoch: Annotated[
         float | None,
-        typer.Option(
-            metavar="YEAR", help="Mean epoch of the mission; the file's if left out."
-        ),
+        Option(metavar="YEAR", help="Mean epoch of the mission; the file's if left out."),
     ] = None,
     color: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
+        Option(
             metavar="C BV VI", help="Instrumental magnitude: V + C + BV (B-V) + VI (V-I)."
         ),
     ] = None,
@@ -163,10 +153,10 @@ def catalog_readcat(
 
 @app.command("proc-cat")
 def catalog_proc_cat(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="A file of readcat.")],
+    source: Annotated[Path, Argument(metavar="FILE", help="A file of readcat.")],
     out: CatFile,
     closer: Annotated[
-        float, typer.Option(metavar="ARCSEC", min=0, help="Merge stars closer than this.")
+        float, Option(metavar="ARCSEC", min=0, help="Merge stars closer than this.")
     ] = 60.0,
     json: Json = False,
 ) -> None:

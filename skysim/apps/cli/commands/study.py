@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
+from typer import Argument, Option
 
 from skysim.apps.cli.options import (
     Json,
@@ -35,6 +36,7 @@ from skysim.apps.cli.terminal import (
 from skysim.core.errors import InputError, printable, unknown_name
 
 if TYPE_CHECKING:
+    from skysim.core.types import Record
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
@@ -46,22 +48,17 @@ app = typer.Typer(
 
 StudyArg = Annotated[
     str,
-    typer.Argument(
+    Argument(
         metavar="STUDY",
         help="Study file (.yaml), or name of a shipped study; once it has run, its output folder too.",
         autocompletion=complete_study,
     ),
 ]
 Workers = Annotated[
-    int | None,
-    typer.Option(min=1, help="Number of worker processes; default: number of cores."),
+    int | None, Option(min=1, help="Number of worker processes; default: number of cores.")
 ]
-EngineName = Annotated[
-    str, typer.Option("--engine", help="How trials are run: pool, serial or dask.")
-]
-Scheduler = Annotated[
-    str, typer.Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")
-]
+EngineName = Annotated[str, Option(help="How trials are run: pool, serial or dask.")]
+Scheduler = Annotated[str, Option(help="Address of the Dask scheduler, tcp://HOST:PORT.")]
 
 
 @app.callback()
@@ -114,9 +111,7 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[
-        bool, typer.Option("--failed", help="Repeat failed trials too.")
-    ] = False,
+    failed: Annotated[bool, Option("--failed", help="Repeat failed trials too.")] = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
@@ -130,14 +125,7 @@ def resume(
     place, plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
     trial_engine = create_engine(engine, workers, scheduler)
     run_and_report(
-        plan,
-        place,
-        trial_engine,
-        overrides,
-        json,
-        open_,
-        resumed=True,
-        repeat_failed=failed,
+        plan, place, trial_engine, overrides, json, open_, resumed=True, repeat_failed=failed
     )
 
 
@@ -172,7 +160,7 @@ def export(
     study: StudyArg,
     to: Annotated[
         list[Path],
-        typer.Argument(
+        Argument(
             metavar="FILES",
             help="Output files: .csv or .parquet (a row per trial), .zarr (the responses).",
         ),
@@ -194,14 +182,12 @@ def replay(
     study: StudyArg,
     trial: Annotated[
         int,
-        typer.Argument(
+        Argument(
             metavar="TRIAL", help="Number of the trial, as in the report and in `status`."
         ),
     ],
     out: Out = None,
-    show: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the first image.")
-    ] = False,
+    show: Annotated[bool, Option("--open/--no-open", help="Open the first image.")] = False,
     scene_3d: Scene3d = False,
     program: Programs = None,
     json: Json = False,
@@ -215,7 +201,7 @@ def replay(
     with place.open() as stored:
         repeated = runner.replay(plan, stored, trial, folder, draw)
     row = repeated.row
-    result: dict[str, Any] = {
+    result: Record = {
         "trial": trial,
         "point": row.point,
         "replicate": row.replicate,
@@ -240,18 +226,18 @@ def worst(
     study: StudyArg,
     response: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response."
         ),
     ] = "",
     where: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="FACTOR=LEVEL",
             help="Only points at this level; may be given several times.",
         ),
     ] = None,
-    count: Annotated[int, typer.Option(min=1, max=100, help="Number of attitudes.")] = 3,
+    count: Annotated[int, Option(min=1, max=100, help="Number of attitudes.")] = 3,
     out: Out = None,
     json: Json = False,
 ) -> None:

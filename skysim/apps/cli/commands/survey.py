@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Option
 
 from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
 from skysim.apps.cli.terminal import print_json
@@ -16,33 +16,33 @@ CHECKS = 40
 
 FrameCount = Annotated[
     int | None,
-    typer.Option(
+    Option(
         min=2,
         help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
 PlanOnly = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--plan",
         help="Print the attitudes to hold and the predicted errors; simulate nothing.",
     ),
 ]
 Images = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."
     ),
 ]
 CameraFile = Annotated[
     Path | None,
-    typer.Option(
+    Option(
         help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."
     ),
 ]
 Watch = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--watch",
         help="With --images: follow the folder while the images are taken, and print which LEDs are measured and which"
         " attitudes to hold next; after the last one, or Ctrl-C, survey.",
@@ -50,41 +50,37 @@ Watch = Annotated[
 ]
 Repeat = Annotated[
     int | None,
-    typer.Option(
+    Option(
         min=2, help="Simulate so many surveys, and compare their errors with the prediction."
     ),
 ]
 AttitudesBy = Annotated[
     Literal["plan", "random"] | None,
-    typer.Option(help="Attitudes: by the plan (default), or random."),
+    Option(help="Attitudes: by the plan (default), or random."),
 ]
 Next = Annotated[
     int | None,
-    typer.Option(
-        "--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."
-    ),
+    Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
 ]
 FramesTo = Annotated[
     Path | None,
-    typer.Option(help="Write the simulated frames and attitudes to a folder, for --images."),
+    Option(help="Write the simulated frames and attitudes to a folder, for --images."),
 ]
-Tilt = Annotated[float, typer.Option(help="Maximum tilt of the attitudes, degrees.")]
+Tilt = Annotated[float, Option(help="Maximum tilt of the attitudes, degrees.")]
 ImuSigma = Annotated[
-    str, typer.Option(help="Standard error of the IMU's attitude about each axis.")
+    str, Option(help="Standard error of the IMU's attitude about each axis.")
 ]
 LedSigma = Annotated[
-    str, typer.Option(help="Standard error of an LED's assumed position along each axis.")
+    str, Option(help="Standard error of an LED's assumed position along each axis.")
 ]
-LeverSigma = Annotated[
-    str, typer.Option(help="Standard error of the camera's assumed position.")
-]
-FocalError = Annotated[str, typer.Option(help="Standard error of the assumed focal length.")]
+LeverSigma = Annotated[str, Option(help="Standard error of the camera's assumed position.")]
+FocalError = Annotated[str, Option(help="Standard error of the assumed focal length.")]
 Distortion = Annotated[
-    bool, typer.Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
+    bool, Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
 ]
 Checks = Annotated[
     int | None,
-    typer.Option(
+    Option(
         min=1,
         help=f"Further attitudes at which the tracker is tested before and after; default: {CHECKS}.",
     ),

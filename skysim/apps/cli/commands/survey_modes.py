@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from estimator.trackers.pipeline import Settings
 from skysim.apps.cli.options import command_line
@@ -12,6 +11,7 @@ from skysim.apps.cli.terminal import print_error, progress, progress_callback
 from skysim.apps.plate_solver import read_camera
 from skysim.core import files
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
@@ -61,13 +61,13 @@ def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.H
     )
 
 
-def plan_only(request: Request) -> dict[str, Any]:
+def plan_only(request: Request) -> Record:
     """Return the attitudes of a plan and the predicted errors; print them."""
 
     _, _, plan = planned(request)
     path = files.make_folder(request.folder) / "plan.csv"
     survey_procedure.write_plan(path, plan)
-    result: dict[str, Any] = {
+    result: Record = {
         "scene": request.scene.name,
         "attitudes": survey_findings.stop_rows(plan.lab_from_body, plan.shown),
         "leds": plan.shown.shape[1],
@@ -112,7 +112,7 @@ def plan_only(request: Request) -> dict[str, Any]:
     return result
 
 
-def repeated(request: Request, repeat: int) -> dict[str, Any]:
+def repeated(request: Request, repeat: int) -> Record:
     """Return the predicted errors beside those of simulated surveys; print them."""
 
     lab, _, plan = planned(request)
@@ -122,7 +122,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     failures = [one for one in results if isinstance(one, InputError)]
     if not errors:
         raise failures[0]
-    result: dict[str, Any] = {
+    result: Record = {
         "scene": request.scene.name,
         "frames": len(plan.shown),
         "surveys": repeat,
@@ -153,7 +153,7 @@ def repeated(request: Request, repeat: int) -> dict[str, Any]:
     return result
 
 
-def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str, Any]:
+def simulated(request: Request, checks: int, frames_to: Path | None) -> Record:
     """A simulated survey, compared with the truth."""
 
     lab, before, plan = planned(request)
@@ -187,9 +187,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> dict[str
     return write_report(request, run, statistics | {"frames": count, "predicted": predicted})
 
 
-def from_images(
-    request: Request, images: Path, camera_file: Path, watch: bool
-) -> dict[str, Any]:
+def from_images(request: Request, images: Path, camera_file: Path, watch: bool) -> Record:
     """A survey from the images of a folder; the LEDs of the scene are the list before the survey."""
 
     known, read = read_camera(camera_file)
@@ -272,7 +270,7 @@ def print_coverage(
     print_blocks(survey_report.coverage_blocks(with_next(request, so_far, prior)))
 
 
-def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> dict[str, Any]:
+def with_next(request: Request, so_far: Coverage, prior: CalibrationPrior) -> Record:
     """Statistics of a coverage, with the attitudes to hold next and the accuracy predicted with them."""
 
     further = survey_findings.next_stops(
@@ -291,7 +289,7 @@ def write_results(
     before: CalibrationPrior,
     lab: Lab | None,
     names: Sequence[str],
-) -> dict[str, Any]:
+) -> Record:
     """Write map, attitudes and picture of a survey of images of these names, and return its statistics.
 
     The picture of a simulated one shows its errors.
@@ -322,9 +320,7 @@ def write_results(
     return statistics
 
 
-def write_report(
-    request: Request, run: SurveyRun, statistics: dict[str, Any]
-) -> dict[str, Any]:
+def write_report(request: Request, run: SurveyRun, statistics: Record) -> Record:
     """Write a survey's statistics as JSON, write and print its report; return the statistics with the report's path."""
 
     path = request.folder / "report.html"

@@ -73,7 +73,7 @@ class Palette:
             self.field.on("keydown.down.prevent", lambda: self.choose(self.chosen + 1))
             self.field.on("keydown.up.prevent", lambda: self.choose(self.chosen - 1))
             self.field.on("keydown.enter.prevent", self.enter)
-            self.list = ui.element("div").classes("lab-commands").props('role="listbox"')
+            self.list = widgets.div("lab-commands").props('role="listbox"')
             widgets.quiet(keys.PURPOSE)
         ui.add_body_html(f"<script>{OPEN_JS}</script>")
         ui.on("palette", self.open)

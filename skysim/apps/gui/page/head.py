@@ -25,7 +25,7 @@ class Head:
     ) -> None:
         self.page = page
         self.folder = folder
-        with ui.element("div").classes("lab-head"):
+        with widgets.div("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
                 self.scenes(),
@@ -222,7 +222,7 @@ class Arrangement:
         kind
             `side` (the column of panels) or `space` (the 3-D view)
         """
-        ui.element("div").classes(f"lab-split {orientation}").props(
+        widgets.div(f"lab-split {orientation}").props(
             f'role="separator" data-split="{kind}" aria-orientation="{orientation}" tabindex="0"'
             f' aria-label="{label}" title="{label}: drag, or arrow keys; double-click: as at first"'
         )

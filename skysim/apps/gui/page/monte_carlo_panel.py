@@ -6,7 +6,6 @@ import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from nicegui import run, ui
@@ -25,6 +24,7 @@ from skysim.apps.gui.worker.study_process import (
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.paths import STUDIES, shipped_files, title_of
+from skysim.core.types import Record
 from skysim.experiments.study import study_file as loader
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.execution.store import STORE
@@ -74,7 +74,7 @@ class MonteCarloPanel:
             )
             self.study_select.mark("study").on_value_change(self.study_chosen)
             self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
-        with ui.element("div").classes("lab-trial") as self.fields:
+        with widgets.div("lab-trial") as self.fields:
             self.count = widgets.number(
                 "runs, F8", value=200, min=1, max=100_000, precision=0
             )
@@ -101,7 +101,7 @@ class MonteCarloPanel:
         self.chart = (
             ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
         )
-        self.table = ui.element("div").classes("mono w-full").mark("figures")
+        self.table = widgets.div("mono w-full").mark("figures")
         self.failures = ui.column().classes("w-full gap-1")
         ui.separator().style("margin: 8px 0")
         widgets.quiet("Finished studies")
@@ -200,7 +200,7 @@ class MonteCarloPanel:
             return False
         path, study = found
         self.process = StudyProcess(
-            path.parent if not self.study_select.value else self.out / path.stem
+            self.out / path.stem if self.study_select.value else path.parent
         )
         self.process.total = study.trials
         self.bar.set_value(0)
@@ -208,14 +208,10 @@ class MonteCarloPanel:
         self.stopped = False
         self.note.set_text("starting …")
         self.page.log(f"study {path.stem}: {study.trials} trials")
-        unused = (
-            []
-            if self.study_select.value
-            else sorted(self.page.state.overrides.keys() - study.spec.base.keys())
-        )
-        if unused:
+        unused = self.page.state.overrides.keys() - study.spec.base.keys()
+        if unused and not self.study_select.value:
             self.page.show_message(
-                f"trials of {self.kind.value} do not use {', '.join(unused)}", "quiet"
+                f"trials of {self.kind.value} do not use {', '.join(sorted(unused))}", "quiet"
             )
         self.page.set_state(study=self.process.folder.name)
         await self.process.start(path)
@@ -242,7 +238,7 @@ class MonteCarloPanel:
         """
         if self.study_select.value:
             return STUDIES / f"{self.study_select.value}.yaml"
-        trial: dict[str, Any] = {"kind": self.kind.value}
+        trial: Record = {"kind": self.kind.value}
         if self.kind.value == "centroids":
             noise = {"noise_px": self.noise, "magnitude_sigma": self.magnitude}
             trial |= {
@@ -358,10 +354,8 @@ class MonteCarloPanel:
 
     async def replay(self, number: int) -> None:
         """Repeat a failed trial and show its frame in the sensor view."""
-        study = next(
-            iter(self.process.folder.glob("*.yaml")),
-            STUDIES / f"{self.study_select.value}.yaml",
-        )
+        shipped = STUDIES / f"{self.study_select.value}.yaml"
+        study = min(self.process.folder.glob("*.yaml"), default=shipped)
         self.page.stop_playback()
         photo = await self.page.run_task(
             "replay",
@@ -385,7 +379,7 @@ class MonteCarloPanel:
                     "%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime)
                 )
                 # The study's title if its file is in the report's folder, else the folder's name.
-                file = next(iter(sorted(folder.glob("*.yaml"))), None)
+                file = min(folder.glob("*.yaml"), default=None)
                 title = (title_of(file) if file else "") or folder.name
                 with ui.row().classes("w-full no-wrap gap-3"):
                     ui.label(done).classes("mono quiet flex-none")
@@ -398,8 +392,8 @@ class MonteCarloPanel:
 def stored_study(folder: Path) -> Plan | None:
     """The plan of a study with a store in the folder; None if there is none."""
     try:
-        own = sorted(folder.glob("*.yaml"))
-        file = own[0] if own else shipped_files(STUDIES).get(folder.name, folder)
+        shipped = shipped_files(STUDIES).get(folder.name, folder)
+        file = min(folder.glob("*.yaml"), default=shipped)
         return loader.load(file) if (folder / STORE).is_file() else None
     except (InputError, ValueError, OSError):  # a name with a null byte, or too long
         return None
@@ -412,10 +406,9 @@ def format_interval(value: float, low: float, high: float) -> str:
     return text if math.isnan(low) or low == high else f"{text}   {low:.4g} .. {high:.4g}"
 
 
-def options() -> dict[str, Any]:
+def options() -> Record:
     """ECharts options of the histogram of the error angle."""
     text = {":color": style.chart_color("quiet"), "fontSize": 10}
-    rule = {"lineStyle": {":color": style.chart_color("line")}}
     title = {"text": "no trials yet", "left": "center", "top": "middle"}
     axis = {"axisLabel": text, "nameTextStyle": text}
     x_name = {"name": "error angle, ″", "nameLocation": "middle", "nameGap": 24}
@@ -424,7 +417,7 @@ def options() -> dict[str, Any]:
         "title": title | {"textStyle": text | {"fontWeight": "normal", "fontSize": 11}},
         "grid": {"left": 42, "right": 10, "top": 22, "bottom": 36},
         "xAxis": axis | x_name | {"type": "category", "data": []},
-        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": rule},
+        "yAxis": axis | {"name": "trials", "type": "value", "splitLine": style.RULE},
         "tooltip": style.TOOLTIP,
         "series": [
             {

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from nicegui import ui
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import context, forms, space, style, widgets
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
 from skysim.scene.sections.motion import PRESCRIBED
@@ -108,7 +107,7 @@ class PlanPanel:
         elif self.colored:
             self.color("survey", *self.colored)
 
-    def color(self, by: str, ids: NDArray[np.int64], values: Floats) -> None:
+    def color(self, by: str, ids: Ints, values: Floats) -> None:
         """Color LEDs of the 3-D view, and show the meaning of the colors."""
         self.scene_3d.color_lights(ids, values)
         for name, legend in self.legends.items():
@@ -117,7 +116,7 @@ class PlanPanel:
     def clear_survey(self) -> None:
         """Discard the survey, and show what a survey does."""
         self.plan: SurveyPlan | None = None
-        self.colored: tuple[NDArray[np.int64], Floats] | None = None
+        self.colored: tuple[Ints, Floats] | None = None
         self.taken = 0
         self.legends.pop("survey", None)
         self.enable()
@@ -157,7 +156,7 @@ class PlanPanel:
                 ui.label(finding).classes("warn").style("overflow-wrap: anywhere")
             if not found.findings:
                 ui.label("No warnings.").classes("good")
-            with ui.element("div").classes("lab-facts"):
+            with widgets.div("lab-facts"):
                 for fact in found.facts:
                     widgets.quiet(fact.name)
                     ui.label("\n".join(fact.lines)).style(
@@ -240,7 +239,7 @@ class PlanPanel:
                 ui.label(line).style("overflow-wrap: anywhere")
             self.legends["survey"] = ui.label(COLORED)
             self.legends["survey"].set_visibility(False)
-            with ui.element("div").classes("lab-stops mono"):
+            with widgets.div("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")
                 for number, (angles, leds) in enumerate(

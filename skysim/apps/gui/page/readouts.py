@@ -1,7 +1,7 @@
 """The tracker's results on the frame: the card of its attitude, and the table of its lights."""
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import (
     Detection,
     FrameView,
+    LightName,
     Lights,
     SceneInfo,
     TrackerResult,
@@ -19,6 +20,7 @@ from skysim.apps.gui.views import context, overlay, widgets
 from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.photo import Photo
+from skysim.core.types import Record
 
 ANGLES_JS = (
     "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
@@ -37,8 +39,8 @@ class AttitudeCard:
     def __init__(self, page: context.PageContext, contents: Contents) -> None:
         self.page = page
         self.contents = contents
-        with ui.element("div").classes("lab-card"):
-            with ui.element("div").classes("lab-grid"):
+        with widgets.div("lab-card"):
+            with widgets.div("lab-grid"):
                 widgets.quiet("attitude")
                 self.heads = [ui.label().classes("quiet num") for _ in range(3)]
                 widgets.quiet("true (F5)")
@@ -97,22 +99,21 @@ class AttitudeCard:
             if field.props.get("placeholder", "") != placeholder:
                 field.props["placeholder"] = placeholder
                 field.update()
-        # Dashes without a solution.
+        estimates = errors = ["–"] * 3  # without a solution
         result = image.result
-        if result is None or result.angles_deg is None:
-            for label in (*self.estimates, *self.errors):
-                label.set_text("–")
-        else:
-            for label, angle in zip(self.estimates, result.angles_deg, strict=True):
-                label.set_text(format_angle(angle))
+        if result and result.angles_deg:
+            estimates = [format_angle(angle) for angle in result.angles_deg]
             cross, roll = result.sigma_arcsec
             texts = (
                 (result.cross_arcsec, f"cross {result.cross_arcsec:.2f}″"),
                 (result.roll_arcsec, f"roll {result.roll_arcsec:+.1f}″"),
                 (cross, f"σ {format_number(cross)}″ {format_number(roll)}″"),
             )
-            for label, (value, text) in zip(self.errors, texts, strict=True):
-                label.set_text("–" if math.isnan(value) else text)
+            errors = ["–" if math.isnan(value) else text for value, text in texts]
+        for label, text in zip(
+            (*self.estimates, *self.errors), (*estimates, *errors), strict=True
+        ):
+            label.set_text(text)
         color, text = status_line(result)
         self.status.set_text(text, color)
 
@@ -175,10 +176,8 @@ class LightsPanel:
 
 
 def rows(
-    lights: Lights,
-    detections: Collection[Detection],
-    name: Callable[[int], str],
-) -> Iterator[dict[str, Any]]:
+    lights: Lights, detections: Collection[Detection], name: LightName
+) -> Iterator[Record]:
     """Rows of the table: true lights with their detections, brightest first, then detections of no light.
 
     Returns
@@ -214,7 +213,7 @@ def rows(
         yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": texts}
 
 
-def cells(light: Any, spot: Detection | None, name: Callable[[int], str]) -> list[str]:
+def cells(light: Any, spot: Detection | None, name: LightName) -> list[str]:
     magnitude = "" if math.isnan(light.magnitude) else f"{light.magnitude:.2f}"
     x, y = light.xy_px
     texts = [name(light.id), magnitude, f"{light.electrons:.4g}", f"{x:.2f}", f"{y:.2f}"]

@@ -11,7 +11,7 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, SceneInfo
+from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.sensor import SensorView
@@ -147,7 +147,7 @@ class RunPanel:
         """Forget the flight."""
         self.rows: list[FlightRow] = []
         self.log: Curves = {}
-        self.residuals: list[tuple[float, int, float]] = []
+        self.residuals: list[Residual] = []
         self.index = 0
         self.from_s = 0.0
         self.seek.set_value(0)

@@ -224,9 +224,9 @@ class ScenePanel:
         self.page = page
         self.folder = folder
         self.saved = saved
-        self.shown: tuple[str, Mapping[str, str]] | None = None
+        self.shown: forms.Opened | None = None
         with widgets.row().style("margin-bottom: 8px"):
-            self.find = ui.input(placeholder="find a key", on_change=lambda: self.search())
+            self.find = ui.input(placeholder="find a key", on_change=self.search)
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
             self.name = ui.input(placeholder="new-name").props(
                 'dense outlined aria-label="Name of the new scene"'
@@ -303,7 +303,7 @@ class TrackerPanel:
     """
 
     def __init__(self, page: context.PageContext) -> None:
-        self.shown: tuple[str, Mapping[str, str]] | None = None
+        self.shown: forms.Opened | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
         self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
 
@@ -322,8 +322,5 @@ class TrackerPanel:
         group = SENSOR if action == "sensor" else IDENTIFIER
         if group in self.form.expansions:
             self.form.expansions[group].open()
-            row = self.form.rows.get(
-                f"tracker.{'detector' if group == SENSOR else 'identifier'}"
-            )
-            if row:
+            if row := self.form.rows.get(next(iter(NAMES[group]))):
                 ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)

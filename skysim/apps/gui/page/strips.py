@@ -1,17 +1,16 @@
 """Strip charts of a flight: curves against a common time axis, one chart above the other, with a shared cursor."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from nicegui import ui
 
-from skysim.apps.gui.messages import Curves, FlightRow
+from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
 from skysim.apps.gui.views.live import Contents
-from skysim.apps.gui.views.style import CURVE_COLORS, TOOLTIP, chart_color
-from skysim.core.types import Floats
+from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
+from skysim.core.types import Floats, Record
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
@@ -102,9 +101,7 @@ class Dots(ui.element, component="js/strips.js"):  # type: ignore[call-arg]
 
 
 def strips(
-    rows: Sequence[FlightRow],
-    log: Curves,
-    residuals: Sequence[tuple[float, int, float]] = (),
+    rows: Sequence[FlightRow], log: Curves, residuals: Sequence[Residual]
 ) -> list[Strip]:
     """Return the strips for which a flight has data.
 
@@ -168,7 +165,7 @@ def point(t_s: float, value: float) -> list[float]:
     return [float(f"{t_s:.4f}"), float(f"{value:.5g}")]
 
 
-def thinned(residuals: Sequence[tuple[float, int, float]]) -> Points:
+def thinned(residuals: Sequence[Residual]) -> Points:
     """The residuals as dots: of all frames or, if they are more than MAX_DOTS, of frames at equal steps."""
     times_s = sorted({t_s for t_s, _, _ in residuals})
     kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
@@ -198,7 +195,7 @@ class StripChart:
         self.chart.on("chart:finished", js_handler=CHART_JS % (self.chart.id, self.dots.id))
         self.chart.set_visibility(False)
 
-    def draw(self, drawn: list[Strip], end_s: float, name: Callable[[int], str]) -> None:
+    def draw(self, drawn: list[Strip], end_s: float, name: LightName) -> None:
         """Draw strips up to a time.
 
         Parameters
@@ -221,7 +218,7 @@ class StripChart:
             self.contents.set(self.chart.id, {"moment": f"{t_s:.4f}"})
 
 
-def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]:
+def dot_fields(drawn: list[Strip], name: LightName) -> Record:
     """Data for strips.js: dots, names of their lights, and the place of their strip."""
     n = next((n for n, strip in enumerate(drawn) if strip.dots), 0)
     dots = drawn[n].dots if drawn else []
@@ -235,10 +232,9 @@ def dot_fields(drawn: list[Strip], name: Callable[[int], str]) -> dict[str, Any]
     return {"dots": dots, "names": names, "grid": n, "place": place, "color": CURVE_COLORS[0]}
 
 
-def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
+def options(drawn: list[Strip], end_s: float) -> Record:
     """ECharts options of stacked strips; each has a title with its unit and a legend."""
     text = {":color": chart_color("quiet"), "fontSize": 11}
-    rule = {"lineStyle": {":color": chart_color("line")}}
     title_text = {":color": chart_color("text"), "fontWeight": "normal", "fontSize": 12}
     title = {"padding": 0, "left": 0, "textStyle": title_text}
     legend = {
@@ -251,7 +247,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     }
     grid = {"left": LEFT_PX, "right": RIGHT_PX, "height": INNER_PX}
     x_axis = {"type": "value", "min": 0, "max": round(end_s, 3), "splitLine": {"show": False}}
-    found: dict[str, list[dict[str, Any]]] = {
+    found: dict[str, list[Record]] = {
         name: [] for name in ("title", "legend", "grid", "xAxis", "yAxis", "series")
     }
     for n, strip in enumerate(drawn):
@@ -261,8 +257,8 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
         found["title"].append(title | {"text": strip.title, "top": top + 3})
         found["legend"].append(legend | {"top": top + 3, "data": names})
         found["grid"].append(grid | {"top": top + HEAD_PX})
-        found["xAxis"].append(x_axis | {"gridIndex": n, "axisLabel": label, "axisTick": rule})
-        found["yAxis"].append(y_axis(strip, n) | {"axisLabel": text, "splitLine": rule})
+        found["xAxis"].append(x_axis | {"gridIndex": n, "axisLabel": label, "axisTick": RULE})
+        found["yAxis"].append(y_axis(strip, n) | {"axisLabel": text, "splitLine": RULE})
         found["series"] += [series(curve, n, k) for k, curve in enumerate(strip.drawn)]
     return found | {
         "animation": False,
@@ -275,7 +271,7 @@ def options(drawn: list[Strip], end_s: float) -> dict[str, Any]:
     }
 
 
-def y_axis(strip: Strip, n: int) -> dict[str, Any]:
+def y_axis(strip: Strip, n: int) -> Record:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
     if strip.dots:
         # The next greater of 1, 2, 5, 10 times a power of ten.
@@ -292,7 +288,7 @@ def y_axis(strip: Strip, n: int) -> dict[str, Any]:
     return axis
 
 
-def series(curve: StripCurve, n: int, k: int) -> dict[str, Any]:
+def series(curve: StripCurve, n: int, k: int) -> Record:
     """ECharts series of a curve in strip n. A band's area reaches to the axis, so that two make one around zero."""
     is_band = curve.kind == "band"
     is_dots = curve.kind == "dots"

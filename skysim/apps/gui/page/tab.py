@@ -3,7 +3,7 @@
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,12 +24,13 @@ from skysim.apps.gui.page import (
     settings_panel,
 )
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style
+from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style, widgets
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
+from skysim.core.yaml_reader import OverrideTexts
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
@@ -123,16 +124,16 @@ class Tab:
             dark=style.DARK["panel"],
             dark_page=style.DARK["ground"],
         )
-        with ui.element("div").classes("lab"):
+        with widgets.div("lab"):
             self.head = head.Head(self, self.contents, self.folder)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
-            with ui.element("div").classes("lab-side"):
+            with widgets.div("lab-side"):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = readouts.AttitudeCard(self, self.contents)
                 await self.build_panels()
-            with ui.element("div").classes("lab-keys").mark("keys"):
+            with widgets.div("lab-keys").mark("keys"):
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(
@@ -154,8 +155,8 @@ class Tab:
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
 
     async def build_panels(self) -> None:
-        with ui.element("div").classes("lab-panes"):
-            with ui.element("div").classes("lab-space-pane"):
+        with widgets.div("lab-panes"):
+            with widgets.div("lab-space-pane"):
                 self.scene_3d = space.Scene3D(self, self.sensor)
             head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
@@ -320,7 +321,7 @@ class Tab:
     async def open(
         self,
         scene: str,
-        overrides: Mapping[str, str] | None = None,
+        overrides: OverrideTexts | None = None,
         angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
@@ -366,7 +367,7 @@ class Tab:
         self.study_panel.set_scene()
 
     async def apply_overrides(
-        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+        self, overrides: OverrideTexts, dropped: Collection[str] = ()
     ) -> None:
         """Reopen the scene with further overrides and without some; concurrent edits are done one after another."""
         async with self.editing:
@@ -391,7 +392,7 @@ class Tab:
                     panel.shown = current
 
     @property
-    def opened(self) -> tuple[str, Mapping[str, str]]:
+    def opened(self) -> forms.Opened:
         """The open scene and its overrides."""
         return self.state.scene, self.state.overrides
 

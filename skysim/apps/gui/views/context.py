@@ -1,11 +1,12 @@
 """The interface of the page for its parts. The page implements it; no part imports the page."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from typing import Any, Protocol
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
+from skysim.core.yaml_reader import OverrideTexts
 
 
 class PageContext(Protocol):
@@ -61,13 +62,13 @@ class PageContext(Protocol):
     async def open(
         self,
         scene: str,
-        overrides: Mapping[str, str] | None = None,
+        overrides: OverrideTexts | None = None,
         angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
 
     async def apply_overrides(
-        self, overrides: Mapping[str, str], dropped: Collection[str] = ()
+        self, overrides: OverrideTexts, dropped: Collection[str] = ()
     ) -> None:
         """Reopen the scene with further overrides and without some."""
 

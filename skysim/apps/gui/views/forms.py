@@ -13,8 +13,9 @@ from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
+from skysim.core.types import Record
 from skysim.core.units import si_unit
-from skysim.core.yaml_reader import read_yaml
+from skysim.core.yaml_reader import OverrideTexts, read_yaml
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.scene import NAME_ALIAS, Scene
@@ -54,7 +55,7 @@ SECTIONS = (
 NO_SECTION = "none"  # the kind of a section that is left out
 # Values for the keys that a kind of section requires, when it is chosen. A kind without such values, for example one
 # that names a file, is not offered; nor is another kind of light, which requires another start of the motion.
-FIRST_VALUES: dict[str, Any] = {
+FIRST_VALUES: Record = {
     "row_time": "10 us",
     "fwhm_px": 2,
     "radius_px": 3,
@@ -81,6 +82,7 @@ FIRST_VALUES: dict[str, Any] = {
     "inclination_deg": 51.6,
 }
 ONE_KIND = ("light",)
+Opened = tuple[str, OverrideTexts]  # a scene and its overrides
 
 
 class FormField(NamedTuple):
@@ -123,7 +125,7 @@ class FormField(NamedTuple):
         return self.meaning if self.meaning and self.text == "null" else self.text
 
 
-def fields(name: str, overrides: Mapping[str, str]) -> list[FormField]:
+def fields(name: str, overrides: OverrideTexts) -> list[FormField]:
     """All keys that a scene has or could have, sections in the order of the README. Raises InputError."""
     scene = load(name, overrides)
     tree = with_overrides(read(find(name))[0], overrides)
@@ -221,7 +223,7 @@ def offered_kinds(annotation: Any) -> tuple[str, ...]:
 
 def first_section(
     model: type[BaseModel], kind: str, kept: Mapping[str, Any] | None = None
-) -> dict[str, Any] | None:
+) -> Record | None:
     """A section of a kind with its required keys and with keys that are kept; None if required values are unknown."""
     required = [
         info.alias or name for name, info in model.model_fields.items() if info.is_required()
@@ -238,9 +240,7 @@ def first_section(
     return section
 
 
-def with_value(
-    name: str, overrides: Mapping[str, str], key: str, text: str
-) -> dict[str, str]:
+def with_value(name: str, overrides: OverrideTexts, key: str, text: str) -> dict[str, str]:
     """Overrides with a new value of a key, without those that lose their effect by it. Raises InputError.
 
     A new kind of a section replaces the section.
@@ -261,9 +261,7 @@ def with_value(
     return kept
 
 
-def with_kind(
-    name: str, overrides: Mapping[str, str], section: str, kind: str
-) -> dict[str, str]:
+def with_kind(name: str, overrides: OverrideTexts, section: str, kind: str) -> dict[str, str]:
     """Overrides that change a section's kind: to that of the file, or to another with the keys that it requires.
 
     Keys that both kinds have keep their values if the new kind allows all of them; sections do not.
@@ -329,7 +327,7 @@ def absolute_path(scene: str) -> str:
     return str(find(scene).resolve())
 
 
-def validated_scene(name: str, overrides: Mapping[str, str]) -> Scene:
+def validated_scene(name: str, overrides: OverrideTexts) -> Scene:
     """Load the scene with the overrides. Raises InputError if it is invalid or names a file outside its folder."""
     scene = load(name, overrides)
     tree = scene.model_dump(mode="json", by_alias=True)
@@ -357,9 +355,7 @@ FEEDBACKS = {
 }
 
 
-def field_override(
-    name: str, overrides: Mapping[str, str], field_deg: float
-) -> dict[str, str]:
+def field_override(name: str, overrides: OverrideTexts, field_deg: float) -> dict[str, str]:
     """Override for another horizontal field of view of a scene: f = width / (2 tan(field / 2)).
 
     Raises
@@ -379,7 +375,7 @@ def field_override(
     return {"camera.focal_length": f"{1e3 * focal_m:.5g} mm"}
 
 
-def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> dict[str, str]:
+def loop_overrides(name: str, overrides: OverrideTexts, feedback: str) -> dict[str, str]:
     """Overrides that close the loop with another feedback (a key of FEEDBACKS); "" removes controller and maneuver."""
     tree = with_overrides(read(find(name))[0], overrides)
     control = expand_control(tree.get("motion", {}).get("control"))
@@ -388,9 +384,7 @@ def loop_overrides(name: str, overrides: Mapping[str, str], feedback: str) -> di
     return {"motion.control": yaml_line(control | {"feedback": feedback})}
 
 
-def save(
-    folder: Path, name: str, base: str, overrides: Mapping[str, str], title: str
-) -> Path:
+def save(folder: Path, name: str, base: str, overrides: OverrideTexts, title: str) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
     from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
     from skysim.core import files

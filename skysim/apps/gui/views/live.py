@@ -15,6 +15,8 @@ from nicegui import ui
 
 from skysim.core.errors import OVERRIDES, InputError
 
+LiveContents = dict[int, dict[str, str]]  # by the number of a field
+
 
 class Contents:
     """The contents of a tab's live fields.
@@ -26,8 +28,8 @@ class Contents:
     """
 
     def __init__(self) -> None:
-        self.all = dict[int, dict[str, str]]()
-        self.send: Callable[[dict[int, dict[str, str]]], Any] = lambda _: None
+        self.all = LiveContents()
+        self.send: Callable[[LiveContents], Any] = lambda _: None
         self.waits = False
 
     def set(self, number: int, content: dict[str, str]) -> None:
@@ -39,7 +41,7 @@ class Contents:
             self.waits = True
             asyncio.get_running_loop().call_soon(self.flush)
 
-    def take(self) -> dict[int, dict[str, str]]:
+    def take(self) -> LiveContents:
         """All contents, for a frame."""
         self.waits = False
         return dict(self.all)

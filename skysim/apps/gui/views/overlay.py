@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 from nicegui import json
-from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import (
     LIMITS,
     Display,
+    LightName,
     Lights,
     Pixels,
     TrackerResult,
@@ -26,7 +26,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.core.yaml_reader import read_yaml
 from skysim.results.plots import CURVES
 
@@ -51,11 +51,8 @@ Points = list[list[float]]  # rounded to a tenth of a pixel, for a short message
 
 
 def marks(
-    lights: Lights,
-    result: TrackerResult | None,
-    shown: Collection[str],
-    name: Callable[[int], str],
-) -> dict[str, Any]:
+    lights: Lights, result: TrackerResult | None, shown: Collection[str], name: LightName
+) -> Record:
     """Return the marks for frame.js.
 
     Returns
@@ -105,7 +102,7 @@ def marks(
     }
 
 
-def bright_count(lights: Lights, identified: Collection[int], near: NDArray[np.bool_]) -> int:
+def bright_count(lights: Lights, identified: Collection[int], near: Bools) -> int:
     """Number of lights that are at least as bright as the faintest identified one, or else the faintest detected one.
 
     Detected ones alone are no measure: in a field of hundreds of faint stars, noise is detected beside some of them.

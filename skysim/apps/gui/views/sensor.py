@@ -27,7 +27,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.views import live, overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.results import plots
 from skysim.sources.bodies import NAMES as BODIES
 
@@ -87,16 +87,13 @@ class SensorView:
         self.size_px = (4, 3)
         self.frames = overlay.TabFrames(self.announce)
         self.frame_drawn = asyncio.Event()
-        with ui.element("div").classes("lab-sensor"):
+        with widgets.div("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
                 self.hover = live.LiveText(contents).classes("mono").mark("hover")
-            with (
-                self.canvas.add_slot("wait"),
-                ui.element("div").classes("lab-wait") as self.wait,
-            ):
+            with self.canvas.add_slot("wait"), widgets.div("lab-wait") as self.wait:
                 # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
-                self.waited = ui.element("div").classes("lab-waited mono")
+                self.waited = widgets.div("lab-waited mono")
                 self.wait_label = ui.label().mark("wait")
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
@@ -114,12 +111,12 @@ class SensorView:
         self.waited.set_visibility(not in_vain)
 
     def build_controls(self) -> None:
-        with ui.element("div").classes("lab-bar"):
+        with widgets.div("lab-bar"):
             for kind in overlay.KINDS:
                 box = widgets.checkbox(kind, value=kind in self.shown)
                 box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
-            self.grid = widgets.checkbox("grid", value=False, on_change=self.update_display)
+            self.grid = widgets.checkbox("grid", on_change=self.update_display)
             self.grid.mark("grid")
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
@@ -210,12 +207,9 @@ class SensorView:
     def address(self, number: int) -> str:
         return f"/frame/{self.id}/{number}"
 
-    def fields(self) -> dict[str, Any]:
+    def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
-        view = {
-            "pose": self.pose,
-            "label": self.description(),
-        }
+        view = {"pose": self.pose, "label": self.description()}
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def description(self) -> str:
@@ -261,19 +255,19 @@ class SensorView:
         if light is not None:
             x, y = light.xy_px
             brightness = "" if math.isnan(light.magnitude) else f"V {light.magnitude:.2f}  "
-            lines += [f"truth      {x:8.2f} {y:8.2f}   {self.name(light.id)}"]
-            lines += [f"           {brightness}{light.electrons:.4g} e-"]
+            lines += [
+                f"truth      {x:8.2f} {y:8.2f}   {self.name(light.id)}",
+                f"           {brightness}{light.electrons:.4g} e-",
+            ]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            lines += [
-                f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px"
-            ]
             residual = (
                 ""
                 if math.isnan(detection.residual_px)
                 else f"   residual {detection.residual_px:.3f} px"
             )
             lines += [
+                f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px",
                 f"           {identity}",
                 f"           flux {detection.flux:.4g}{residual}",
             ]

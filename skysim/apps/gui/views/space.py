@@ -9,15 +9,13 @@ from collections.abc import Callable
 from typing import Any
 
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
-import numpy as np
 from nicegui import ui
-from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
-from skysim.apps.gui.views import context, style
+from skysim.apps.gui.views import context, style, widgets
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.geometry import Grip
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 VIEWS = {
     "outside": "from beside the laboratory",
@@ -50,7 +48,7 @@ class Scene3D:
         self.newest_view: FrameView | None = None
         self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
-        with ui.element("div").classes("lab-looks"):
+        with widgets.div("lab-looks"):
             for name, text in VIEWS.items():
                 button = ui.button(
                     name, color=None, on_click=lambda name=name: self.look(name)
@@ -72,7 +70,7 @@ class Scene3D:
         fields = {"background": style.DARK["ground"], "prefix": scene_info.prefix}
         self.canvas.run_method("build", scene_info.geometry | fields)
 
-    def color_lights(self, ids: NDArray[np.int64], values: Floats) -> None:
+    def color_lights(self, ids: Ints, values: Floats) -> None:
         """Color some lights by values from 0 to 1, until the scene changes."""
         colors = (
             f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * style.color_scale(values)
@@ -133,7 +131,7 @@ class PushControl:
         self.moved = moved
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
-        with ui.element("div").classes("lab-push") as self.bar:
+        with widgets.div("lab-push") as self.bar:
             self.label = ui.label().classes("mono").mark("push")
             ui.button("reset", color=None, on_click=self.reset).props(
                 'dense outline size=xs title="back to the attitude before the push"'

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 from urllib.parse import parse_qsl, urlencode
 
 from skysim.apps.gui.messages import Triple
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 
 Kind = Literal["live", "flight", "replay", "photo"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -54,14 +55,10 @@ class PageView:
             ("scene", self.scene),
             *(("set", f"{key}={value}") for key, value in self.overrides.items()),
         ]
+        at = ",".join(f"{angle:.6f}" for angle in self.angles_deg or ())
         optional = (
             ("view", self.kind if self.kind != "live" else ""),
-            (
-                "at",
-                ",".join(f"{angle:.6f}" for angle in self.angles_deg)
-                if self.angles_deg
-                else "",
-            ),
+            ("at", at),
             ("t", f"{self.t_s:.4f}" if self.kind == "flight" else ""),
             ("study", self.study),
             ("trial", str(self.trial) if self.kind == "replay" else ""),
@@ -84,7 +81,7 @@ class PageView:
             For an address with other scenes or invalid values.
         """
         pairs = parse_qsl(query.removeprefix("?"))
-        one: dict[str, Any] = dict(pairs)
+        one: Record = dict(pairs)
         if "scene" not in one:
             return None
         if one["scene"] not in scenes:
@@ -96,9 +93,7 @@ class PageView:
         if kind not in KINDS:
             raise InputError("link", f"view {kind!r}", ", ".join(KINDS))
         try:
-            angles = (
-                tuple(float(angle) for angle in one["at"].split(",")) if "at" in one else None
-            )
+            angles = tuple(map(float, one["at"].split(","))) if "at" in one else None
             t_s = float(one.get("t", 0))
             trial = int(one.get("trial", -1))
         except ValueError:

@@ -41,6 +41,7 @@ def variables(colors: dict[str, str]) -> str:
     return "; ".join(f"--lab-{name}: {color}" for name, color in colors.items())
 
 
+RULE = {"lineStyle": {":color": chart_color("line")}}  # of a chart's grid
 TOOLTIP = {
     "trigger": "axis",
     "confine": True,

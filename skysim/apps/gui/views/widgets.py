@@ -8,6 +8,11 @@ from nicegui import ui
 from skysim.apps.gui.views import keys
 
 
+def div(classes: str) -> ui.element:
+    """A box with style classes of the page."""
+    return ui.element("div").classes(classes)
+
+
 def row(gap: int = 2) -> ui.row:
     """A row as wide as its panel, without wrapping.
 

@@ -4,14 +4,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.camera import Camera
-from skysim.apps.gui.messages import Lens, Pose
+from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Mount, Sources, Trajectory, Truth
+from skysim.core.types import Bools, Floats, Ints, Mount, Record, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
 from skysim.results import scoring
@@ -32,7 +31,7 @@ MOST_AXIS_M = 1.2
 DIGITS = 5  # decimals of lengths in meters
 
 
-def lab_geometry(lab: Lab) -> dict[str, Any]:
+def lab_geometry(lab: Lab) -> Record:
     """Geometry of a lab for space.js; meters in the lab frame unless stated otherwise.
 
     It has the shapes of the MJCF file that `skysim scenes export` writes, without the lights; the lights, stars on a
@@ -56,7 +55,7 @@ def lab_geometry(lab: Lab) -> dict[str, Any]:
     }
 
 
-def lights(sources: Sources) -> tuple[NDArray[np.int64], Floats, Floats, NDArray[np.bool_]]:
+def lights(sources: Sources) -> tuple[Ints, Floats, Floats, Bools]:
     """Ids, (N, 3) positions and (N,) drawn radii in m of the brightest lights, brightest first, and which are lit.
 
     The radius of an LED grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; that
@@ -151,9 +150,7 @@ RANGES = {  # degrees
 }
 
 
-def from_angles(
-    scene: Scene, mount: Mount, angles_deg: tuple[float, float, float]
-) -> Rotation:
+def from_angles(scene: Scene, mount: Mount, angles_deg: Triple) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises
@@ -219,8 +216,8 @@ MAX_ADVANCE_S = (
 class Grip(NamedTuple):
     """The held point of the vehicle in body axes, and the wanted place of this point in the lab frame; m."""
 
-    held_body_m: tuple[float, float, float]
-    wanted_m: tuple[float, float, float]
+    held_body_m: Triple
+    wanted_m: Triple
 
 
 class Push:

@@ -5,7 +5,6 @@ import zipfile
 from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.images import TOP_DOWN_CARD
 from skysim.core.paths import PAPERS, SCENES
+from skysim.core.types import Record
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.results import scoring
 from skysim.results.files import recording
@@ -81,7 +81,7 @@ def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
     }
 
 
-def solution_record(result: TrackerResult) -> dict[str, Any]:
+def solution_record(result: TrackerResult) -> Record:
     """The tracker's result for JSON."""
     record = asdict(result)
     record["spots"] = record.pop("detections")

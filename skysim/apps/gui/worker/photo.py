@@ -4,7 +4,6 @@ import math
 import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.results import plots, scoring
@@ -51,7 +51,7 @@ class Photo:
     """
 
     result: TrackerResult
-    solution: dict[str, Any]
+    solution: Record
     statistics: plots.FrameStatistics
     pixels: Pixels = NO_PIXELS
     saturation_dn: float = math.inf
@@ -103,24 +103,25 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
         segment = runner.segment_of(plan, stored, trial)
     (row,) = trials.run_block(plan.spec, segment)
     setup = setups.prepared_setup(plan.spec, segment.settings)
+    lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    result = workbench.tracker_result(setup.lab, setup.estimator, frame, truth, report)
+    result = workbench.tracker_result(lab, setup.estimator, frame, truth, report)
     if row.error:
         result = TrackerResult(
             row.error.strip().splitlines()[-1], result.detections, result.ms
         )
-    scene = setup.lab.scene
+    scene = lab.scene
     photo = Photo(
         result,
         {},
         plots.frame_statistics(frame.image_dn, frame.saturation_dn),
         names=scoring.angle_names(scene),
-        angles_deg=scoring.true_angles_deg(setup.lab.camera, truth),
-        lights=workbench.true_lights(truth, workbench.magnitude_by_id(setup.lab)),
-        prefix=workbench.id_prefix(setup.lab),
+        angles_deg=scoring.true_angles_deg(lab.camera, truth),
+        lights=workbench.true_lights(truth, workbench.magnitude_by_id(lab)),
+        prefix=workbench.id_prefix(lab),
         saturation_dn=frame.saturation_dn,
-        lens=(lens := lenses.scene_lens(setup.lab)),
-        pose=lenses.scene_pose(setup.lab, lens, truth),
+        lens=(lens := lenses.scene_lens(lab)),
+        pose=lenses.scene_pose(lab, lens, truth),
     )
     return photo, frame.image_dn
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from skysim.apps.gui.messages import Display, Pixels
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.jit import jit
+from skysim.core.types import Record
 from skysim.results import plots
 
 LEVELS = 2**16 - 1
@@ -88,7 +89,7 @@ def pixels_for(
     drawn = (
         shades(integers, columns, limits, saturation, display.curve) if shaded else integers
     )
-    fields: dict[str, Any] = {
+    fields: Record = {
         "size": (width, height),
         "grid": drawn.shape[::-1],
         "shaded": shaded,
@@ -214,7 +215,7 @@ def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[f
     return plots.display_levels(integers)
 
 
-def histogram(integers: NDArray) -> dict[str, Any]:
+def histogram(integers: NDArray) -> Record:
     """Counts of a sample of the pixels in BINS bins.
 
     The axis is an inverse hyperbolic sine about the sky, in units of the sky's scatter: linear there, logarithmic for
@@ -235,9 +236,4 @@ def histogram(integers: NDArray) -> dict[str, Any]:
     first, last = np.arcsinh((np.array([low, high]) - sky) / scatter)
     ends = first - AXIS_MARGIN, last + AXIS_MARGIN
     counts, _ = np.histogram(np.arcsinh((sample - sky) / scatter), BINS, ends)
-    return {
-        "range": (low, high),
-        "sky": float(sky),
-        "scatter": scatter,
-        "counts": counts,
-    }
+    return {"range": (low, high), "sky": float(sky), "scatter": scatter, "counts": counts}

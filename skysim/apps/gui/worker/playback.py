@@ -5,18 +5,13 @@ import pickle
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import (
-    Curves,
-    FlightRow,
-    FlightStep,
-    FrameView,
-)
+from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, FrameView, Residual
 from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
@@ -106,7 +101,7 @@ class Playback:
         view = bench.frame_view(shot.frame, shot.truth, shot.report, seconds)
         t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
         self.frames.append(
-            KeptFrame(replace(view, t_s=t_s), shot.report, self.keep(shot.frame))
+            KeptFrame(view._replace(t_s=t_s), shot.report, self.keep(shot.frame))
         )
 
     def keep(self, frame: Frame) -> int | None:
@@ -162,8 +157,8 @@ def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
     return FlightRow(view.t_s, *errors, *counts, filter_arcsec, innovation_arcsec)
 
 
-def light_residuals(view: FrameView) -> Iterator[tuple[float, int, float]]:
-    """Time, number and residual in pixels of every light that is identified in a frame."""
+def light_residuals(view: FrameView) -> Iterator[Residual]:
+    """The residual of every light that is identified in a frame."""
     for spot in view.result.detections if view.result else ():
         if spot.id >= 0 and math.isfinite(spot.residual_px):
             yield view.t_s, spot.id, spot.residual_px

@@ -6,13 +6,14 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration.survey_plan import SurveyAccuracy
 from estimator.core.types import Centroids
-from skysim.apps.gui.messages import FrameView, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import FrameView, PlanStep, SurveyFound, SurveyPlan
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats
@@ -168,8 +169,7 @@ class Survey:
             return path.read_bytes()
 
 
-@dataclass(frozen=True, slots=True)
-class TakenFrame:
+class TakenFrame(NamedTuple):
     """A frame of a survey: the scene that was flown, its number in it, the true attitude, and its detections."""
 
     flown: Scene
@@ -201,7 +201,7 @@ def tilt_deg(scene: Scene) -> float:
 
 
 def survey_plan(
-    lab_from_body: Rotation, shown: Bools, steps: tuple[tuple[int, int, float | None], ...]
+    lab_from_body: Rotation, shown: Bools, steps: tuple[PlanStep, ...]
 ) -> SurveyPlan:
     """Return a plan in the form of the page.
 
@@ -214,7 +214,7 @@ def survey_plan(
     return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
 
 
-def plan_step(count: int, accuracy: SurveyAccuracy | None) -> tuple[int, int, float | None]:
+def plan_step(count: int, accuracy: SurveyAccuracy | None) -> PlanStep:
     """Number of frames; predicted after them, the number of LEDs measured and their rms error in mm."""
     statistics = survey_findings.accuracy_statistics(accuracy)
     return count, int(statistics["measured"] or 0), statistics["led_mm"]

@@ -1,7 +1,6 @@
 """Tasks of a worker process: methods of `Worker`, called by name, which keeps its state between them."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -33,6 +32,7 @@ from skysim.apps.gui.worker import workbench as planning
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import images
 from skysim.core.errors import InputError
+from skysim.core.yaml_reader import OverrideTexts
 from skysim.simulation import checks
 from skysim.simulation.checks.plan_check import Check
 
@@ -71,7 +71,7 @@ class Worker:
     other: photo.Photo | None = None
     image: NDArray | None = None
     scene: str = ""
-    overrides: Mapping[str, str] | None = None
+    overrides: OverrideTexts | None = None
     camera: images.LiveCamera | None = None
 
     @property
@@ -84,7 +84,7 @@ class Worker:
     def show_frame(self, view: FrameView, levels: pixels.PixelLevels) -> FrameView:
         """Return the view with its pixels, and drop the other image, because the page now shows the scene."""
         self.other = self.image = None
-        return replace(view, pixels=self.show(levels, view.saturation_dn))
+        return view._replace(pixels=self.show(levels, view.saturation_dn))
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return its view."""
@@ -136,7 +136,7 @@ class Worker:
     def open(
         self,
         scene: str,
-        overrides: Mapping[str, str],
+        overrides: OverrideTexts,
         solve: bool,
         angles_deg: Triple | None = None,
     ) -> tuple[SceneInfo, FrameView]:
@@ -158,7 +158,7 @@ class Worker:
         self.flight = None
         self.pushed = None
         surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
-        return replace(bench.scene_info, surveyed=surveyed), self.render(solve)
+        return bench.scene_info._replace(surveyed=surveyed), self.render(solve)
 
     def render(self, solve: bool) -> FrameView:
         view = self.workbench.render_at_rest(solve)

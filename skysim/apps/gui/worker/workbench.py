@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
@@ -28,7 +26,7 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
-from skysim.core.types import Floats, Frame, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Ints, Record, Trajectory, Truth
 from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
@@ -64,7 +62,7 @@ class Workbench:
     estimator: factory.Estimator
     lab_from_body: Rotation
     lens: Lens
-    geometry: dict[str, Any]
+    geometry: Record
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -251,7 +249,7 @@ def detections_of(estimator: factory.Estimator, report: Report) -> tuple[Detecti
 
 def predicted_lights(
     estimator: DomeTracker | StarTracker, attitude: Attitude
-) -> tuple[NDArray[np.int64], Floats]:
+) -> tuple[Ints, Floats]:
     """(N,) ids and (N, 2) predicted pixels of all lights on the tracker's map, for its attitude and camera model.
 
     If the solution has its own camera (the field of view was fitted), that camera is used.
