@@ -1,0 +1,415 @@
+"""A laboratory as a unit of co-simulation (FMI 3.0), for Simulink and other tools.
+
+1. `LabUnit` flies a scene: inputs are commands and exposure times, outputs the truth, the IMU, and the solutions.
+2. `variables` is the table of its variables. The model description and the unit's program are generated from it.
+3. `write_unit` writes the file. Its program (`data/fmu/laboratory.c`) starts a Python with skysim, which runs
+   `data/fmu/laboratory_slave.py`.
+"""
+
+import hashlib
+import json
+import math
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Iterable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+import skysim
+from skysim.core.errors import InputError
+from skysim.core.files import make_folder, temporary_path, write_text
+from skysim.core.paths import DATA
+from skysim.core.types import ROUNDING, Floats, Record
+from skysim.scene.loader import keys_of
+from skysim.scene.scene import Scene
+from skysim.simulation.flight import Flight, Schedule, Shot
+from skysim.simulation.lab import build_lab
+
+SOURCES = DATA / "fmu"
+
+# Unit and description of each variable; those of a camera have its name before them.
+DESCRIPTIONS = {
+    "t_s": ("s", "Time since the scene's start"),
+    "seed": ("", "Seed of the run; the hardware stays"),
+    "torque_nm": ("N.m", "Torque in body axes that replaces that of the scene's controller"),
+    "torque_nm_given": ("", "Whether the torque replaces that of the controller"),
+    "exposure_s": ("s", "Exposure time of the frames that become due; up to the scene's"),
+    "true.lab_from_body_xyzw": ("", "True attitude: quaternion, scalar last"),
+    "true.rate_body_rad_s": ("rad/s", "True rate in body axes"),
+    "true.wheel_rad_s": ("rad/s", "Speeds of the reaction wheels"),
+    "true.gimbal_rad": ("rad", "Angles of the gimbals"),
+    "imu.angle_rad": ("rad", "Sum of the gyros' angle increments over the step, in body axes"),
+    "imu.velocity_m_s": ("m/s", "Sum of the accelerometers' velocity increments"),
+    "imu.samples": ("", "Number of samples in the step"),
+    "imu.saturated": ("", "Whether a gyro was saturated in the step"),
+    "imu.lab_from_body_xyzw": ("", "Attitude of the inertial navigator"),
+    "filter.lab_from_body_xyzw": ("", "Attitude of the filter"),
+    "filter.rate_body_rad_s": ("rad/s", "Rate of the filter in body axes"),
+    "filter.sigma_rad": ("rad", "Standard deviation of its attitude about the body's axes"),
+    "frame": ("", "Number of the last frame that became due; -1 before the first"),
+    "is_new": ("", "Whether a frame became due in the step"),
+    "t_mid_s": ("s", "Its time of mid-exposure, as the camera gives it"),
+    "exposed_s": ("s", "Its exposure time"),
+    "solved": ("", "Whether the star tracker has its attitude"),
+    "cam_from_ref_xyzw": ("", "The tracker's attitude; the lab is the reference; NaN if none"),
+    "sigma_rad": ("rad", "Its standard deviation about the camera's axes; NaN if none"),
+    "true_t_mid_s": ("s", "True time of mid-exposure"),
+    "true_cam_from_ref_xyzw": ("", "True mean attitude of the camera over the exposure"),
+}
+# Of these powers of SI base units.
+UNITS = {
+    "s": {"s": 1},
+    "rad": {"rad": 1},
+    "rad/s": {"rad": 1, "s": -1},
+    "m/s": {"m": 1, "s": -1},
+    "N.m": {"kg": 1, "m": 2, "s": -2},
+}
+
+
+class UnitVariable(NamedTuple):
+    """A variable of the unit.
+
+    Attributes
+    ----------
+    name, unit, description
+        As in the model description
+    causality
+        independent, parameter, input or output
+    start
+        Value at the beginning: a bool, an int, a float, or an array of floats
+    """
+
+    name: str
+    causality: str
+    unit: str
+    description: str
+    start: Any
+
+    @property
+    def code(self) -> str:
+        """Type, as `struct` writes it: ? (Boolean), q (Int64) or d (Float64)."""
+        return {bool: "?", int: "q"}.get(type(self.start), "d")
+
+
+class LabUnit:
+    """A scene in flight without end, which another program steps. Stateful.
+
+    Attributes
+    ----------
+    inputs
+        Values of the inputs at the beginning, by name
+    outputs
+        Values of the outputs now, by name
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.lab = build_lab(scene)
+        self.begin(scene.seed)
+
+    def begin(self, seed: int) -> None:
+        """Begin a flight of the same hardware with this seed."""
+        lab = self.lab.in_run(seed)
+        self.flight = Flight(lab, endless=True, keeps_history=False)
+        self.inputs: Record = {}
+        if not lab.scene.motion.is_prescribed:
+            self.inputs |= {"torque_nm": np.zeros(3), "torque_nm_given": False}
+        for schedule in self.flight.schedules:
+            scene = schedule.camera.scene
+            if not scene.tracker.exposure_control:
+                self.inputs[f"{schedule.camera.name}.exposure_s"] = scene.exposure.time_s
+        self.outputs: Record = {}
+        for camera in lab.cameras:
+            self.outputs |= named(camera.name, NO_SHOT)
+        self.read_vehicle()
+        if self.flight.motion.navigation:
+            self.read_navigation()
+
+    @property
+    def period_s(self) -> float:
+        """Control period."""
+        return self.flight.motion.flight_computer.period_s
+
+    def step(self, inputs: Record, periods: int) -> None:
+        """Simulate some control periods with inputs that are held.
+
+        Raises
+        ------
+        InputError
+            For a torque that is not finite, and an exposure time beyond its limits.
+        """
+        flight = self.flight
+        for schedule in flight.schedules:
+            set_exposure(schedule, inputs)
+            self.outputs[f"{schedule.camera.name}.is_new"] = False
+        torque_nm = inputs["torque_nm"] if inputs.get("torque_nm_given") else None
+        counts: list[Record] = []
+        for _ in range(periods):
+            begin_s = flight.now_s
+            shots = flight.step(torque_nm)
+            # Without a filter a step takes no exposure.
+            shots += flight.capture_due(flight.schedules, solves=True)
+            for shot in shots:
+                self.outputs |= named(shot.camera.name, shot_values(shot))
+            if flight.motion.navigation:
+                counts.append(increments(flight, begin_s))
+        self.read_vehicle()
+        if flight.motion.navigation:
+            self.read_navigation()
+            for name in counts[0]:
+                self.outputs[f"imu.{name}"] = sum(one[name] for one in counts)
+            self.outputs["imu.saturated"] = bool(self.outputs["imu.saturated"])
+
+    def read_vehicle(self) -> None:
+        """Take the true state into the outputs; wheels and gimbals that it does not have are left out."""
+        state = self.flight.state
+        self.outputs |= {
+            "t_s": state.t_s,
+            "true.lab_from_body_xyzw": state.lab_from_body.as_quat(),
+            "true.rate_body_rad_s": state.rate_body_rad_s,
+        }
+        if len(state.wheel_rad_s):
+            self.outputs["true.wheel_rad_s"] = state.wheel_rad_s
+        if len(state.gimbal_rad):
+            self.outputs["true.gimbal_rad"] = state.gimbal_rad
+
+    def read_navigation(self) -> None:
+        """Take the attitudes of navigator and filter into the outputs, and no increments."""
+        navigation = self.flight.motion.navigation
+        assert navigation is not None
+        self.outputs |= {
+            "imu.angle_rad": np.zeros(3),
+            "imu.velocity_m_s": np.zeros(3),
+            "imu.samples": 0,
+            "imu.saturated": False,
+            "imu.lab_from_body_xyzw": xyzw(navigation.attitude_wxyz("imu")),
+        }
+        if navigation.filter:
+            self.outputs |= {
+                "filter.lab_from_body_xyzw": xyzw(navigation.attitude_wxyz("filter")),
+                "filter.rate_body_rad_s": navigation.body_rate_rad_s("filter"),
+                "filter.sigma_rad": navigation.filter.state.sigma_attitude_rad,
+            }
+
+
+def named(camera: str, values: Record) -> Record:
+    """Values of a camera by the names of their variables."""
+    return {f"{camera}.{name}": value for name, value in values.items()}
+
+
+def xyzw(wxyz: Floats) -> Floats:
+    """(4,) quaternion, scalar last."""
+    return np.roll(wxyz, -1)
+
+
+def set_exposure(schedule: Schedule, inputs: Record) -> None:
+    """Set the exposure time of a camera's next frames. Raises InputError beyond the limits."""
+    key = f"{schedule.camera.name}.exposure_s"
+    if key not in inputs:
+        return
+    longest_s = schedule.camera.scene.exposure.time_s
+    if not 0 < inputs[key] <= longest_s * (1 + ROUNDING):
+        raise InputError(
+            key, f"{inputs[key]:g} s", f"above 0, up to exposure.time, {longest_s:g} s"
+        )
+    schedule.exposure_control.exposure_s = inputs[key]
+
+
+def increments(flight: Flight, begin_s: float) -> Record:
+    """What the IMU has measured since a time: sums of its increments, and numbers of its samples."""
+    samples = flight.imu_samples(begin_s)
+    assert samples is not None
+    # Half a sample before it: rounding must neither lose a sample nor count it twice.
+    new = samples.t_s > begin_s + samples.step_s / 2
+    return {
+        "angle_rad": samples.angle_rad[new].sum(axis=0),
+        "velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
+        "samples": int(new.sum()),
+        "saturated": int(samples.saturated[new].sum()),
+    }
+
+
+NO_SHOT: Record = {
+    "frame": -1,
+    "is_new": False,
+    "t_mid_s": math.nan,
+    "exposed_s": math.nan,
+    "solved": False,
+    "cam_from_ref_xyzw": np.full(4, math.nan),
+    "sigma_rad": np.full(3, math.nan),
+    "true_t_mid_s": math.nan,
+    "true_cam_from_ref_xyzw": np.full(4, math.nan),
+}
+
+
+def shot_values(shot: Shot) -> Record:
+    """The values of `NO_SHOT` for an exposure."""
+    assert shot.report is not None
+    attitude = shot.report.attitude
+    values = NO_SHOT | {
+        "frame": shot.frame.index,
+        "is_new": True,
+        "t_mid_s": shot.frame.t_mid_s,
+        "exposed_s": shot.frame.exposure_s,
+        "solved": attitude.solved,
+        "true_t_mid_s": shot.truth.t_s,
+        "true_cam_from_ref_xyzw": shot.truth.mean_cam_from_lab.as_quat(),
+    }
+    if attitude.cam_from_ref is not None:
+        values["cam_from_ref_xyzw"] = attitude.cam_from_ref.as_quat()
+    if attitude.covariance_rad2 is not None:
+        values["sigma_rad"] = np.sqrt(np.diag(attitude.covariance_rad2))
+    return values
+
+
+def variables(unit: LabUnit) -> list[UnitVariable]:
+    """The variables of a unit that has just begun; their value references are their indices."""
+    outputs = dict(unit.outputs)
+    causes = {
+        "independent": {"t_s": outputs.pop("t_s")},
+        "parameter": {"seed": unit.lab.scene.seed},
+        "input": unit.inputs,
+        "output": outputs,
+    }
+    table = []
+    for causality, values in causes.items():
+        for name, value in values.items():
+            texts = DESCRIPTIONS.get(name) or DESCRIPTIONS[name.partition(".")[2]]
+            table.append(UnitVariable(name, causality, *texts, value))
+    return table
+
+
+# The file.
+
+
+def require_builder(key: str) -> None:
+    """Raise InputError if the package that describes and builds units is not installed."""
+    if find_spec("pythonfmu3") is None:
+        raise InputError(
+            key, "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'"
+        )
+
+
+def write_unit(path: Path, scene: Scene) -> None:
+    """Write a scene as a unit of co-simulation.
+
+    It runs on Linux, with the Python that has written it.
+
+    Raises
+    ------
+    InputError
+        Without pythonfmu3, a C compiler or Linux, and for a scene that was changed after it was loaded.
+    """
+    require_builder("--out")
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if platform.system() != "Linux" or compiler is None:
+        raise InputError("--out", f"{path.name} needs Linux and a C compiler", "cc in PATH")
+    keys = keys_of(scene)
+    unit = LabUnit(scene)
+    table = variables(unit)
+    setup = yaml.safe_dump({"path": str(Path(skysim.__file__).parents[1]), "scene": keys})
+    token = hashlib.sha256(f"{setup}{table}".encode()).hexdigest()
+    name = re.sub(r"\W|^(?=\d)", "_", scene.name)
+    with tempfile.TemporaryDirectory() as folder:
+        library = compile_program(Path(folder), compiler, program_table(unit, table, token))
+        make_folder(path.parent)
+        with temporary_path(path) as temporary:
+            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+                archive.writestr("modelDescription.xml", describe(unit, table, name, token))
+                archive.write(library, f"binaries/{platform.machine()}-linux/{name}.so")
+                archive.write(SOURCES / SLAVE, f"resources/{SLAVE}")
+                archive.writestr("resources/laboratory.yaml", setup)
+            temporary.replace(path)
+
+
+SLAVE = "laboratory_slave.py"
+
+
+def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str) -> bytes:
+    """The model description (XML) of a unit."""
+    import pythonfmu3
+    from pythonfmu3.default_experiment import DefaultExperiment
+    from pythonfmu3.unit import Unit
+    from pythonfmu3.variables import Dimension
+
+    model = pythonfmu3.Fmi3Slave(instance_name=name)
+    model.modelName = name
+    model.guid = token
+    model.description = unit.lab.scene.title
+    stop_s = math.ceil(unit.lab.duration_s / unit.period_s) * unit.period_s
+    model.default_experiment = DefaultExperiment(0.0, stop_s, unit.period_s)
+    model.register_units([Unit(symbol, **powers) for symbol, powers in UNITS.items()])
+    kinds = {"d": pythonfmu3.Float64, "q": pythonfmu3.Int64, "?": pythonfmu3.Boolean}
+    for one in table:
+        value = np.asarray(one.start)
+        changes = "continuous" if one.code == "d" else "discrete"
+        if one.causality == "parameter":
+            changes = "fixed"
+        variable = kinds[one.code](
+            one.name,
+            causality=pythonfmu3.Fmi3Causality[one.causality],
+            variability=pythonfmu3.Fmi3Variability[changes],
+            description=one.description,
+            dimensions=[Dimension(str(size)) for size in value.shape],
+            getter=value.tolist,
+            **({"unit": one.unit} if one.unit else {}),
+        )
+        model.register_variable(variable, nested=False)
+    xml = model.to_xml()
+    xml.set("generationTool", f"skysim {skysim.__version__}")
+    simulation = xml.find("CoSimulation")
+    simulation.set("canHandleVariableCommunicationStepSize", "true")
+    simulation.set("fixedInternalStepSize", repr(unit.period_s))
+    ElementTree.indent(xml)
+    return ElementTree.tostring(xml, "utf-8", xml_declaration=True)
+
+
+def program_table(unit: LabUnit, table: Iterable[UnitVariable], token: str) -> str:
+    """The header `variables.h` of the unit's program: its variables and the Python that it starts."""
+    rows = []
+    starts: list[str] = []
+    access = {"input": "i", "parameter": "p"}
+    for one in table:
+        values = np.ravel(one.start)
+        may = access.get(one.causality, "r")
+        rows.append(f"    {{'{one.code}', '{may}', {len(starts)}, {len(values)}}},")
+        for value in values.tolist():
+            number = f".real = {value!r}" if one.code == "d" else f".whole = {int(value)}"
+            starts.append(f"    {{{number.replace('nan', 'NAN')}}},")
+    lines = [
+        f'#define TOKEN "{token}"',
+        f"#define PYTHON {json.dumps(sys.executable)}",
+        f"#define PERIOD_S {unit.period_s!r}",
+        f"#define CELLS {len(starts)}",
+        "static const Variable VARIABLES[] = {",
+        *rows,
+        "};",
+        "static const Cell STARTS[CELLS] = {",
+        *starts,
+        "};",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def compile_program(folder: Path, compiler: str, header: str) -> Path:
+    """Compile the unit's program in a folder; return the shared library. Raises InputError if the compiler fails."""
+    import pythonfmu3
+
+    write_text(folder / "variables.h", header)
+    standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
+    library = folder / "laboratory.so"
+    words = [compiler, "-std=gnu11", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"]
+    words += [f"-I{folder}", f"-I{standard}", str(SOURCES / "laboratory.c"), "-lm"]
+    done = subprocess.run([*words, "-o", str(library)], capture_output=True, text=True)
+    if done.returncode:
+        raise InputError("--out", f"{compiler} failed: {done.stderr.strip()[-300:]}")
+    return library
