@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-SETUP = yaml.safe_load((Path(__file__).parent / "laboratory.yaml").read_text(encoding="utf-8"))
+SETUP = yaml.safe_load(
+    (Path(__file__).parent / "laboratory.yaml").read_text(encoding="utf-8")
+)
 sys.path.insert(0, SETUP["path"])
 
 from skysim.core.errors import InputError  # noqa: E402

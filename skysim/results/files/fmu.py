@@ -34,6 +34,7 @@ from skysim.scene.loader import keys_of
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Schedule, Shot
 from skysim.simulation.lab import build_lab
+from skysim.simulation.timing import longest_live_s
 
 SOURCES = DATA / "fmu"
 
@@ -42,13 +43,20 @@ DESCRIPTIONS = {
     "t_s": ("s", "Time since the scene's start"),
     "seed": ("", "Seed of the run; the hardware stays"),
     "torque_nm": ("N.m", "Torque in body axes that replaces that of the scene's controller"),
-    "torque_nm_given": ("", "Whether the torque replaces that of the controller"),
-    "exposure_s": ("s", "Exposure time of the frames that become due; up to the scene's"),
+    "wheels_nm": ("N.m", "Torques of the wheels' motors"),
+    "cmgs_rad_s": ("rad/s", "Rates of the gimbals"),
+    "fans_n": ("N", "Thrusts of the fans"),
+    "ideal_nm": ("N.m", "Torque of the ideal actuator in body axes"),
+    "given": ("", "Whether this command holds; else the scene's controller acts"),
+    "exposure_s": ("s", "Exposure time of the frames that become due"),
     "true.lab_from_body_xyzw": ("", "True attitude: quaternion, scalar last"),
     "true.rate_body_rad_s": ("rad/s", "True rate in body axes"),
     "true.wheel_rad_s": ("rad/s", "Speeds of the reaction wheels"),
     "true.gimbal_rad": ("rad", "Angles of the gimbals"),
-    "imu.angle_rad": ("rad", "Sum of the gyros' angle increments over the step, in body axes"),
+    "imu.angle_rad": (
+        "rad",
+        "Sum of the gyros' angle increments over the step, in body axes",
+    ),
     "imu.velocity_m_s": ("m/s", "Sum of the accelerometers' velocity increments"),
     "imu.samples": ("", "Number of samples in the step"),
     "imu.saturated": ("", "Whether a gyro was saturated in the step"),
@@ -61,7 +69,10 @@ DESCRIPTIONS = {
     "t_mid_s": ("s", "Its time of mid-exposure, as the camera gives it"),
     "exposed_s": ("s", "Its exposure time"),
     "solved": ("", "Whether the star tracker has its attitude"),
-    "cam_from_ref_xyzw": ("", "The tracker's attitude; the lab is the reference; NaN if none"),
+    "cam_from_ref_xyzw": (
+        "",
+        "The tracker's attitude; the lab is the reference; NaN if none",
+    ),
     "sigma_rad": ("rad", "Its standard deviation about the camera's axes; NaN if none"),
     "true_t_mid_s": ("s", "True time of mid-exposure"),
     "true_cam_from_ref_xyzw": ("", "True mean attitude of the camera over the exposure"),
@@ -72,8 +83,11 @@ UNITS = {
     "rad": {"rad": 1},
     "rad/s": {"rad": 1, "s": -1},
     "m/s": {"m": 1, "s": -1},
+    "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
 }
+# Inputs of single motors by the key of their actuators.
+MOTORS = {"wheels": "wheels_nm", "cmgs": "cmgs_rad_s", "fans": "fans_n", "ideal": "ideal_nm"}
 
 
 class UnitVariable(NamedTuple):
@@ -122,7 +136,9 @@ class LabUnit:
         self.flight = Flight(lab, endless=True, keeps_history=False)
         self.inputs: Record = {}
         if not lab.scene.motion.is_prescribed:
-            self.inputs |= {"torque_nm": np.zeros(3), "torque_nm_given": False}
+            self.inputs |= command("torque_nm", 3)
+            for key, motors in self.flight.motion.flight_computer.actuator_sets.items():
+                self.inputs |= command(MOTORS[key], len(motors.command_map()[0]))
         for schedule in self.flight.schedules:
             scene = schedule.camera.scene
             if not scene.tracker.exposure_control:
@@ -145,17 +161,18 @@ class LabUnit:
         Raises
         ------
         InputError
-            For a torque that is not finite, and an exposure time beyond its limits.
+            For commands that are not finite, and an exposure time beyond its limits.
         """
         flight = self.flight
         for schedule in flight.schedules:
             set_exposure(schedule, inputs)
             self.outputs[f"{schedule.camera.name}.is_new"] = False
-        torque_nm = inputs["torque_nm"] if inputs.get("torque_nm_given") else None
+        given = {key: inputs[key] for key in inputs if inputs.get(f"{key}_given")}
+        motors = {key: given[name] for key, name in MOTORS.items() if name in given}
         counts: list[Record] = []
         for _ in range(periods):
             begin_s = flight.now_s
-            shots = flight.step(torque_nm)
+            shots = flight.step(given.get("torque_nm"), motors)
             # Without a filter a step takes no exposure.
             shots += flight.capture_due(flight.schedules, solves=True)
             for shot in shots:
@@ -201,6 +218,11 @@ class LabUnit:
             }
 
 
+def command(name: str, size: int) -> Record:
+    """A command at the beginning, when the scene's controller acts."""
+    return {name: np.zeros(size), f"{name}_given": False}
+
+
 def named(camera: str, values: Record) -> Record:
     """Values of a camera by the names of their variables."""
     return {f"{camera}.{name}": value for name, value in values.items()}
@@ -216,11 +238,9 @@ def set_exposure(schedule: Schedule, inputs: Record) -> None:
     key = f"{schedule.camera.name}.exposure_s"
     if key not in inputs:
         return
-    longest_s = schedule.camera.scene.exposure.time_s
+    longest_s = longest_live_s(schedule.camera.scene)
     if not 0 < inputs[key] <= longest_s * (1 + ROUNDING):
-        raise InputError(
-            key, f"{inputs[key]:g} s", f"above 0, up to exposure.time, {longest_s:g} s"
-        )
+        raise InputError(key, f"{inputs[key]:g} s", f"above 0, up to {longest_s:g} s")
     schedule.exposure_control.exposure_s = inputs[key]
 
 
@@ -283,7 +303,8 @@ def variables(unit: LabUnit) -> list[UnitVariable]:
     table = []
     for causality, values in causes.items():
         for name, value in values.items():
-            texts = DESCRIPTIONS.get(name) or DESCRIPTIONS[name.partition(".")[2]]
+            own = re.sub(r"^\w+(\.|_(?=given$))", "", name)
+            texts = DESCRIPTIONS.get(name) or DESCRIPTIONS[own]
             table.append(UnitVariable(name, causality, *texts, value))
     return table
 
