@@ -1,7 +1,8 @@
 """A laboratory as a unit of co-simulation (FMI 3.0), for Simulink and other tools.
 
 1. `LabUnit` flies a scene: inputs are commands and exposure times, outputs the truth, the IMU, and the solutions.
-2. `variables` is the table of its variables. The model description and the unit's program are generated from it.
+2. `variables` is the table of its variables, with the texts of `data/fmu/variables.yaml`. The model description and the
+   unit's program are generated from it.
 3. `write_unit` writes the file. Its program (`data/fmu/laboratory.c`) starts a Python with skysim, which runs
    `data/fmu/laboratory_slave.py`.
 """
@@ -29,7 +30,7 @@ import skysim
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, temporary_path, write_text
 from skysim.core.paths import DATA
-from skysim.core.types import ROUNDING, Floats, Record
+from skysim.core.types import ROUNDING, Record
 from skysim.scene.loader import keys_of
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Schedule, Shot
@@ -38,46 +39,7 @@ from skysim.simulation.timing import longest_live_s
 
 SOURCES = DATA / "fmu"
 
-# Unit and description of each variable; those of a camera have its name before them.
-DESCRIPTIONS = {
-    "t_s": ("s", "Time since the scene's start"),
-    "seed": ("", "Seed of the run; the hardware stays"),
-    "torque_nm": ("N.m", "Torque in body axes that replaces that of the scene's controller"),
-    "wheels_nm": ("N.m", "Torques of the wheels' motors"),
-    "cmgs_rad_s": ("rad/s", "Rates of the gimbals"),
-    "fans_n": ("N", "Thrusts of the fans"),
-    "ideal_nm": ("N.m", "Torque of the ideal actuator in body axes"),
-    "given": ("", "Whether this command holds; else the scene's controller acts"),
-    "exposure_s": ("s", "Exposure time of the frames that become due"),
-    "true.lab_from_body_xyzw": ("", "True attitude: quaternion, scalar last"),
-    "true.rate_body_rad_s": ("rad/s", "True rate in body axes"),
-    "true.wheel_rad_s": ("rad/s", "Speeds of the reaction wheels"),
-    "true.gimbal_rad": ("rad", "Angles of the gimbals"),
-    "imu.angle_rad": (
-        "rad",
-        "Sum of the gyros' angle increments over the step, in body axes",
-    ),
-    "imu.velocity_m_s": ("m/s", "Sum of the accelerometers' velocity increments"),
-    "imu.samples": ("", "Number of samples in the step"),
-    "imu.saturated": ("", "Whether a gyro was saturated in the step"),
-    "imu.lab_from_body_xyzw": ("", "Attitude of the inertial navigator"),
-    "filter.lab_from_body_xyzw": ("", "Attitude of the filter"),
-    "filter.rate_body_rad_s": ("rad/s", "Rate of the filter in body axes"),
-    "filter.sigma_rad": ("rad", "Standard deviation of its attitude about the body's axes"),
-    "frame": ("", "Number of the last frame that became due; -1 before the first"),
-    "is_new": ("", "Whether a frame became due in the step"),
-    "t_mid_s": ("s", "Its time of mid-exposure, as the camera gives it"),
-    "exposed_s": ("s", "Its exposure time"),
-    "solved": ("", "Whether the star tracker has its attitude"),
-    "cam_from_ref_xyzw": (
-        "",
-        "The tracker's attitude; the lab is the reference; NaN if none",
-    ),
-    "sigma_rad": ("rad", "Its standard deviation about the camera's axes; NaN if none"),
-    "true_t_mid_s": ("s", "True time of mid-exposure"),
-    "true_cam_from_ref_xyzw": ("", "True mean attitude of the camera over the exposure"),
-}
-# Of these powers of SI base units.
+# Powers of SI base units in the units of `variables.yaml`.
 UNITS = {
     "s": {"s": 1},
     "rad": {"rad": 1},
@@ -86,8 +48,6 @@ UNITS = {
     "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
 }
-# Inputs of single motors by the key of their actuators.
-MOTORS = {"wheels": "wheels_nm", "cmgs": "cmgs_rad_s", "fans": "fans_n", "ideal": "ideal_nm"}
 
 
 class UnitVariable(NamedTuple):
@@ -135,20 +95,19 @@ class LabUnit:
         lab = self.lab.in_run(seed)
         self.flight = Flight(lab, endless=True, keeps_history=False)
         self.inputs: Record = {}
-        if not lab.scene.motion.is_prescribed:
-            self.inputs |= command("torque_nm", 3)
-            for key, motors in self.flight.motion.flight_computer.actuator_sets.items():
-                self.inputs |= command(MOTORS[key], len(motors.command_map()[0]))
-        for schedule in self.flight.schedules:
-            scene = schedule.camera.scene
-            if not scene.tracker.exposure_control:
-                self.inputs[f"{schedule.camera.name}.exposure_s"] = scene.exposure.time_s
         self.outputs: Record = {}
+        if not lab.scene.motion.is_prescribed:
+            sets = self.flight.motion.flight_computer.actuator_sets
+            motors = {key: len(one.command_map()[0]) for key, one in sets.items()}
+            for name, size in {"torque_nm": 3, **motors}.items():
+                self.inputs |= {name: np.zeros(size), f"{name}_given": False}
         for camera in lab.cameras:
-            self.outputs |= named(camera.name, NO_SHOT)
-        self.read_vehicle()
+            self.outputs |= {f"{camera.name}.{name}": NO_SHOT[name] for name in NO_SHOT}
+            if not camera.scene.tracker.exposure_control:
+                self.inputs[f"{camera.name}.exposure_s"] = camera.scene.exposure.time_s
         if self.flight.motion.navigation:
-            self.read_navigation()
+            self.outputs |= NO_INCREMENTS
+        self.read_state()
 
     @property
     def period_s(self) -> float:
@@ -167,70 +126,71 @@ class LabUnit:
         for schedule in flight.schedules:
             set_exposure(schedule, inputs)
             self.outputs[f"{schedule.camera.name}.is_new"] = False
-        given = {key: inputs[key] for key in inputs if inputs.get(f"{key}_given")}
-        motors = {key: given[name] for key, name in MOTORS.items() if name in given}
-        counts: list[Record] = []
+        motors = {key: inputs[key] for key in inputs if inputs.get(f"{key}_given")}
+        torque_nm = motors.pop("torque_nm", None)
+        self.outputs |= {
+            name: NO_INCREMENTS[name] for name in NO_INCREMENTS if name in self.outputs
+        }
         for _ in range(periods):
             begin_s = flight.now_s
-            shots = flight.step(given.get("torque_nm"), motors)
+            shots = flight.step(torque_nm, motors)
             # Without a filter a step takes no exposure.
             shots += flight.capture_due(flight.schedules, solves=True)
             for shot in shots:
-                self.outputs |= named(shot.camera.name, shot_values(shot))
-            if flight.motion.navigation:
-                counts.append(increments(flight, begin_s))
-        self.read_vehicle()
-        if flight.motion.navigation:
-            self.read_navigation()
-            for name in counts[0]:
-                self.outputs[f"imu.{name}"] = sum(one[name] for one in counts)
-            self.outputs["imu.saturated"] = bool(self.outputs["imu.saturated"])
+                values = shot_values(shot)
+                self.outputs |= {
+                    f"{shot.camera.name}.{name}": values[name] for name in values
+                }
+            self.add_increments(begin_s)
+        self.read_state()
 
-    def read_vehicle(self) -> None:
-        """Take the true state into the outputs; wheels and gimbals that it does not have are left out."""
+    def add_increments(self, begin_s: float) -> None:
+        """Add what the IMU has measured since a time."""
+        samples = self.flight.imu_samples(begin_s)
+        if samples is None:
+            return
+        # Half a sample before it: rounding must neither lose a sample nor count it twice.
+        new = samples.t_s > begin_s + samples.step_s / 2
+        sums = {
+            "imu.angle_rad": samples.angle_rad[new].sum(axis=0),
+            "imu.velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
+            "imu.samples": int(new.sum()),
+        }
+        self.outputs |= {name: self.outputs[name] + one for name, one in sums.items()}
+        self.outputs["imu.saturated"] |= bool(samples.saturated[new].any())
+
+    def read_state(self) -> None:
+        """Take the true state and the attitudes of navigator and filter into the outputs."""
         state = self.flight.state
+        navigation = self.flight.motion.navigation
         self.outputs |= {
             "t_s": state.t_s,
             "true.lab_from_body_xyzw": state.lab_from_body.as_quat(),
             "true.rate_body_rad_s": state.rate_body_rad_s,
         }
+        # An array of no values is no variable.
         if len(state.wheel_rad_s):
             self.outputs["true.wheel_rad_s"] = state.wheel_rad_s
         if len(state.gimbal_rad):
             self.outputs["true.gimbal_rad"] = state.gimbal_rad
-
-    def read_navigation(self) -> None:
-        """Take the attitudes of navigator and filter into the outputs, and no increments."""
-        navigation = self.flight.motion.navigation
-        assert navigation is not None
-        self.outputs |= {
-            "imu.angle_rad": np.zeros(3),
-            "imu.velocity_m_s": np.zeros(3),
-            "imu.samples": 0,
-            "imu.saturated": False,
-            "imu.lab_from_body_xyzw": xyzw(navigation.attitude_wxyz("imu")),
-        }
-        if navigation.filter:
+        if navigation:
+            self.outputs["imu.lab_from_body_xyzw"] = np.roll(
+                navigation.attitude_wxyz("imu"), -1
+            )
+        if navigation and navigation.filter:
             self.outputs |= {
-                "filter.lab_from_body_xyzw": xyzw(navigation.attitude_wxyz("filter")),
-                "filter.rate_body_rad_s": navigation.body_rate_rad_s("filter"),
+                "filter.lab_from_body_xyzw": np.roll(navigation.attitude_wxyz("filter"), -1),
+                "filter.rate_body_rad_s": navigation.filter.rate_rad_s,
                 "filter.sigma_rad": navigation.filter.state.sigma_attitude_rad,
             }
 
 
-def command(name: str, size: int) -> Record:
-    """A command at the beginning, when the scene's controller acts."""
-    return {name: np.zeros(size), f"{name}_given": False}
-
-
-def named(camera: str, values: Record) -> Record:
-    """Values of a camera by the names of their variables."""
-    return {f"{camera}.{name}": value for name, value in values.items()}
-
-
-def xyzw(wxyz: Floats) -> Floats:
-    """(4,) quaternion, scalar last."""
-    return np.roll(wxyz, -1)
+NO_INCREMENTS: Record = {
+    "imu.angle_rad": np.zeros(3),
+    "imu.velocity_m_s": np.zeros(3),
+    "imu.samples": 0,
+    "imu.saturated": False,
+}
 
 
 def set_exposure(schedule: Schedule, inputs: Record) -> None:
@@ -242,20 +202,6 @@ def set_exposure(schedule: Schedule, inputs: Record) -> None:
     if not 0 < inputs[key] <= longest_s * (1 + ROUNDING):
         raise InputError(key, f"{inputs[key]:g} s", f"above 0, up to {longest_s:g} s")
     schedule.exposure_control.exposure_s = inputs[key]
-
-
-def increments(flight: Flight, begin_s: float) -> Record:
-    """What the IMU has measured since a time: sums of its increments, and numbers of its samples."""
-    samples = flight.imu_samples(begin_s)
-    assert samples is not None
-    # Half a sample before it: rounding must neither lose a sample nor count it twice.
-    new = samples.t_s > begin_s + samples.step_s / 2
-    return {
-        "angle_rad": samples.angle_rad[new].sum(axis=0),
-        "velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
-        "samples": int(new.sum()),
-        "saturated": int(samples.saturated[new].sum()),
-    }
 
 
 NO_SHOT: Record = {
@@ -300,12 +246,13 @@ def variables(unit: LabUnit) -> list[UnitVariable]:
         "input": unit.inputs,
         "output": outputs,
     }
+    texts = yaml.safe_load((SOURCES / "variables.yaml").read_text(encoding="utf-8"))
     table = []
     for causality, values in causes.items():
         for name, value in values.items():
             own = re.sub(r"^\w+(\.|_(?=given$))", "", name)
-            texts = DESCRIPTIONS.get(name) or DESCRIPTIONS[own]
-            table.append(UnitVariable(name, causality, *texts, value))
+            unit_of, description = texts.get(name) or texts[own]
+            table.append(UnitVariable(name, causality, unit_of, description, value))
     return table
 
 
@@ -330,10 +277,10 @@ def write_unit(path: Path, scene: Scene) -> None:
     InputError
         Without pythonfmu3, a C compiler or Linux, and for a scene that was changed after it was loaded.
     """
-    require_builder("--out")
-    compiler = shutil.which("cc") or shutil.which("gcc")
+    require_builder("export.file")
+    compiler = shutil.which("cc")
     if platform.system() != "Linux" or compiler is None:
-        raise InputError("--out", f"{path.name} needs Linux and a C compiler", "cc in PATH")
+        raise InputError("export.file", f"{path.name} needs Linux and a C compiler, cc")
     keys = keys_of(scene)
     unit = LabUnit(scene)
     table = variables(unit)
@@ -432,5 +379,5 @@ def compile_program(folder: Path, compiler: str, header: str) -> Path:
     words += [f"-I{folder}", f"-I{standard}", str(SOURCES / "laboratory.c"), "-lm"]
     done = subprocess.run([*words, "-o", str(library)], capture_output=True, text=True)
     if done.returncode:
-        raise InputError("--out", f"{compiler} failed: {done.stderr.strip()[-300:]}")
+        raise InputError("export.file", f"{compiler} failed: {done.stderr.strip()[-300:]}")
     return library

@@ -50,7 +50,7 @@ def scenes_export(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Output file: .xml, .fmu; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+            help="Output file: .xml, .fmu; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj. Else out/SCENE.xml."
         ),
     ] = None,
     paper: Annotated[
