@@ -30,10 +30,9 @@ typedef union {
 } Cell;
 
 typedef struct {
-    char type;     /* d: Float64, q: Int64, ?: Boolean */
-    char access;   /* i: input, p: parameter, r: only read */
-    size_t first;  /* of its cells */
-    size_t size;
+    char type; /* d: Float64, q: Int64, ?: Boolean */
+    const char *causality;
+    size_t size; /* number of its cells */
 } Variable;
 
 #include "variables.h"
@@ -298,7 +297,16 @@ static const Variable *variable(Laboratory *lab, fmi3ValueReference reference, c
 
 static int is_settable(const Laboratory *lab, const Variable *one) {
     int is_before = lab->state == INSTANTIATED || lab->state == INITIALIZATION;
-    return (one->access == 'p' && is_before) || (one->access == 'i' && (is_before || lab->state == STEPS));
+    return (!strcmp(one->causality, "parameter") && is_before) ||
+           (!strcmp(one->causality, "input") && (is_before || lab->state == STEPS));
+}
+
+/* The cells of a variable, which lie in the order of the table. */
+static Cell *cells(Laboratory *lab, const Variable *one) {
+    Cell *first = lab->cells;
+    for (const Variable *before = VARIABLES; before < one; before++)
+        first += before->size;
+    return first;
 }
 
 #define ACCESS(NAME, TYPE, CODE, MEMBER)                                                                               \
@@ -312,7 +320,7 @@ static int is_settable(const Laboratory *lab, const Variable *one) {
             if (!one)                                                                                                  \
                 return fmi3Error;                                                                                      \
             for (size_t k = 0; k < one->size; k++)                                                                     \
-                values[at++] = (TYPE)lab->cells[one->first + k].MEMBER;                                                \
+                values[at++] = (TYPE)cells(lab, one)[k].MEMBER;                                                        \
         }                                                                                                              \
         return status;                                                                                                 \
     }                                                                                                                  \
@@ -328,7 +336,7 @@ static int is_settable(const Laboratory *lab, const Variable *one) {
                 return fail(lab, fmi3Error, "variable %u: not to be set now; allowed: inputs, and parameters before"    \
                             " the first step", (unsigned)references[n]);                                               \
             for (size_t k = 0; k < one->size; k++)                                                                     \
-                lab->cells[one->first + k].MEMBER = values[at++];                                                      \
+                cells(lab, one)[k].MEMBER = values[at++];                                                              \
             lab->is_stale = 1;                                                                                         \
         }                                                                                                              \
         return fmi3OK;                                                                                                 \

@@ -28,7 +28,7 @@ import yaml
 
 import skysim
 from skysim.core.errors import InputError
-from skysim.core.files import make_folder, temporary_path, write_text
+from skysim.core.files import make_folder, write_text
 from skysim.core.paths import DATA
 from skysim.core.types import ROUNDING, Record
 from skysim.scene.loader import keys_of
@@ -38,16 +38,7 @@ from skysim.simulation.lab import build_lab
 from skysim.simulation.timing import longest_live_s
 
 SOURCES = DATA / "fmu"
-
-# Powers of SI base units in the units of `variables.yaml`.
-UNITS = {
-    "s": {"s": 1},
-    "rad": {"rad": 1},
-    "rad/s": {"rad": 1, "s": -1},
-    "m/s": {"m": 1, "s": -1},
-    "N": {"kg": 1, "m": 1, "s": -2},
-    "N.m": {"kg": 1, "m": 2, "s": -2},
-}
+SLAVE = "laboratory_slave.py"
 
 
 class UnitVariable(NamedTuple):
@@ -107,7 +98,7 @@ class LabUnit:
                 self.inputs[f"{camera.name}.exposure_s"] = camera.scene.exposure.time_s
         if self.flight.motion.navigation:
             self.outputs |= NO_INCREMENTS
-        self.read_state()
+        self.take_state()
 
     @property
     def period_s(self) -> float:
@@ -142,7 +133,7 @@ class LabUnit:
                     f"{shot.camera.name}.{name}": values[name] for name in values
                 }
             self.add_increments(begin_s)
-        self.read_state()
+        self.take_state()
 
     def add_increments(self, begin_s: float) -> None:
         """Add what the IMU has measured since a time."""
@@ -159,7 +150,7 @@ class LabUnit:
         self.outputs |= {name: self.outputs[name] + one for name, one in sums.items()}
         self.outputs["imu.saturated"] |= bool(samples.saturated[new].any())
 
-    def read_state(self) -> None:
+    def take_state(self) -> None:
         """Take the true state and the attitudes of navigator and filter into the outputs."""
         state = self.flight.state
         navigation = self.flight.motion.navigation
@@ -237,6 +228,12 @@ def shot_values(shot: Shot) -> Record:
     return values
 
 
+def shipped_texts() -> Record:
+    """Units and descriptions of all variables, and the definitions of the units."""
+    found: Record = yaml.safe_load((SOURCES / "variables.yaml").read_text(encoding="utf-8"))
+    return found
+
+
 def variables(unit: LabUnit) -> list[UnitVariable]:
     """The variables of a unit that has just begun; their value references are their indices."""
     outputs = dict(unit.outputs)
@@ -246,7 +243,7 @@ def variables(unit: LabUnit) -> list[UnitVariable]:
         "input": unit.inputs,
         "output": outputs,
     }
-    texts = yaml.safe_load((SOURCES / "variables.yaml").read_text(encoding="utf-8"))
+    texts = shipped_texts()["variables"]
     table = []
     for causality, values in causes.items():
         for name, value in values.items():
@@ -290,16 +287,11 @@ def write_unit(path: Path, scene: Scene) -> None:
     with tempfile.TemporaryDirectory() as folder:
         library = compile_program(Path(folder), compiler, program_table(unit, table, token))
         make_folder(path.parent)
-        with temporary_path(path) as temporary:
-            with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                archive.writestr("modelDescription.xml", describe(unit, table, name, token))
-                archive.write(library, f"binaries/{platform.machine()}-linux/{name}.so")
-                archive.write(SOURCES / SLAVE, f"resources/{SLAVE}")
-                archive.writestr("resources/laboratory.yaml", setup)
-            temporary.replace(path)
-
-
-SLAVE = "laboratory_slave.py"
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("modelDescription.xml", describe(unit, table, name, token))
+            archive.write(library, f"binaries/{platform.machine()}-linux/{name}.so")
+            archive.write(SOURCES / SLAVE, f"resources/{SLAVE}")
+            archive.writestr("resources/laboratory.yaml", setup)
 
 
 def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str) -> bytes:
@@ -315,17 +307,16 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
     model.description = unit.lab.scene.title
     stop_s = math.ceil(unit.lab.duration_s / unit.period_s) * unit.period_s
     model.default_experiment = DefaultExperiment(0.0, stop_s, unit.period_s)
-    model.register_units([Unit(symbol, **powers) for symbol, powers in UNITS.items()])
+    units = shipped_texts()["units"]
+    model.register_units([Unit(symbol, **units[symbol]) for symbol in units])
     kinds = {"d": pythonfmu3.Float64, "q": pythonfmu3.Int64, "?": pythonfmu3.Boolean}
     for one in table:
         value = np.asarray(one.start)
-        changes = "continuous" if one.code == "d" else "discrete"
-        if one.causality == "parameter":
-            changes = "fixed"
+        is_fixed = one.causality == "parameter"
         variable = kinds[one.code](
             one.name,
             causality=pythonfmu3.Fmi3Causality[one.causality],
-            variability=pythonfmu3.Fmi3Variability[changes],
+            variability=pythonfmu3.Fmi3Variability.fixed if is_fixed else None,
             description=one.description,
             dimensions=[Dimension(str(size)) for size in value.shape],
             getter=value.tolist,
@@ -344,26 +335,20 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
 def program_table(unit: LabUnit, table: Iterable[UnitVariable], token: str) -> str:
     """The header `variables.h` of the unit's program: its variables and the Python that it starts."""
     rows = []
-    starts: list[str] = []
-    access = {"input": "i", "parameter": "p"}
+    cells: list[int] = []
     for one in table:
-        values = np.ravel(one.start)
-        may = access.get(one.causality, "r")
-        rows.append(f"    {{'{one.code}', '{may}', {len(starts)}, {len(values)}}},")
-        for value in values.tolist():
-            number = f".real = {value!r}" if one.code == "d" else f".whole = {int(value)}"
-            starts.append(f"    {{{number.replace('nan', 'NAN')}}},")
+        rows.append(f"{{'{one.code}', \"{one.causality}\", {np.size(one.start)}}},")
+        start = np.array(one.start, float if one.code == "d" else np.int64)
+        cells += start.reshape(-1).view(np.uint64).tolist()
     lines = [
         f'#define TOKEN "{token}"',
         f"#define PYTHON {json.dumps(sys.executable)}",
         f"#define PERIOD_S {unit.period_s!r}",
-        f"#define CELLS {len(starts)}",
+        f"#define CELLS {len(cells)}",
         "static const Variable VARIABLES[] = {",
         *rows,
         "};",
-        "static const Cell STARTS[CELLS] = {",
-        *starts,
-        "};",
+        f"static const uint64_t STARTS[CELLS] = {{{', '.join(map(hex, cells))}}};",
     ]
     return "\n".join(lines) + "\n"
 
