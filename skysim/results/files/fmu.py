@@ -26,7 +26,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-import skysim
+from skysim.core import __version__
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.paths import DATA
@@ -281,7 +281,7 @@ def write_unit(path: Path, scene: Scene) -> None:
     keys = keys_of(scene)
     unit = LabUnit(scene)
     table = variables(unit)
-    setup = yaml.safe_dump({"path": str(Path(skysim.__file__).parents[1]), "scene": keys})
+    setup = yaml.safe_dump({"path": str(Path(__file__).parents[3]), "scene": keys})
     token = hashlib.sha256(f"{setup}{table}".encode()).hexdigest()
     name = re.sub(r"\W|^(?=\d)", "_", scene.name)
     with tempfile.TemporaryDirectory() as folder:
@@ -324,7 +324,7 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
         )
         model.register_variable(variable, nested=False)
     xml = model.to_xml()
-    xml.set("generationTool", f"skysim {skysim.__version__}")
+    xml.set("generationTool", f"skysim {__version__}")
     simulation = xml.find("CoSimulation")
     simulation.set("canHandleVariableCommunicationStepSize", "true")
     simulation.set("fixedInternalStepSize", repr(unit.period_s))
