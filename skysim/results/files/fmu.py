@@ -1,8 +1,7 @@
 """A laboratory as a unit of co-simulation (FMI 3.0), for Simulink and other tools.
 
 1. `LabUnit` flies a scene: inputs are commands and exposure times, outputs the truth, the IMU, and the solutions.
-2. `variables` is the table of its variables, with the texts of `data/fmu/variables.yaml`. The model description and the
-   unit's program are generated from it.
+2. `variables` is the table of its variables, from which model description and program are generated.
 3. `write_unit` writes the file. Its program (`data/fmu/laboratory.c`) starts a Python with skysim, which runs
    `data/fmu/laboratory_slave.py`.
 """
@@ -46,18 +45,14 @@ class UnitVariable(NamedTuple):
 
     Attributes
     ----------
-    name, unit, description
+    name, causality
         As in the model description
-    causality
-        independent, parameter, input or output
     start
         Value at the beginning: a bool, an int, a float, or an array of floats
     """
 
     name: str
     causality: str
-    unit: str
-    description: str
     start: Any
 
     @property
@@ -154,16 +149,15 @@ class LabUnit:
         """Take the true state and the attitudes of navigator and filter into the outputs."""
         state = self.flight.state
         navigation = self.flight.motion.navigation
-        self.outputs |= {
+        values = {
             "t_s": state.t_s,
             "true.lab_from_body_xyzw": state.lab_from_body.as_quat(),
             "true.rate_body_rad_s": state.rate_body_rad_s,
+            "true.wheel_rad_s": state.wheel_rad_s,
+            "true.gimbal_rad": state.gimbal_rad,
         }
-        # An array of no values is no variable.
-        if len(state.wheel_rad_s):
-            self.outputs["true.wheel_rad_s"] = state.wheel_rad_s
-        if len(state.gimbal_rad):
-            self.outputs["true.gimbal_rad"] = state.gimbal_rad
+        # An array without values is no variable.
+        self.outputs |= {name: one for name, one in values.items() if np.size(one)}
         if navigation:
             self.outputs["imu.lab_from_body_xyzw"] = np.roll(
                 navigation.attitude_wxyz("imu"), -1
@@ -228,12 +222,6 @@ def shot_values(shot: Shot) -> Record:
     return values
 
 
-def shipped_texts() -> Record:
-    """Units and descriptions of all variables, and the definitions of the units."""
-    found: Record = yaml.safe_load((SOURCES / "variables.yaml").read_text(encoding="utf-8"))
-    return found
-
-
 def variables(unit: LabUnit) -> list[UnitVariable]:
     """The variables of a unit that has just begun; their value references are their indices."""
     outputs = dict(unit.outputs)
@@ -243,14 +231,11 @@ def variables(unit: LabUnit) -> list[UnitVariable]:
         "input": unit.inputs,
         "output": outputs,
     }
-    texts = shipped_texts()["variables"]
-    table = []
-    for causality, values in causes.items():
-        for name, value in values.items():
-            own = re.sub(r"^\w+(\.|_(?=given$))", "", name)
-            unit_of, description = texts.get(name) or texts[own]
-            table.append(UnitVariable(name, causality, unit_of, description, value))
-    return table
+    return [
+        UnitVariable(name, causality, value)
+        for causality, values in causes.items()
+        for name, value in values.items()
+    ]
 
 
 # The file.
@@ -295,7 +280,7 @@ def write_unit(path: Path, scene: Scene) -> None:
 
 
 def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str) -> bytes:
-    """The model description (XML) of a unit."""
+    """The model description (XML) of a unit, with the texts of `variables.yaml`."""
     import pythonfmu3
     from pythonfmu3.default_experiment import DefaultExperiment
     from pythonfmu3.unit import Unit
@@ -307,20 +292,24 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
     model.description = unit.lab.scene.title
     stop_s = math.ceil(unit.lab.duration_s / unit.period_s) * unit.period_s
     model.default_experiment = DefaultExperiment(0.0, stop_s, unit.period_s)
-    units = shipped_texts()["units"]
+    texts = yaml.safe_load((SOURCES / "variables.yaml").read_text(encoding="utf-8"))
+    units = texts["units"]
     model.register_units([Unit(symbol, **units[symbol]) for symbol in units])
     kinds = {"d": pythonfmu3.Float64, "q": pythonfmu3.Int64, "?": pythonfmu3.Boolean}
     for one in table:
         value = np.asarray(one.start)
+        # Without the name of a camera or of a command.
+        own = re.sub(r"^\w+(\.|_(?=given$))", "", one.name)
+        symbol, description = texts["variables"].get(one.name) or texts["variables"][own]
         is_fixed = one.causality == "parameter"
         variable = kinds[one.code](
             one.name,
             causality=pythonfmu3.Fmi3Causality[one.causality],
             variability=pythonfmu3.Fmi3Variability.fixed if is_fixed else None,
-            description=one.description,
+            description=description,
             dimensions=[Dimension(str(size)) for size in value.shape],
             getter=value.tolist,
-            **({"unit": one.unit} if one.unit else {}),
+            **({"unit": symbol} if symbol else {}),
         )
         model.register_variable(variable, nested=False)
     xml = model.to_xml()
@@ -360,9 +349,9 @@ def compile_program(folder: Path, compiler: str, header: str) -> Path:
     write_text(folder / "variables.h", header)
     standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
     library = folder / "laboratory.so"
-    words = [compiler, "-std=gnu11", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"]
-    words += [f"-I{folder}", f"-I{standard}", str(SOURCES / "laboratory.c"), "-lm"]
-    done = subprocess.run([*words, "-o", str(library)], capture_output=True, text=True)
+    words = [compiler, *"-std=gnu11 -O2 -shared -fPIC -fvisibility=hidden -o".split()]
+    words += map(str, [library, f"-I{folder}", f"-I{standard}", SOURCES / "laboratory.c"])
+    done = subprocess.run([*words, "-lm"], capture_output=True, text=True)
     if done.returncode:
         raise InputError("export.file", f"{compiler} failed: {done.stderr.strip()[-300:]}")
     return library
