@@ -6,7 +6,6 @@
    `data/fmu/laboratory_slave.py`.
 """
 
-import hashlib
 import json
 import math
 import platform
@@ -15,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import uuid
 import zipfile
 from collections.abc import Iterable
 from importlib.util import find_spec
@@ -267,7 +267,7 @@ def write_unit(path: Path, scene: Scene) -> None:
     unit = LabUnit(scene)
     table = variables(unit)
     setup = yaml.safe_dump({"path": str(Path(__file__).parents[3]), "scene": keys})
-    token = hashlib.sha256(f"{setup}{table}".encode()).hexdigest()
+    token = str(uuid.uuid4())
     name = re.sub(r"\W|^(?=\d)", "_", scene.name)
     with tempfile.TemporaryDirectory() as folder:
         library = compile_program(Path(folder), compiler, program_table(unit, table, token))
@@ -314,9 +314,11 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
         model.register_variable(variable, nested=False)
     xml = model.to_xml()
     xml.set("generationTool", f"skysim {__version__}")
-    simulation = xml.find("CoSimulation")
-    simulation.set("canHandleVariableCommunicationStepSize", "true")
-    simulation.set("fixedInternalStepSize", repr(unit.period_s))
+    abilities = {
+        "canHandleVariableCommunicationStepSize": "true",
+        "fixedInternalStepSize": repr(unit.period_s),
+    }
+    xml.find("CoSimulation").attrib.update(abilities)
     ElementTree.indent(xml)
     return ElementTree.tostring(xml, "utf-8", xml_declaration=True)
 
@@ -349,9 +351,9 @@ def compile_program(folder: Path, compiler: str, header: str) -> Path:
     write_text(folder / "variables.h", header)
     standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
     library = folder / "laboratory.so"
-    words = [compiler, *"-std=gnu11 -O2 -shared -fPIC -fvisibility=hidden -o".split()]
-    words += map(str, [library, f"-I{folder}", f"-I{standard}", SOURCES / "laboratory.c"])
-    done = subprocess.run([*words, "-lm"], capture_output=True, text=True)
+    words = [compiler, "-shared", "-fPIC", f"-I{folder}", f"-I{standard}", "-o", library]
+    words += [SOURCES / "laboratory.c", "-lm"]
+    done = subprocess.run(words, capture_output=True, text=True)
     if done.returncode:
         raise InputError("export.file", f"{compiler} failed: {done.stderr.strip()[-300:]}")
     return library
