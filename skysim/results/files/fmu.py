@@ -351,8 +351,8 @@ def compile_program(folder: Path, compiler: str, header: str) -> Path:
     write_text(folder / "variables.h", header)
     standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
     library = folder / "laboratory.so"
-    words = [compiler, "-shared", "-fPIC", f"-I{folder}", f"-I{standard}", "-o", library]
-    words += [SOURCES / "laboratory.c", "-lm"]
+    words: list[str | Path] = [compiler, "-shared", "-fPIC", f"-I{folder}", f"-I{standard}"]
+    words += ["-o", library, SOURCES / "laboratory.c", "-lm"]
     done = subprocess.run(words, capture_output=True, text=True)
     if done.returncode:
         raise InputError("export.file", f"{compiler} failed: {done.stderr.strip()[-300:]}")
