@@ -54,7 +54,8 @@ LONG = {
     "howto/tracker.md",
     "explanation/error_budget.md",
 }
-NEEDS = {"howto/query_results.md": "duckdb"}  # of the extra that `make test-slow` installs
+# Of the extras that `make test-slow` installs.
+NEEDS = {"howto/query_results.md": "duckdb", "howto/simulink.md": "fmpy"}
 # All that a page may have; the last five are not run.
 LANGUAGES = {"sh", "python", "yaml", "toml", "json", "text", "math", "c"}
 FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

@@ -88,6 +88,7 @@ OUT_OF_REACH = {
     "skysim.experiments.dataset_shards.Storage.read_text": "hands the text on to `check_manifest`",
     "skysim.experiments.datasheet.error_model.ErrorModel.read": OURS,
     "skysim.experiments.datasheet.model_fit.write_fmu": SHIPPED,
+    "skysim.results.files.fmu.describe": SHIPPED,
     "skysim.experiments.datasheet.model_fit.write_model": SHIPPED,
     "skysim.experiments.datasheet.cells.read": "columns of a store, which is opened by `open_store`",
     "skysim.experiments.dome_survey.survey_report.survey_report": "takes a picture of ours into a page",

@@ -208,6 +208,7 @@ OPTIONS = {  # the option of each function parameter, by the parameter's key in 
     "programs": "--program",
     "trackers": "--tracker",
     "export.formats": "--to",
+    "export.file": "--out",
     "dataset.formats": "--to",
     "dataset.frames_per_shard": "--shard-frames",
     "survey.tilt_deg": "--tilt",

@@ -1,7 +1,6 @@
 """Fit the constants of the error model (`error_model`) to the frames of a datasheet, test the fit, and write it."""
 
 import math
-from importlib.util import find_spec
 from itertools import combinations, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from skysim.core.errors import InputError
 from skysim.core.files import make_folder, to_json, write_text
 from skysim.core.paths import DATA
 from skysim.core.random_streams import random_stream
@@ -25,6 +23,7 @@ from skysim.experiments.datasheet.variance_components import (
     term_errors,
 )
 from skysim.experiments.study.execution import setups, trials
+from skysim.results.files.fmu import require_builder
 
 GRID = 60  # number of correlation angles that are tried
 LEAST_NOISE = 0.05  # of the mean square at a rate: noise below it cannot be separated from the slow terms
@@ -328,20 +327,12 @@ def write_model(folder: Path, constants: Record) -> list[Path]:
     return paths
 
 
-def require_fmu_builder() -> None:
-    """Raise InputError if the package that builds the units is not installed."""
-    if find_spec("pythonfmu3") is None:
-        raise InputError(
-            "datasheet.fmu", "pythonfmu3 is not installed", "after pip install 'skysim[fmu]'"
-        )
-
-
 def write_fmu(folder: Path) -> Path:
     """Build the co-simulation unit (FMI 3) from a folder of `write_model`; return its path.
 
     It runs in a Python with NumPy on the machine of the importer.
     """
-    require_fmu_builder()
+    require_builder("datasheet.fmu")
     from pythonfmu3.builder import FmuBuilder
 
     script = folder / "fmu_slave.py"

@@ -115,12 +115,12 @@ def datasheet(
 def require_outputs(markdown: Path | None, model: Path | None, fmu: bool) -> None:
     """Make the folders of the page and of the model. Raises InputError for what could not be written in the end."""
     from skysim.core import files
-    from skysim.experiments.datasheet import model_fit
+    from skysim.results.files.fmu import require_builder
 
     if fmu:
         if model is None:
             raise InputError("--fmu", "has no effect without --model", "--model FOLDER --fmu")
-        model_fit.require_fmu_builder()
+        require_builder("datasheet.fmu")
     if markdown:
         page_path(markdown)
     if model:

@@ -51,7 +51,7 @@ def scenes_export(
     out: Annotated[
         Path | None,
         Option(
-            help="Output file, .xml; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj; default: out/SCENE.xml."
+            help="Output file: .xml, .fmu; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj. Else out/SCENE.xml."
         ),
     ] = None,
     paper: Annotated[
@@ -63,20 +63,25 @@ def scenes_export(
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
-    """Write a scene as one MJCF file for MuJoCo's viewer, or what a builder of its dome needs.
+    """Write a scene for MuJoCo's viewer (.xml), as a unit of co-simulation (.fmu), or what a builder of its dome needs.
 
+    The unit is of FMI 3, for Simulink and other tools; it needs pythonfmu3 and a C compiler.
     The builder gets a list of the LEDs (.csv), a pattern of gores at full scale on pages (.pdf), in one drawing to
     print (.svg) or to cut (.dxf), or the shell with a mark at each LED as a mesh (.obj).
     """
     from skysim.core import files
-    from skysim.results.files import gore_pages, templates
+    from skysim.results.files import fmu, gore_pages, templates
     from skysim.simulation.lab import build_lab
     from skysim.sources.dome.layouts.led_list import led_list
 
     loaded = load(scene, None, seed, set_)
     path = out or Path("out") / f"{loaded.name}.xml"
-    lab = build_lab(loaded)
     ending = path.suffix.lower()
+    if ending == ".fmu":
+        fmu.write_unit(path, loaded)
+        print(f"{path}: FMI 3.0, co-simulation; its variables: fmpy info {path}")
+        return
+    lab = build_lab(loaded)
     use = f"python -m mujoco.viewer --mjcf={path}"
     if ending == ".pdf":
         files.make_folder(path.parent)
