@@ -46,6 +46,7 @@ TARGETS = {
     "orbits": (),
     "torques": (),
     "packets": (),
+    "commands": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

@@ -17,6 +17,7 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.packets import unpack
 from skysim.apps.plate_solver import picture
 from skysim.camera.psf import otf
@@ -36,6 +37,7 @@ from skysim.results.files.parts import read_prices
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 from skysim.scene import loader, opencv_calibration
+from skysim.simulation.flight import open_flight
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
@@ -244,6 +246,23 @@ def packets(data: bytes) -> None:
     rejects(lambda: unpack(BytesIO(data)), InputError)
 
 
+@cache
+def commanded_flight() -> CommandState:
+    """A flight that takes every kind of command."""
+    flight = open_flight(loader.load("simsat_bump"), keeps_history=False)
+    return CommandState(flight, 0.5, has_triggers=True)
+
+
+def commands(data: bytes) -> None:
+    """Lines of a client of the wire: what is taken must be in force without an error."""
+    state = commanded_flight()
+    inbox = Inbox()
+    for line in data.splitlines():
+        rejects(lambda line=line: inbox.put(parse(line), lambda _: None), InputError)
+    state.receive(inbox)
+    state.in_force()
+
+
 def quantities(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     rejects(lambda: units.quantity("m", "length", '"35 mm"')(text), ValueError)
@@ -269,6 +288,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         orbits,
         torques,
         packets,
+        commands,
         quantities,
     )
 }
