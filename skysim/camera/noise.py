@@ -96,7 +96,7 @@ def guide() -> NDArray[np.uint8]:
     Row k is for means from k to k + 1 over GUIDES_PER_E. Bucket b holds the count that every uniform number in
     [b, b + 1) / BUCKETS gives, or AMBIGUOUS. The last row is LARGE.
     """
-    return np.asarray(_guide())
+    return _guide()
 
 
 def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:

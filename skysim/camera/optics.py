@@ -24,7 +24,7 @@ def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
     # 1.57 is just below pi / 2, where the tangent overflows.
     tangent = np.tan(np.minimum(field_rad, 1.57))
     u = np.clip(tangent / np.tan(np.radians(config.cutoff_deg)), 0, 1)
-    return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
+    return 2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2))
 
 
 def table(config: VignettingTableConfig, field_rad: Floats) -> Floats:

@@ -195,7 +195,7 @@ def decode_guarded(path: Path, what: str, *arguments: str) -> NDArray:
             script, *arguments, str(out), cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES
         ):
             raise InputError(path, f"not {what}: {fault}")
-        return np.asarray(np.load(out))
+        return np.load(out)
 
 
 def planes(path: Path, pixels: NDArray) -> list[NDArray]:
@@ -508,7 +508,7 @@ def monochrome(image: NDArray) -> NDArray:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
         return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
-    return np.asarray(image[:, :, :3] @ LUMINANCE)
+    return image[:, :, :3] @ LUMINANCE
 
 
 class LiveCamera:
@@ -534,7 +534,7 @@ class LiveCamera:
                 self.source, "no camera found", "an index such as 0, a video file, a URL"
             )
         self.frame_count += 1
-        return np.asarray(frame)
+        return frame
 
     def close(self) -> None:
         """Release the camera."""

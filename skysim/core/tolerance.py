@@ -87,9 +87,9 @@ class Tolerance(float):
 
         probability = ndtr(normal)
         if self.parent_sigma is None:
-            return np.asarray(self.half_width * (2 * probability - 1))
+            return self.half_width * (2 * probability - 1)
         lowest = ndtr(-self.half_width / self.parent_sigma)
-        return np.asarray(self.parent_sigma * ndtri(lowest + probability * (1 - 2 * lowest)))
+        return self.parent_sigma * ndtri(lowest + probability * (1 - 2 * lowest))
 
 
 def scaled_errors(sigma: float, normal: Floats) -> Floats:

@@ -153,7 +153,7 @@ class VibrationComponent:
 
     def active(self, t_s: Floats) -> Bools:
         """(N - 1,) whether the vibration is active between each of (N,) times and the next."""
-        return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
+        return (t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:])
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
@@ -331,7 +331,7 @@ def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
         angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6
     )
     cross = np.cross(phi, phi_rate)
-    return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))
+    return phi_rate - first * cross + second * np.cross(phi, cross)
 
 
 @jit

@@ -240,7 +240,7 @@ def quaternions(path: Path, metadata: Metadata, kind: str, numbers: Floats) -> F
     line, sequence = metadata["EULER_ROT_SEQ"] if kind.startswith("EULER") else (0, "ZXZ")
     try:
         axes = sequence.upper().translate(NUMBERED)
-        return np.asarray(Rotation.from_euler(axes, angles_deg, degrees=True).as_quat())
+        return Rotation.from_euler(axes, angles_deg, degrees=True).as_quat()
     except ValueError:
         raise Where(path, line).error(
             f"EULER_ROT_SEQ = {excerpt(sequence)}", "three axes, such as 321 or ZYX"

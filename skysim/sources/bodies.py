@@ -71,9 +71,8 @@ def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
     """Spectral photon flux of a body of V = 0, in the units of `black_body_v0`."""
     # Relative to V, in which the magnitude is given.
     relative = np.array(albedo) / albedo[1]
-    return np.asarray(
-        black_body_v0(wavelength_m, temperature_k(*SUN))
-        * np.interp(wavelength_m, BANDS_M, relative)
+    return black_body_v0(wavelength_m, temperature_k(*SUN)) * np.interp(
+        wavelength_m, BANDS_M, relative
     )
 
 

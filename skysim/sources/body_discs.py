@@ -82,7 +82,7 @@ def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     if surface.earthshine:
         light += earthlit * (surface.earthshine / float(earthlit.sum()))
         light /= 1 + surface.earthshine
-    return np.asarray(light)
+    return light
 
 
 @jit

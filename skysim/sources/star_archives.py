@@ -86,7 +86,7 @@ def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
     V = Hp - (.305 (V-I) - .170 (V-I)^2 + .019 (V-I)^3), rms .037 mag (reference §2).
     """
     x = np.asarray(v_i, dtype=float)
-    return np.asarray(hp_mag - x * (0.305 - x * (0.170 - x * 0.019)))
+    return hp_mag - x * (0.305 - x * (0.170 - x * 0.019))
 
 
 def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:

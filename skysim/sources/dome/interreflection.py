@@ -160,7 +160,7 @@ def kernel(patches: Patches) -> Floats:
     cos_to = -np.einsum("ijk,jk->ij", offset, patches.normal)
     values = np.maximum(cos_from, 0) * np.maximum(cos_to, 0) / (np.pi * square**2)
     np.fill_diagonal(values, values[np.arange(len(values)), square.argmin(axis=1)])
-    return np.asarray(values)
+    return values
 
 
 def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
@@ -168,8 +168,8 @@ def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
 
     E = sum over emitters of I(theta) cos(phi) / d^2.
     """
-    return np.asarray(
-        _irradiance(np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters)
+    return _irradiance(
+        np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters
     )
 
 

@@ -50,7 +50,7 @@ FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
 
 def cosine_lobe(config: CosineLobeConfig, cos_emission: Floats) -> Floats:
     """Relative radiant intensity cos^m of the emission angle; m = 1 is a Lambertian disk."""
-    return np.asarray(np.maximum(cos_emission, 0.0) ** config.exponent)
+    return np.maximum(cos_emission, 0.0) ** config.exponent
 
 
 def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
@@ -59,7 +59,7 @@ def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
     Constant within the first angle, zero beyond the last.
     """
     angle_deg = np.degrees(np.arccos(np.clip(cos_emission, -1.0, 1.0)))
-    return np.asarray(np.interp(angle_deg, config.angle_deg, config.intensity, right=0.0))
+    return np.interp(angle_deg, config.angle_deg, config.intensity, right=0.0)
 
 
 # Arguments: its section of the scene, cosine of the angle from the LED's normal. Intensity is 1 on the normal.
