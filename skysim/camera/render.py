@@ -36,9 +36,18 @@ from skysim.camera.projection import (
 from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
 from skysim.camera.psf.kernel import DiskImages, disk_images
 from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
-from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
+from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import (
+    Bools,
+    Floats,
+    Ints,
+    Mount,
+    Singles,
+    Sources,
+    SourceTruth,
+    Trajectory,
+)
 from skysim.sources.dome.led import Emitter, lit_moments_s
 
 # Largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma).
@@ -52,7 +61,7 @@ STILL_PX = 1e-3
 MAX_PATCH_PIXELS = 1 << 20
 
 # (N,) which of N sources at `Sources.place` are occluded
-OcclusionTest = Callable[[Floats], NDArray[np.bool_]]
+OcclusionTest = Callable[[Floats], Bools]
 
 
 class Window(NamedTuple):
@@ -72,7 +81,7 @@ class Window(NamedTuple):
 
 
 def render(
-    image: NDArray[Any],
+    image: NDArray,
     sources: Sources,
     optics: Optics,
     trajectory: Trajectory,
@@ -126,7 +135,7 @@ def render(
 
 
 def truth_on_chip(
-    ids: NDArray[np.int64], tracks: Tracks, table: Floats, window: Window, rows: int
+    ids: Ints, tracks: Tracks, table: Floats, window: Window, rows: int
 ) -> SourceTruth:
     """The truth of the sources that gave light to the chip, from the table of `draw`."""
     mid_px = tracks.xy_px[len(tracks.xy_px) // 2]
@@ -190,7 +199,7 @@ def led_images(
 
 
 def draw(
-    image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
+    image: NDArray, tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
 ) -> Floats:
     """Integrate every source on a patch of its own and add the patches to the image.
 
@@ -221,7 +230,7 @@ def draw(
     return out
 
 
-def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[np.int64]:
+def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> Ints:
     """(N, 4) first column, last + 1, first row, last + 1 that each image can reach; empty where it misses the chip."""
     if not xy_px.shape[1]:
         return np.zeros((0, 4), np.int64)

@@ -227,7 +227,7 @@ def planes(path: Path, pixels: NDArray) -> list[NDArray]:
 
 def header_values(*headers: Any) -> Record:
     """ViewedImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
-    found: dict[str, str] = {}
+    found = {}
     for header in reversed(headers):
         for key in ("ROWORDER", "DATE-OBS", *MOSAIC_KEYS, *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
             with suppress(Exception):  # of many types, for a damaged card
@@ -381,7 +381,7 @@ def as_light(picture: ViewedImage) -> ViewedImage:
        the median difference of neighbors, in which few pixels have stars.
     """
     pixels = monochrome(picture.pixels)
-    notes = list[str]()
+    notes = []
     # 2. Masked pixels.
     is_float = pixels.dtype.kind == "f"
     if is_float and (masked := np.isnan(pixels)).any() and not masked.all():

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
@@ -97,11 +96,7 @@ def scaled_errors(sigma: float, normal: Floats) -> Floats:
 
     A tolerance instead of a sigma does not change the random streams.
     """
-    return (
-        sigma.from_normal(normal)
-        if isinstance(sigma, Tolerance)
-        else np.asarray(sigma * normal)
-    )
+    return sigma.from_normal(normal) if isinstance(sigma, Tolerance) else sigma * normal
 
 
 class ToleranceConfig(ConfigModel):

@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
 Bools = NDArray[np.bool_]
+Singles = NDArray[np.float32]
 
 
 def normalized(vectors: Floats) -> Floats:

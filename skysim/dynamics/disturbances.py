@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector
@@ -171,7 +170,7 @@ class DisturbanceModel:
         lab_from_body_wxyz: Floats,
         rate_body_rad_s: Floats,
         momentum_nms: Floats,
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """(K, 3) torque in body axes in each of K steps between the (K + 1,) times of a control period.
 
         Attitude (4,), rate (3,) and rotors' momentum (3,) are those at the start of the period and are held over

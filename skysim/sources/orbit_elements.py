@@ -349,7 +349,7 @@ def gravity_m_s2(position_m: Floats) -> Floats:
 def split_segments(path: str) -> list[TextSegment]:
     """The segments of an OEM file. Raises InputError for a line out of place."""
     version = ""
-    segments = list[TextSegment]()
+    segments = []
     section = ""
     for n, line in read_lines(Path(path)):
         word = line.split(maxsplit=1)[0]

@@ -24,9 +24,9 @@ from scipy import special
 
 from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, softening_sigma_px
 from skysim.camera.psf.otf import EXTENT, WINGED
-from skysim.camera.psf.splat import Singles, cubic
+from skysim.camera.psf.splat import cubic
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 CUT_SIGMA = (

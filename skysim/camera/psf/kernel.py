@@ -26,8 +26,8 @@ from scipy import fft, special
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
-from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
-from skysim.core.types import Floats, Ints
+from skysim.camera.psf.splat import PER_PX, REACH_SIGMA
+from skysim.core.types import Floats, Ints, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular

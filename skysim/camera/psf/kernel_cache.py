@@ -19,9 +19,9 @@ from skysim.camera.psf.otf import (
     chromatic_sigma_px,
     field_sigma_px,
 )
-from skysim.camera.psf.splat import PER_PX, Singles
+from skysim.camera.psf.splat import PER_PX
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints
+from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 # Kinds of kernel.

@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats
-
-Singles = NDArray[np.float32]
+from skysim.core.types import Floats, Singles
 
 PER_PX = 64  # entries of a radial table per pixel
 REACH_SIGMA = 6.5  # 7e-10 of a Gaussian's light is beyond

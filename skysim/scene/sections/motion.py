@@ -348,7 +348,7 @@ class ControlConfig(ConfigModel):
     @model_validator(mode="after")
     def check_options(self) -> ControlConfig:
         """Refuse keys that have no effect with the law."""
-        unused: list[str] = []
+        unused = []
         if self.law in BUILT_IN_LAWS:
             unused = ["options", "time_limit_s"]
         elif self.law == PRESCRIBED:

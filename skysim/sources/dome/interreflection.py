@@ -92,7 +92,7 @@ def diffuse_light(
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)
-    total = np.asarray(np.linalg.solve(np.eye(len(transfer)) - transfer, direct))
+    total = np.linalg.solve(np.eye(len(transfer)) - transfer, direct)
     # Lambertian patches of this irradiance have the radiance rho E / pi.
     strength = patches.reflectance * total * patches.area_m2 / np.pi
     linear = np.linspace(0, 1, 2)

@@ -22,14 +22,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats
-
-Ints = NDArray[np.int64]
+from skysim.core.types import Floats, Ints
 
 
 class Fields(NamedTuple):
