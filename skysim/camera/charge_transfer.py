@@ -5,7 +5,7 @@ of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers. Every function 
 
 - `bloom`: charge above the full well spreads along its column; sum and first moment are conserved.
 - `transfer_loss`: of n transfers each leaves a fraction behind; the charge arrives late by the negative binomial law.
-- `frame_transfer_smear`, `interline_smear`: charge that is moved under light collects it from every row it passes.
+- `smear`: charge that is moved under light collects it from every row it passes.
 """
 
 import functools
@@ -212,36 +212,22 @@ def _delay_columns(electrons: NDArray, fraction: NDArray) -> None:
         row[:] = gathered
 
 
-def frame_transfer_smear(light_e: NDArray, exposure_s: float, row_time_s: float) -> None:
-    """Smear of a frame-transfer chip, which is shifted into its store row by row before the exposure as after it.
+def smear(light_e: NDArray, exposure_s: float, row_time_s: float, leak: float = 1.0) -> None:
+    """Smear of a frame-transfer chip, or of an interline chip whose covered register lets the fraction `leak` through.
 
-    A pixel that ends at row y was shifted in, empty, over the rows above y (greater y) and is shifted out over those
-    below, for row_time in each. So it passes every other row of its column once, with the same brightness as in the
-    exposure, and collects row_time / exposure of each row's light L:
+    A frame-transfer chip is shifted into its store row by row before the exposure as after it. A pixel that ends at
+    row y was shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in
+    each. So it passes every other row of its column once, with the same brightness as in the exposure, and collects
+    row_time / exposure of each row's light L. The register of an interline chip is clocked all the time, so the cell
+    that takes over a pixel's charge has passed the rows above it and will pass those below, with `leak` of their light:
 
-        smear(y) = row_time / exposure sum over j != y of L(j).
+        smear(y) = leak row_time / exposure sum over j != y of L(j).
 
     Parameters
     ----------
     light_e
         (H, W) light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
         affected.
-    """
-    _smear(light_e, row_time_s / exposure_s)
-
-
-def interline_smear(
-    light_e: NDArray, exposure_s: float, row_time_s: float, leak: float
-) -> None:
-    """Smear of an interline chip: the covered register collects the fraction `leak` of the light of every row passed.
-
-    The register is clocked all the time, so the register cell that takes over a pixel's charge has passed the rows
-    above it and will pass those below: smear(y) = leak row_time / exposure sum over j != y of L(j).
-
-    Parameters
-    ----------
-    light_e
-        (H, W) light of the exposure; the smear is added in place
     """
     _smear(light_e, leak * row_time_s / exposure_s)
 

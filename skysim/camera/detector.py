@@ -256,12 +256,8 @@ def smear(
     if not isinstance(shutter, FrameTransferConfig | InterlineConfig):
         return
     with added.watch(SMEAR, light_e) if added else nullcontext():
-        if isinstance(shutter, FrameTransferConfig):
-            charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
-        else:
-            charge_transfer.interline_smear(
-                light_e, exposure_s, shutter.row_time_s, shutter.leak
-            )
+        leak = shutter.leak if isinstance(shutter, InterlineConfig) else 1.0
+        charge_transfer.smear(light_e, exposure_s, shutter.row_time_s, leak)
 
 
 class ReadoutConstants(NamedTuple):

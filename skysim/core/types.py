@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,16 @@ Singles = NDArray[np.float32]
 def normalized(vectors: Floats) -> Floats:
     """(..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+Columns = TypeVar("Columns")
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Objects of one class, whose fields are columns of equal length, as one: the rows of all, in their order."""
+    kind: Any = type(parts[0])
+    columns = ([getattr(part, name) for part in parts] for name in kind.__slots__)
+    return kind(*map(np.concatenate, columns))
 
 
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
@@ -329,14 +339,6 @@ def _closer(place: Floats, direction: Floats, chord: float) -> Ints:
         found[count] = n
         count += x * x + y * y + z * z <= chord * chord
     return found[:count]
-
-
-def with_sources(parts: Sequence[Sources]) -> Sources:
-    """All sources of several sets without motion, in their order."""
-    columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
-    return Sources(
-        **{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None}
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,8 +78,7 @@ class ControllerSetup:
 
     def as_tree(self) -> Record:
         """The set-up as a JSON object; arrays become lists."""
-        tree: Record = to_lists(asdict(self))
-        return {"skysim_controller": PROTOCOL, **tree}
+        return {"skysim_controller": PROTOCOL, **to_lists(asdict(self))}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
@@ -136,8 +135,7 @@ class ControllerInput:
 
     def as_tree(self) -> Record:
         """The input as a JSON object; arrays become lists."""
-        tree: Record = to_lists(asdict(self))
-        return tree
+        return to_lists(asdict(self))
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:

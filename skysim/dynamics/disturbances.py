@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.random import Generator
 
 from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector
@@ -93,9 +94,7 @@ class AirCurrent:
     autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
-    def __init__(
-        self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, config: AirCurrentConfig, period_s: float, rng: Generator) -> None:
         self.rms_nm = np.array(config.rms_nm)
         self.decay = math.exp(-period_s / config.correlation_s)
         self.rng = rng
@@ -143,7 +142,7 @@ class DisturbanceModel:
         impulses: tuple[Impulse, ...],
         inertia_kg_m2: Floats,
         period_s: float,
-        rng: np.random.Generator,
+        rng: Generator,
     ) -> DisturbanceModel:
         """The disturbances that the scene switches on; period_s is the control period."""
         return cls(

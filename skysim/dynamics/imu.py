@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skysim.core import quaternion
@@ -433,10 +434,10 @@ class Imu:
 
     gyro: Triad
     accelerometer: Triad
-    rng: np.random.Generator
+    rng: Generator
 
     @classmethod
-    def from_config(cls, config: ImuConfig, rng: np.random.Generator) -> Imu:
+    def from_config(cls, config: ImuConfig, rng: Generator) -> Imu:
         """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
         distribution.
         """

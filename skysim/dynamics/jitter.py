@@ -18,11 +18,12 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Bools, Floats, Ints, Trajectory
+from skysim.core.types import Bools, Floats, Ints, Trajectory, joined
 from skysim.dynamics.guidance import Reference, plan
 from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
@@ -58,12 +59,12 @@ class Sines:
     cosine_rad: Floats
 
 
-def line(config: JitterLineConfig, rng: np.random.Generator) -> Sines:
+def line(config: JitterLineConfig, rng: Generator) -> Sines:
     """One frequency: sqrt(2) rms sin(2 pi f t + phase) about each axis, with random phases."""
     return with_phases(np.array([config.frequency_hz]), np.ones(1), config.rms_arcsec, rng)
 
 
-def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
+def band(config: JitterBandConfig, rng: Generator) -> Sines:
     """A power spectral density proportional to f^slope from from_hz to to_hz, as a sum of many sines.
 
     1. Split the band into pieces of equal frequency ratio.
@@ -97,7 +98,7 @@ def with_phases(
     frequency_hz: Floats,
     power_fraction: Floats,
     rms_arcsec: Sequence[float],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Sines:
     """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis.
 
@@ -111,7 +112,7 @@ def with_phases(
 
 
 # Spectra by kind. To add one, add a class to scene/sections/motion.py and a function here.
-SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line, "band": band}
+SPECTRA: dict[str, Callable[[Any, Generator], Sines]] = {"line": line, "band": band}
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +178,7 @@ class Vibration:
     def draw(
         cls,
         motion: MotionConfig,
-        rng: np.random.Generator,
+        rng: Generator,
         reference: Reference | None = None,
     ) -> Vibration:
         """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
@@ -283,7 +284,7 @@ class Vibration:
 
 def draw_component(
     configs: Sequence[JitterPart],
-    rng: np.random.Generator,
+    rng: Generator,
     name: str,
     begin_s: float = -math.inf,
     end_s: float = math.inf,
@@ -293,17 +294,11 @@ def draw_component(
     if not active:
         return None
     return VibrationComponent(
-        concatenate([SPECTRA[config.kind](config, rng) for config in active]),
+        joined([SPECTRA[config.kind](config, rng) for config in active]),
         name,
         begin_s,
         end_s,
     )
-
-
-def concatenate(sets: Sequence[Sines]) -> Sines:
-    """The sines of several sets as one set."""
-    columns = ([getattr(sines, name) for sines in sets] for name in Sines.__slots__)
-    return Sines(*map(np.concatenate, columns))
 
 
 def subdivide(t_s: Floats, counts: Ints) -> Floats:

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import erfa
 import numpy as np
+from numpy.random import Generator
 from scipy import special
 from scipy.interpolate import RectBivariateSpline
 
@@ -138,7 +139,7 @@ def exposure_filter(turns: Floats) -> Floats:
     return 2 * (special.itj0y0(x)[0] - special.j1(x)) / x
 
 
-def factors(variances: Floats, rng: np.random.Generator) -> Floats:
+def factors(variances: Floats, rng: Generator) -> Floats:
     """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173).
 
     exp(s g - s^2 / 2) with s^2 = ln(1 + variance) and g standard normal.
@@ -254,7 +255,7 @@ class Sky:
         return replace(lights, place=place, strength=lights.strength * passed)
 
     def twinkling(
-        self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator
+        self, seen: Sources, aperture_m: float, exposure_s: float, rng: Generator
     ) -> Sources:
         """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter.
 

@@ -130,8 +130,7 @@ class Setup:
 
     def as_tree(self) -> Record:
         """The set-up as a JSON object; arrays become lists."""
-        tree: Record = to_lists(asdict(self))
-        return {"skysim_tracker": PROTOCOL, **tree}
+        return {"skysim_tracker": PROTOCOL, **to_lists(asdict(self))}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:

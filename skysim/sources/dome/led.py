@@ -12,6 +12,7 @@ from math import ceil, exp, floor, log, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
@@ -229,13 +230,13 @@ class PulseTrains(NamedTuple):
     clock: Ints
 
 
-def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> PulseTrains:
+def direct(_led: LedConfig, inputs: DriveInput, _rng: Generator) -> PulseTrains:
     """Direct current: the LED is always lit, and its level scales its strength."""
     ones = np.ones(len(inputs.level))
     return PulseTrains(ones, 0 * ones, ones, inputs.level, inputs.board)
 
 
-def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def pwm(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36), with T = led.pwm_period_s.
 
     The channels of a board have random phases and share its oscillator.
@@ -248,7 +249,7 @@ def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTr
     )
 
 
-def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def sequential(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
     Each LED of a controller has a slot T and is lit for the fraction `level` of it; the controller's cycle is the sum
@@ -284,7 +285,7 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     )
 
 
-def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def refresh(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """A panel whose rows are lit one after another once a frame, each for duty / rate.
 
     A row is delayed by its position on the panel, `row` / rate. A gray level is in the strength, because the liquid
@@ -307,7 +308,7 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
 
 
 # Drives by kind: (the LED section, the drive's input, the hardware's random stream) to the pulse trains.
-DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTrains]] = {
+DRIVES: dict[str, Callable[[LedConfig, DriveInput, Generator], PulseTrains]] = {
     "direct": direct,
     "pwm": pwm,
     "sequential": sequential,
