@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
@@ -55,6 +56,7 @@ STEP = 1.3
 MAX_PIECES = 100_000
 # Path length, in steps, up to which one piece is enough: error 1e-4 of the peak.
 SINGLE_PIECE_STEPS = 0.4
+DISK_FIELDS = len(EllipseDisk._fields)
 # An image that moves less is drawn as one point.
 STILL_PX = 1e-3
 # Pixels of patches held in memory at once, or as many as the frame has.
@@ -392,24 +394,7 @@ def _sampled(n: int, kernels: Kernels) -> Any:
     if kernels.kind[n] != ELLIPSE:
         return np.empty((0, 0, 0), np.float32)
     begin, end, waves, samples = kernels.table[n]
-    d = kernels.disk[n]
-    disk = EllipseDisk(
-        d[0],
-        d[1],
-        d[2],
-        d[3],
-        d[4],
-        d[5],
-        d[6],
-        d[7],
-        d[8],
-        d[9],
-        d[10],
-        d[11],
-        d[12],
-        d[13],
-        d[14],
-    )
+    disk = EllipseDisk(*to_fixed_tuple(kernels.disk[n], DISK_FIELDS))
     return ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
 
 

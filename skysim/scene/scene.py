@@ -36,7 +36,7 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
-from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
+from skysim.scene.sections.surroundings import Coefficients, Glow, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import OWN, FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -118,7 +118,7 @@ class HeadConfig(ConfigModel):
     position_m: Position
     rotation_deg: Spins
     mount_error_arcsec: Triple = (0.0, 0.0, 0.0)
-    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
     exposure: ExposureConfig | None = None

@@ -372,7 +372,7 @@ def fill(image: NDArray, coarse: Floats, factor: float) -> None:
         Exposure in s, for electrons
     """
     if coarse.max() == coarse.min():
-        _fill_flat(image, float(coarse[0, 0]) * factor)
+        image[:] = coarse[0, 0] * factor
     else:
         _fill_bilinear(image, coarse * factor)
 
@@ -385,13 +385,6 @@ def add(image: NDArray, glow: Floats, factor: float) -> None:
         own = np.empty_like(image)
         fill(own, glow, factor)
         image += own
-
-
-@jit(parallel=True)
-def _fill_flat(image: NDArray, value: float) -> None:
-    """Set all pixels to one value."""
-    for y in numba.prange(image.shape[0]):
-        image[y, :] = value
 
 
 @jit(parallel=True)

@@ -47,6 +47,10 @@ Wavelength = Annotated[Length, Field(ge=200e-9, le=2e-6)]
 Blur = Annotated[Number, Field(ge=0, le=20)]
 SampledBlur = Annotated[Number, Field(ge=0.2, le=20)]
 
+DiskRadius = Annotated[Number, Field(gt=0, le=200)]
+Side = Annotated[int, Field(ge=16, le=20000)]
+TransferLoss = Annotated[Number, Field(ge=0, le=1e-2)]
+
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
@@ -99,7 +103,7 @@ class DiskPsfConfig(PsfConfig):
     """A uniform disk, the geometric image of a defocused lens, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["disk"]
-    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    radius_px: DiskRadius
     sigma_px: SampledBlur = 0.7
 
 
@@ -187,7 +191,7 @@ class GhostConfig(ConfigModel):
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
     share: Annotated[Fraction, Field(gt=0)]
-    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    radius_px: DiskRadius
 
     @field_validator("magnification")
     @classmethod
@@ -413,8 +417,8 @@ class DetectorConfig(ConfigModel):
     full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
     blooming: Literal["none", "column"] = "none"
     anti_blooming: Fraction = 0.0
-    cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
-    cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    cti_parallel: TransferLoss = 0.0
+    cti_serial: TransferLoss = 0.0
     read_noise_e: Electrons = 0.0
     reset_noise_e: Electrons = 0.0
     column_offset_e: Electrons = 0.0
@@ -466,8 +470,8 @@ class CameraConfig(ConfigModel):
         Stray light of the bodies and of the Earth at their present places; none if left out
     """
 
-    width_px: Annotated[int, Field(ge=16, le=20000)]
-    height_px: Annotated[int, Field(ge=16, le=20000)]
+    width_px: Side
+    height_px: Side
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]

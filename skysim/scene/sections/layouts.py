@@ -35,6 +35,8 @@ Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
+TapeLength = Annotated[Length, Field(ge=1e-3)]
+LimitMagnitude = Annotated[Number, Field(ge=-2, le=15)]
 
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
@@ -249,8 +251,8 @@ class StringConfig(LitConfig):
     """
 
     kind: Literal["string"]
-    pitch_m: Annotated[Length, Field(ge=1e-3)]
-    spacing_m: Annotated[Length, Field(ge=1e-3)]
+    pitch_m: TapeLength
+    spacing_m: TapeLength
     winding: Literal["latitude", "spiral", "meridian"] = "latitude"
     pitch_error: NumberError = 0.0
     glue_scatter_m: LengthError = 0.0
@@ -313,7 +315,7 @@ class CelestialConfig(ConfigModel):
     cap_deg: Cap
     catalog: str = "hipparcos_hp6.5"
     count: Count | None = None
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    limit_mag: LimitMagnitude | None = None
     brightness: Literal["v", "band"] = "band"
     brightest_mag: Number | None = None
     camera_m: Position

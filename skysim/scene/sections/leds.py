@@ -34,6 +34,9 @@ from skysim.core.units import (
     with_unit,
 )
 
+Distance = Literal[3, 5, 7, 11]
+ClockError = Annotated[NumberError, Field(le=10_000)]
+
 
 class CosineLobeConfig(ConfigModel):
     """Radiant intensity proportional to cos^exponent of the angle from the normal; 1 is Lambert's law."""
@@ -142,8 +145,8 @@ class ClockConfig(ConfigModel):
         Standard deviation of the frequency drift per hour, or its tolerance; drawn by the scene's seed
     """
 
-    offset_ppm: Annotated[NumberError, Field(le=10_000)] = 50.0
-    drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
+    offset_ppm: ClockError = 50.0
+    drift_ppm_h: ClockError = 1.0
 
 
 class CodeConfig(ConfigModel):
@@ -207,14 +210,14 @@ class BchCodeConfig(TriggeredCodeConfig):
     """The shortest BCH code with enough words for the LEDs and this designed distance."""
 
     kind: Literal["bch"]
-    distance: Literal[3, 5, 7, 11] = 5
+    distance: Distance = 5
 
 
 class CyclicCodeConfig(CodeConfig):
     """Words of a cyclic BCH code that differ at all shifts, so they can be read without knowing where a word begins."""
 
     kind: Literal["cyclic"]
-    distance: Literal[3, 5, 7, 11] = 7
+    distance: Distance = 7
 
 
 Code = Annotated[

@@ -40,6 +40,7 @@ from skysim.core.units import (
 )
 from skysim.scene.sections.layouts import (
     Layout,
+    LimitMagnitude,
     OnPoints,
     PatchBoardsConfig,
     PixelsConfig,
@@ -460,7 +461,7 @@ class CollimatedDisplayConfig(PixelsConfig):
     kind: Literal["collimated_display"]
     focal_length_m: PositiveLength
     catalog: str = SKY
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    limit_mag: LimitMagnitude | None = None
     axis_ra_deg: RightAscension
     axis_dec_deg: Declination
     roll_deg: Number = 0.0

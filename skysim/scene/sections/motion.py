@@ -24,7 +24,7 @@ from skysim.core.units import (
     Positive,
     RightAscension,
     Spins,
-    Time,
+    TimeLimit,
     Triple,
 )
 from skysim.core.yaml_reader import existing_file
@@ -75,12 +75,15 @@ Start = Annotated[
 ]
 
 
+AxesRms = tuple[NotNegative, NotNegative, NotNegative]
+
+
 class JitterLineConfig(ConfigModel):
     """A vibration at one frequency: rms_arcsec about each axis of the body, with random phases."""
 
     kind: Literal["line"]
     frequency_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    rms_arcsec: AxesRms
 
 
 class JitterBandConfig(ConfigModel):
@@ -89,7 +92,7 @@ class JitterBandConfig(ConfigModel):
     kind: Literal["band"]
     from_hz: Positive
     to_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    rms_arcsec: AxesRms
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
     @model_validator(mode="after")
@@ -284,6 +287,9 @@ Maneuver = Annotated[
 ]
 
 
+Stored = Annotated[Momentum, Field(gt=0)]
+
+
 class DesaturationConfig(ConfigModel):
     """Unloading of momentum from wheels or CMGs by the fans.
 
@@ -295,8 +301,8 @@ class DesaturationConfig(ConfigModel):
         Stored momentum over the torque of the fans, within their limits
     """
 
-    start_nms: Annotated[Momentum, Field(gt=0)]
-    stop_nms: Annotated[Momentum, Field(gt=0)]
+    start_nms: Stored
+    stop_nms: Stored
     time_s: Duration = 10.0
 
     @model_validator(mode="after")
@@ -336,7 +342,7 @@ class ControlConfig(ConfigModel):
 
     law: LawName = "pid"
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
-    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
+    time_limit_s: TimeLimit = 10.0
     actuators: ActuatorsName = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
     rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0

@@ -111,6 +111,7 @@ class AirConfig(ConfigModel):
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
+Coefficients = tuple[Coefficient, Coefficient, Coefficient]
 
 
 class SteadyTemperatureConfig(ConfigModel):
@@ -181,7 +182,7 @@ class ThermalConfig(ConfigModel):
     dome_ppm_k: Coefficient = 0.0
     anchor_height_m: Length = 0.0
     creep_m: Position = (0.0, 0.0, 0.0)
-    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
     lens_ppm_k: Coefficient = 0.0
 
     @property

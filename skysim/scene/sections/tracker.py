@@ -22,6 +22,7 @@ from skysim.core.units import (
     Seed,
     Spins,
     Time,
+    TimeLimit,
 )
 from skysim.core.yaml_reader import existing_file
 
@@ -66,6 +67,9 @@ class TotalStationConfig(ConfigModel):
     leveling_sigma_arcsec: NumberError = 0.0
 
 
+PlaceError = Annotated[LengthError, Field(le=0.1)]
+
+
 class SurveyErrorsConfig(ConfigModel):
     """Errors of the survey of LEDs and camera, drawn once from their own seed, which also draws `light.surface.error`.
 
@@ -91,8 +95,8 @@ class SurveyErrorsConfig(ConfigModel):
 
     rotation_deg: Spins = (0.0, 0.0, 0.0)
     surface_seed: Seed | None = None
-    led_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
-    lever_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
+    led_sigma_m: PlaceError = 0.0
+    lever_sigma_m: PlaceError = 0.0
     focal_length_sigma_m: LengthError = 0.0
     instrument: TotalStationConfig | None = None
     seed: Seed = 0
@@ -235,7 +239,7 @@ class TrackerConfig(ConfigModel):
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = OWN
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
-    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
+    time_limit_s: TimeLimit = 10.0
     detector: str | None = None
     centroider: str | None = None
     identifier: str | None = None
