@@ -15,8 +15,6 @@ average of light and dark current together, far below the full well, is
 the last term that of rounding to whole numbers of gain e-/DN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -93,7 +91,7 @@ class Detector:
     column_offset_e: Singles
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Detector:
+    def from_camera(cls, camera: CameraConfig) -> "Detector":
         """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector
         shape = (camera.height_px, camera.width_px)

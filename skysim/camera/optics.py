@@ -3,8 +3,6 @@
 This is the hardware as it is; what a tracker believes about its camera is separate code (estimator/core/camera.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -66,7 +64,7 @@ class Optics:
     scale: float | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Optics:
+    def from_camera(cls, camera: CameraConfig) -> "Optics":
         """The optics of a scene's camera, without seeing."""
         # Collecting area of the round pupil.
         area_m2 = np.pi / 4 * camera.pupil_m**2

@@ -7,8 +7,6 @@ read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`)
 2. `as_light` makes a picture that a tracker takes: monochrome, without a mosaic of filters, in digital numbers.
 """
 
-from __future__ import annotations
-
 import datetime
 import gzip
 import importlib.util
@@ -68,7 +66,7 @@ TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
 ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
 
 
-def read_fits_images(path: Path) -> list[ViewedImage]:
+def read_fits_images(path: Path) -> list["ViewedImage"]:
     """The first image of a FITS file, or the planes of a cube, in the machine's byte order. Raises InputError."""
     from astropy.io import fits
 

@@ -11,8 +11,6 @@ In Python the value is the equivalent standard deviation, a float, for covarianc
 float that also has its distribution. `scaled_errors` draws from either.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
@@ -68,7 +66,7 @@ class Tolerance(float):
         self.parent_sigma = parent_sigma
         return self
 
-    def __reduce__(self) -> tuple[type[Tolerance], tuple[float, float | None]]:
+    def __reduce__(self) -> tuple[type["Tolerance"], tuple[float, float | None]]:
         return Tolerance, (self.half_width, self.parent_sigma)
 
     def __eq__(self, other: object) -> bool:

@@ -1,7 +1,5 @@
 """Data passed between the packages: frozen arrays with their shapes, frames and units."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -75,7 +73,7 @@ class Trajectory:
     rate_body_rad_s: Floats
 
     @classmethod
-    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
+    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> "Trajectory":
         """A constant attitude from 0 to end_s."""
         ends = Rotation.concatenate([lab_from_body, lab_from_body])
         return cls(np.array([0.0, end_s]), ends, np.zeros((2, 3)))
@@ -83,12 +81,12 @@ class Trajectory:
     @classmethod
     def at_rate(
         cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats
-    ) -> Trajectory:
+    ) -> "Trajectory":
         """A constant rate (3,) in body axes, with this attitude at the time at_s; sampled at times (N,)."""
         turned = Rotation.from_rotvec(np.outer(t_s - at_s, rate_body_rad_s))
         return cls(t_s, lab_from_body * turned, np.tile(rate_body_rad_s, (len(t_s), 1)))
 
-    def since(self, begin_s: float) -> Trajectory:
+    def since(self, begin_s: float) -> "Trajectory":
         """The same motion; if it begins after begin_s, preceded by a rotation at the rate of its start."""
         if self.t_s[0] <= begin_s:
             return self
@@ -287,7 +285,7 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, which: NDArray) -> Sources:
+    def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)

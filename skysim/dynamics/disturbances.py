@@ -9,8 +9,6 @@
 The cable's spring and the air drag depend on the state within a step. MuJoCo computes them (multibody/model.py).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass
@@ -143,7 +141,7 @@ class DisturbanceModel:
         inertia_kg_m2: Floats,
         period_s: float,
         rng: Generator,
-    ) -> DisturbanceModel:
+    ) -> "DisturbanceModel":
         """The disturbances that the scene switches on; period_s is the control period."""
         return cls(
             np.array(config.turbine_nm),

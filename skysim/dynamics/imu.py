@@ -10,8 +10,6 @@ The unit's axes are the body's. Its outputs are increments (delta angle, delta v
 unit. They contain all motion between two samples; only its order within the interval is lost.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
@@ -437,7 +435,7 @@ class Imu:
     rng: Generator
 
     @classmethod
-    def from_config(cls, config: ImuConfig, rng: Generator) -> Imu:
+    def from_config(cls, config: ImuConfig, rng: Generator) -> "Imu":
         """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
         distribution.
         """

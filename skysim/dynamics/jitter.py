@@ -9,8 +9,6 @@ Vibration is kinematic: MuJoCo does not simulate it, but the IMU senses it (`Mot
 images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -180,7 +178,7 @@ class Vibration:
         motion: MotionConfig,
         rng: Generator,
         reference: Reference | None = None,
-    ) -> Vibration:
+    ) -> "Vibration":
         """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
 
         Parameters

@@ -1,7 +1,5 @@
 """The air over a site at a time: refraction, extinction, scintillation and seeing of stars and bodies."""
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -193,14 +191,14 @@ class Air:
     @classmethod
     def from_config(
         cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band
-    ) -> Air:
+    ) -> "Air":
         """The air over a site for a catalog's stars and a chip's band."""
         order = np.argsort(stars.hip)
         b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
         refraction = Refraction(weather_of(config, site, band))
         return cls(config, site, refraction, stars.hip[order], b_v, mean_wavelength_m(band))
 
-    def at(self, time: datetime.datetime) -> Sky:
+    def at(self, time: datetime.datetime) -> "Sky":
         """The sky at a time."""
         return Sky(self, time, topocentric_axes(time, self.site))
 

@@ -1,7 +1,5 @@
 """The bodies of a scene at a time, as light sources: points, or discs of many points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -185,7 +183,7 @@ class BodyLight:
         vectors = center + np.tan(self.radius_rad) * offset
         return normalized(vectors)
 
-    def overlaps(self, other: BodyLight) -> bool:
+    def overlaps(self, other: "BodyLight") -> bool:
         """Whether the disc overlaps another body's disc."""
         cosine = float(self.place.direction @ other.place.direction)
         return cosine > np.cos(self.radius_rad + other.radius_rad)

@@ -4,8 +4,6 @@ A file is ECSV (astropy reads it too): a YAML header that states the epoch and t
 per star, sorted by number. Directions are in the ICRS.
 """
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Iterable
@@ -93,13 +91,13 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def take(self, which: NDArray) -> Catalog:
+    def take(self, which: NDArray) -> "Catalog":
         """The chosen stars, by mask or index."""
         # All fields but the epoch are arrays.
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
         return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
-    def to_limit(self, limit_mag: float | None) -> Catalog:
+    def to_limit(self, limit_mag: float | None) -> "Catalog":
         """The stars with V <= limit_mag; all if it is None."""
         return self if limit_mag is None else self.take(self.v_mag <= limit_mag)
 

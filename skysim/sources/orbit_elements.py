@@ -5,8 +5,6 @@ SGP4's theory and its constants (WGS 72) belong to the elements, which were fitt
 whose code the package `sgp4` compiles. Formats: CCSDS 502.0-B-2 and 502.0-B-3 (OMM, OEM).
 """
 
-from __future__ import annotations
-
 import csv
 import datetime
 import io
@@ -72,7 +70,7 @@ class MeanElements(NamedTuple):
     names: tuple[str, ...]
     records: tuple[Any, ...]
 
-    def take(self, which: Iterable[int]) -> MeanElements:
+    def take(self, which: Iterable[int]) -> "MeanElements":
         """The elements of the chosen satellites."""
         rows = list(which)
         return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]

@@ -8,8 +8,6 @@ dwarfs, scaled to its V magnitude. An LED has a tabulated spectrum, a Gaussian o
 with the camera's response R (`Band`): the chip's quantum efficiency, times the lens's transmission if that is a curve.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -75,7 +73,7 @@ class Band:
     chromatic: ChromaticConfig | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig, curve: str = "") -> Band:
+    def from_camera(cls, camera: CameraConfig, curve: str = "") -> "Band":
         """The response of a camera: its chip's quantum efficiency times its lens's transmission curve; cached.
 
         `curve` is the quantum efficiency of one of its colors; if empty, that of the chip. A transmission that is one
@@ -91,7 +89,7 @@ class Band:
     @classmethod
     def from_efficiency(
         cls, quantum_efficiency: float | str | EfficiencyConfig | ColorEfficiencyConfig
-    ) -> Band:
+    ) -> "Band":
         """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
 
         A curve with a peak is scaled to it. That of three colors is the band of the gray image that a tracker makes of

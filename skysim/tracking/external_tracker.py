@@ -4,8 +4,6 @@ They get the same set-up and frames as skysim's own tracker, and their answers b
 an external tracker becomes the status of a frame.
 """
 
-from __future__ import annotations
-
 import inspect
 import time
 from collections.abc import Callable, Mapping
@@ -63,7 +61,7 @@ class ExternalTracker(FrameTracker):
     @classmethod
     def start(
         cls, scene: scenes.Scene, setup: Setup, commands: Mapping[str, str]
-    ) -> ExternalTracker:
+    ) -> "ExternalTracker":
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         name = scene.tracker.name
         TRACKERS.check_name(name, commands)
@@ -164,7 +162,7 @@ class FunctionTracker(FrameTracker):
         self.takes_setup = takes_setup(function)
         self.takes_picture = takes_picture
 
-    def set_up(self, setup: Setup) -> FunctionTracker:
+    def set_up(self, setup: Setup) -> "FunctionTracker":
         """The tracker after its set-up: a function of a `Picture`. Raises InputError if it makes none."""
         made = self.function(setup)
         solve = getattr(made, "solve", made)

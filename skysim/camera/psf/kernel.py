@@ -14,8 +14,6 @@ sub-pixel position. There are three forms (`build_kernel` chooses):
    (`grid_kernel`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -379,7 +377,7 @@ class DiskImages(NamedTuple):
     center: Floats
     gradient: Floats
 
-    def take(self, which: Ints) -> DiskImages:
+    def take(self, which: Ints) -> "DiskImages":
         """The images in the chosen rows."""
         return DiskImages(*(part[which] for part in self))
 

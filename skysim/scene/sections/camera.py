@@ -1,7 +1,5 @@
 """Schema of the scene section `camera`: the true hardware of lens, detector and electronics."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -163,7 +161,7 @@ class ChromaticConfig(ConfigModel):
     ) = None
 
     @model_validator(mode="after")
-    def check_columns(self) -> ChromaticConfig:
+    def check_columns(self) -> "ChromaticConfig":
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
         for name, column in columns.items():
             if column is not None:
@@ -235,7 +233,7 @@ class BaffleConfig(TableConfig):
     pst: Fractions
 
     @model_validator(mode="after")
-    def check_angles(self) -> BaffleConfig:
+    def check_angles(self) -> "BaffleConfig":
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
         return self
@@ -436,7 +434,7 @@ class DetectorConfig(ConfigModel):
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
     @model_validator(mode="after")
-    def check_values(self) -> DetectorConfig:
+    def check_values(self) -> "DetectorConfig":
         if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
             raise InputError(
                 "quantum_efficiency",
@@ -499,7 +497,7 @@ class CameraConfig(ConfigModel):
     detector: DetectorConfig
 
     @model_validator(mode="after")
-    def check_focus(self) -> CameraConfig:
+    def check_focus(self) -> "CameraConfig":
         if self.focus_m <= 2 * self.focal_length_m:
             raise InputError(
                 "focus",

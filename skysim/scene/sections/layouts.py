@@ -1,7 +1,5 @@
 """Schema of the layouts of a dome's LEDs: positions and brightness."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Sequence
@@ -68,7 +66,7 @@ class BoardConfig(ConfigModel):
     types: TypeNames | None = None
 
     @model_validator(mode="after")
-    def check_leds(self) -> BoardConfig:
+    def check_leds(self) -> "BoardConfig":
         if len(set(self.leds)) < len(self.leds):
             raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
         for name, values in (("levels", self.levels), ("types", self.types)):
@@ -113,7 +111,7 @@ class PatchBoardsConfig(ConfigModel):
     hardware_seed: Seed = 0
 
     @model_validator(mode="after")
-    def check_boards(self) -> PatchBoardsConfig:
+    def check_boards(self) -> "PatchBoardsConfig":
         if not 1 <= self.lit[0] <= self.lit[1] <= HOLES:
             raise InputError(
                 "lit",
@@ -225,7 +223,7 @@ class GeodesicConfig(LitConfig):
     rotation_deg: Number = 0.0
 
     @model_validator(mode="after")
-    def check_frequency(self) -> GeodesicConfig:
+    def check_frequency(self) -> "GeodesicConfig":
         if self.class_ == "II" and self.frequency % 2:
             raise InputError("frequency", f"{self.frequency} is odd, with class: II", "even")
         return self
@@ -326,7 +324,7 @@ class CelestialConfig(ConfigModel):
     hardware_seed: Seed = 0
 
     @model_validator(mode="after")
-    def check_star_selection(self) -> CelestialConfig:
+    def check_star_selection(self) -> "CelestialConfig":
         if (self.count is None) == (self.limit_mag is None):
             raise InputError("", "celestial takes either count or limit_mag")
         if not 1900 <= self.epoch.year <= 2100:
@@ -359,7 +357,7 @@ class ListedConfig(DimmedConfig):
     types: TypeNames | None = None
 
     @model_validator(mode="after")
-    def check_positions(self) -> ListedConfig:
+    def check_positions(self) -> "ListedConfig":
         lists = [
             each
             for each in (self.positions_m, self.directions_deg, self.file)
@@ -436,7 +434,7 @@ class FibersConfig(ConfigModel):
     aiming: AimingConfig | None = None
 
     @model_validator(mode="after")
-    def check_aiming(self) -> FibersConfig:
+    def check_aiming(self) -> "FibersConfig":
         laser = self.aiming
         if laser and not (
             self.radius_variation
@@ -539,7 +537,7 @@ class ProjectorConfig(PixelsConfig):
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
     @model_validator(mode="after")
-    def check_lens(self) -> ProjectorConfig:
+    def check_lens(self) -> "ProjectorConfig":
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
             raise InputError(

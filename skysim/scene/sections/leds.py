@@ -1,7 +1,5 @@
 """Schema of the LED type of a dome: emission lobe, drive, brightness."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -53,7 +51,7 @@ class LobeTableConfig(TableConfig):
     intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def check_axis(self) -> LobeTableConfig:
+    def check_axis(self) -> "LobeTableConfig":
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
         return self
@@ -383,12 +381,12 @@ class LedConfig(LedLightConfig):
     code: Code | None = None
     pwm_period_s: Duration = 1e-3
 
-    def of_type(self, name: str) -> LedConfig:
+    def of_type(self, name: str) -> "LedConfig":
         """The LED with brightness and color of one of its types; itself for an empty name."""
         return self.model_copy(update=dict(self.types[name])) if name else self
 
     @model_validator(mode="after")
-    def check_code(self) -> LedConfig:
+    def check_code(self) -> "LedConfig":
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
             raise InputError(
                 "code.bit_time",

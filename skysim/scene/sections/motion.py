@@ -1,7 +1,5 @@
 """Schema of the scene section `motion`: start, maneuver, attitude controller and jitter."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -96,7 +94,7 @@ class JitterBandConfig(ConfigModel):
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
     @model_validator(mode="after")
-    def check_frequencies(self) -> JitterBandConfig:
+    def check_frequencies(self) -> "JitterBandConfig":
         if self.from_hz >= self.to_hz:
             raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
         return self
@@ -140,7 +138,7 @@ class SlewConfig(AttitudeConfig):
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
-    def check_rate(self) -> SlewConfig:
+    def check_rate(self) -> "SlewConfig":
         if self.rate_deg_s is not None and self.duration_s is not None:
             raise InputError("duration", "given beside rate_deg_s", "one of the two")
         return self
@@ -190,7 +188,7 @@ class ChirpConfig(ConfigModel):
     sweep: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
-    def check_frequencies(self) -> ChirpConfig:
+    def check_frequencies(self) -> "ChirpConfig":
         if self.from_hz == self.to_hz:
             raise InputError(
                 "",
@@ -264,7 +262,7 @@ class BumpConfig(ConfigModel):
     caught_after_s: Duration | None = None
 
     @model_validator(mode="after")
-    def check_catch_time(self) -> BumpConfig:
+    def check_catch_time(self) -> "BumpConfig":
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
             raise InputError(
                 "caught_after", f"{self.caught_after_s:g} s is before the impulse ends"
@@ -306,7 +304,7 @@ class DesaturationConfig(ConfigModel):
     time_s: Duration = 10.0
 
     @model_validator(mode="after")
-    def check_thresholds(self) -> DesaturationConfig:
+    def check_thresholds(self) -> "DesaturationConfig":
         if self.stop_nms >= self.start_nms:
             raise InputError(
                 "stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s"
@@ -352,7 +350,7 @@ class ControlConfig(ConfigModel):
     desaturation: DesaturationConfig | None = None
 
     @model_validator(mode="after")
-    def check_options(self) -> ControlConfig:
+    def check_options(self) -> "ControlConfig":
         """Refuse keys that have no effect with the law."""
         unused = []
         if self.law in BUILT_IN_LAWS:
@@ -411,7 +409,7 @@ class MotionConfig(ConfigModel):
         return self.control is not None and self.control.law == PRESCRIBED
 
     @model_validator(mode="after")
-    def check_motion(self) -> MotionConfig:
+    def check_motion(self) -> "MotionConfig":
         if self.rate_deg_s == SIDEREAL and self.control is not None:
             raise InputError(
                 "rate_deg_s", "sidereal conflicts with a controller", "no control"

@@ -1,7 +1,5 @@
 """Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, satellites, `background`."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal, Self
 
@@ -191,7 +189,7 @@ class ThermalConfig(ConfigModel):
         return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
 
     @model_validator(mode="after")
-    def check_effect(self) -> ThermalConfig:
+    def check_effect(self) -> "ThermalConfig":
         if not self.has_effect:
             raise InputError(
                 "",

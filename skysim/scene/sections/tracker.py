@@ -1,7 +1,5 @@
 """Schema of the scene sections `tracker` and `filter`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -130,7 +128,7 @@ class ExposureControlConfig(ConfigModel):
     saturated_px: Annotated[int, Field(ge=0)] = 1
 
     @model_validator(mode="after")
-    def check_limits(self) -> ExposureControlConfig:
+    def check_limits(self) -> "ExposureControlConfig":
         if self.shortest_s > self.longest_s:
             raise InputError(
                 "shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s"
@@ -270,7 +268,7 @@ class TrackerConfig(ConfigModel):
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")
-    def check_assumed(self) -> TrackerConfig:
+    def check_assumed(self) -> "TrackerConfig":
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise InputError(
                 "survey.lever_sigma",
@@ -376,7 +374,7 @@ class FilterConfig(ConfigModel):
     time_tag_sigma_s: Delay = 0.0
 
     @model_validator(mode="after")
-    def check_drift(self) -> FilterConfig:
+    def check_drift(self) -> "FilterConfig":
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
             raise InputError(
                 "mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0"

@@ -1,7 +1,5 @@
 """Schema of the scene section `vehicle`: body, bearing, actuators, sensors and disturbances."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -66,7 +64,7 @@ class WheelsConfig(ConfigModel):
     start_rpm: tuple[Number, ...] = ()
 
     @model_validator(mode="after")
-    def check_speeds(self) -> WheelsConfig:
+    def check_speeds(self) -> "WheelsConfig":
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         return self
@@ -131,7 +129,7 @@ class TrimConfig(ConfigModel):
     step_m: PositiveLength = 1e-6
 
     @model_validator(mode="after")
-    def check_positions(self) -> TrimConfig:
+    def check_positions(self) -> "TrimConfig":
         if any(abs(position_m) > self.travel_m for position_m in self.position_m):
             raise InputError("position", f"beyond travel {1e3 * self.travel_m:g} mm")
         return self
@@ -309,7 +307,7 @@ class VehicleConfig(ConfigModel):
     gimbals: GimbalsConfig | None = None
 
     @model_validator(mode="after")
-    def check_body(self) -> VehicleConfig:
+    def check_body(self) -> "VehicleConfig":
         inertia = self.inertia_kg_m2
         if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(

@@ -4,8 +4,6 @@ A drive converts the level of each LED to a pulse train (`DRIVES`). `lit_moments
 exposure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil, exp, floor, log, sqrt
@@ -86,7 +84,7 @@ class Emitter:
     lobe: Lobe = field(default_factory=CosineLobeConfig)
 
     @classmethod
-    def from_config(cls, led: LedConfig) -> Emitter:
+    def from_config(cls, led: LedConfig) -> "Emitter":
         """The emitter of a scene's LED section."""
         return cls(led.falloff, led.lobe)
 
