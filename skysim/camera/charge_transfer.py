@@ -5,24 +5,23 @@ of pixel (x, y) makes y + 1 parallel and x + 1 serial transfers. Every function 
 
 - `bloom`: charge above the full well spreads along its column; sum and first moment are conserved.
 - `transfer_loss`: of n transfers each leaves a fraction behind; the charge arrives late by the negative binomial law.
-- `frame_transfer_smear`, `interline_smear`: charge that is moved under light collects it from every row it passes.
+- `smear`: charge that is moved under light collects it from every row it passes.
 """
 
 import functools
-from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Ints
 
 BLOCK = 256  # columns processed together: a kilobyte or two of each row, which the processor reads ahead
 TAIL = 1e-6  # fraction of a packet that the table of delays does not resolve
 
 
-def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.0) -> None:
+def bloom(electrons: NDArray, full_well_e: float, anti_blooming: float = 0.0) -> None:
     """Spread charge above the full well along its column: half of each excess to either neighbor, until all fits.
 
     The final state does not depend on the order of the halvings, and it conserves the charge's sum and first moment
@@ -48,8 +47,8 @@ def bloom(electrons: NDArray[Any], full_well_e: float, anti_blooming: float = 0.
 
 @jit(parallel=True)
 def _bloom(
-    electrons: NDArray[Any],
-    columns: NDArray[np.int64],
+    electrons: NDArray,
+    columns: Ints,
     full_well_e: float,
     anti_blooming: float,
 ) -> None:
@@ -124,7 +123,7 @@ def _settle(headroom: Floats, y: int) -> tuple[int, int]:
     return a, b
 
 
-def transfer_loss(electrons: NDArray[Any], cti_parallel: float, cti_serial: float) -> None:
+def transfer_loss(electrons: NDArray, cti_parallel: float, cti_serial: float) -> None:
     """Charge-transfer inefficiency: every transfer leaves a fraction behind, which joins the next packet.
 
     This gives trailing tails. Of a packet that makes n transfers the fraction
@@ -172,7 +171,7 @@ def delayed_fractions(transfers: int, cti: float) -> Floats:
 
 
 @jit(parallel=True)
-def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
+def _delay_rows(electrons: NDArray, fraction: Floats) -> None:
     """Apply the parallel loss in place: row y receives delayed charge of the rows with lower numbers."""
     height, width = electrons.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
@@ -192,7 +191,7 @@ def _delay_rows(electrons: NDArray[Any], fraction: Floats) -> None:
 
 
 @jit(parallel=True)
-def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
+def _delay_columns(electrons: NDArray, fraction: NDArray) -> None:
     """Apply the serial loss in place, row by row.
 
     Parameters
@@ -213,14 +212,16 @@ def _delay_columns(electrons: NDArray[Any], fraction: NDArray[Any]) -> None:
         row[:] = gathered
 
 
-def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: float) -> None:
-    """Smear of a frame-transfer chip, which is shifted into its store row by row before the exposure as after it.
+def smear(light_e: NDArray, exposure_s: float, row_time_s: float, leak: float = 1.0) -> None:
+    """Smear of a frame-transfer chip, or of an interline chip whose covered register lets the fraction `leak` through.
 
-    A pixel that ends at row y was shifted in, empty, over the rows above y (greater y) and is shifted out over those
-    below, for row_time in each. So it passes every other row of its column once, with the same brightness as in the
-    exposure, and collects row_time / exposure of each row's light L:
+    A frame-transfer chip is shifted into its store row by row before the exposure as after it. A pixel that ends at
+    row y was shifted in, empty, over the rows above y (greater y) and is shifted out over those below, for row_time in
+    each. So it passes every other row of its column once, with the same brightness as in the exposure, and collects
+    row_time / exposure of each row's light L. The register of an interline chip is clocked all the time, so the cell
+    that takes over a pixel's charge has passed the rows above it and will pass those below, with `leak` of their light:
 
-        smear(y) = row_time / exposure sum over j != y of L(j).
+        smear(y) = leak row_time / exposure sum over j != y of L(j).
 
     Parameters
     ----------
@@ -228,27 +229,11 @@ def frame_transfer_smear(light_e: NDArray[Any], exposure_s: float, row_time_s: f
         (H, W) light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
         affected.
     """
-    _smear(light_e, row_time_s / exposure_s)
-
-
-def interline_smear(
-    light_e: NDArray[Any], exposure_s: float, row_time_s: float, leak: float
-) -> None:
-    """Smear of an interline chip: the covered register collects the fraction `leak` of the light of every row passed.
-
-    The register is clocked all the time, so the register cell that takes over a pixel's charge has passed the rows
-    above it and will pass those below: smear(y) = leak row_time / exposure sum over j != y of L(j).
-
-    Parameters
-    ----------
-    light_e
-        (H, W) light of the exposure; the smear is added in place
-    """
     _smear(light_e, leak * row_time_s / exposure_s)
 
 
 @jit(parallel=True)
-def _smear(light_e: NDArray[Any], fraction: float) -> None:
+def _smear(light_e: NDArray, fraction: float) -> None:
     """Add to every pixel a fraction of the sum of the other pixels in its column."""
     height, width = light_e.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):

@@ -5,6 +5,7 @@ from math import erf, sqrt
 
 import numpy as np
 import scipy
+from numpy.random import Generator
 from numpy.typing import NDArray
 
 from skysim.camera.psf.splat import add_gaussian
@@ -39,7 +40,7 @@ def add_particles(
     exposure_s: float,
     pixel_m: float,
     particles: Sequence[ParticlesConfig],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> NDArray:
     """Add the particle tracks of an exposure to a frame of electrons, in place (float32 or float64).
 
@@ -68,7 +69,7 @@ def draw_tracks(
     shape: tuple[int, ...],
     exposure_s: float,
     pixel_m: float,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> NDArray:
     """Draw every track that could reach a chip of this shape (H, W): its ends, length and charge.
 

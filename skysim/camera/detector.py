@@ -15,8 +15,6 @@ average of light and dark current together, far below the full well, is
 the last term that of rounding to whole numbers of gain e-/DN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -32,7 +30,7 @@ from numpy.typing import NDArray
 from skysim.camera import charge_transfer, cosmic_rays, noise
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
-from skysim.core.types import SourceTruth
+from skysim.core.types import Bools, Singles, SourceTruth
 from skysim.scene.sections.camera import (
     CameraConfig,
     DetectorConfig,
@@ -57,10 +55,10 @@ class AddedCharge:
 
     def __init__(self, threshold_e: float) -> None:
         self.threshold_e = threshold_e
-        self.masks = dict[str, NDArray[np.bool_]]()
+        self.masks = dict[str, Bools]()
 
     @contextmanager
-    def watch(self, name: str, electrons: NDArray[Any]) -> Iterator[None]:
+    def watch(self, name: str, electrons: NDArray) -> Iterator[None]:
         """Compare a frame of electrons before and after the body of this context changes it in place."""
         before = electrons.copy()
         yield
@@ -88,12 +86,12 @@ class Detector:
     config: DetectorConfig
     shutter: Shutter
     pixel_m: float
-    sensitivity: NDArray[np.float32]
-    dark_e_s: NDArray[np.float32]
-    column_offset_e: NDArray[np.float32]
+    sensitivity: Singles
+    dark_e_s: Singles
+    column_offset_e: Singles
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Detector:
+    def from_camera(cls, camera: CameraConfig) -> "Detector":
         """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector
         shape = (camera.height_px, camera.width_px)
@@ -109,9 +107,7 @@ class Detector:
         )
 
 
-def sensitivity(
-    config: DetectorConfig, shape: tuple[int, int], rng: Generator
-) -> NDArray[np.float32]:
+def sensitivity(config: DetectorConfig, shape: tuple[int, int], rng: Generator) -> Singles:
     """Photo-response non-uniformity (PRNU): Gaussian about 1, independent in each pixel, not below 0."""
     if config.prnu == 0:
         return np.ones(shape, np.float32)
@@ -123,7 +119,7 @@ def sensitivity(
 
 def dark_current_e_s(
     config: DetectorConfig, shape: tuple[int, int], rng: Generator
-) -> NDArray[np.float32]:
+) -> Singles:
     """Dark current of every pixel: D = D_ref 2^((T - T_ref) / T_double), D_ref lognormal over the pixels.
 
     A lognormal of mean 1 and standard deviation dsnu has s^2 = ln(1 + dsnu^2) and median exp(-s^2 / 2). Hot pixels
@@ -145,12 +141,12 @@ def dark_current_e_s(
 
 
 def expose(
-    light_e: NDArray[Any],
+    light_e: NDArray,
     exposure_s: float,
     detector: Detector,
     rng: Generator,
     added: AddedCharge | None = None,
-) -> NDArray[Any]:
+) -> NDArray:
     """Convert a frame's light to digital numbers, by steps 2 to 6 of the module. Returns (H, W) uint16.
 
     With noise off the frame is the expected value in digital numbers, of light_e's own type, neither rounded nor
@@ -204,7 +200,7 @@ def expose(
 
 
 def collect_charge(
-    charge_e: NDArray[Any],
+    charge_e: NDArray,
     exposure_s: float,
     detector: Detector,
     rng: Generator,
@@ -228,7 +224,7 @@ def collect_charge(
         charge_transfer.transfer_loss(charge_e, config.cti_parallel, config.cti_serial)
 
 
-def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) -> NDArray[Any]:
+def expectation(light_e: NDArray, exposure_s: float, detector: Detector) -> NDArray:
     """Expected digital numbers without full well, nonlinearity and particles.
 
     DN = (PRNU light + dark t, after transfer loss, + column offset) / gain + offset.
@@ -241,7 +237,7 @@ def expectation(light_e: NDArray[Any], exposure_s: float, detector: Detector) ->
 
 
 def smear(
-    light_e: NDArray[Any],
+    light_e: NDArray,
     exposure_s: float,
     shutter: Shutter,
     added: AddedCharge | None = None,
@@ -258,12 +254,8 @@ def smear(
     if not isinstance(shutter, FrameTransferConfig | InterlineConfig):
         return
     with added.watch(SMEAR, light_e) if added else nullcontext():
-        if isinstance(shutter, FrameTransferConfig):
-            charge_transfer.frame_transfer_smear(light_e, exposure_s, shutter.row_time_s)
-        else:
-            charge_transfer.interline_smear(
-                light_e, exposure_s, shutter.row_time_s, shutter.leak
-            )
+        leak = shutter.leak if isinstance(shutter, InterlineConfig) else 1.0
+        charge_transfer.smear(light_e, exposure_s, shutter.row_time_s, leak)
 
 
 class ReadoutConstants(NamedTuple):
@@ -419,7 +411,7 @@ def saturation_dn(config: DetectorConfig) -> float:
 
 
 def add_snr_and_saturation(
-    sources: SourceTruth, light_e: NDArray[Any], exposure_s: float, detector: Detector
+    sources: SourceTruth, light_e: NDArray, exposure_s: float, detector: Detector
 ) -> SourceTruth:
     """Add to the truth which sources are expected to saturate, and the signal-to-noise ratio of each.
 

@@ -417,11 +417,3 @@ def hidden_points(
         )
 
     return hidden if overlapping or by_vehicle.any() else None
-
-
-def concatenated(truths: Sequence[SourceTruth]) -> SourceTruth:
-    """The rows of several truths, in their order, as one."""
-    if len(truths) == 1:
-        return truths[0]
-    columns = ([getattr(truth, name) for truth in truths] for name in SourceTruth.__slots__)
-    return SourceTruth(*map(np.concatenate, columns))

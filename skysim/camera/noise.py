@@ -27,6 +27,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
+from skysim.core.types import Singles
 
 BUCKETS = 1024  # ten bits; the rows of a dark frame's means then fit the L2 cache
 GUIDES_PER_E = 128  # guide tables per electron of mean
@@ -67,10 +68,10 @@ class Scratch(NamedTuple):
     cell: NDArray[np.int32]
     late: NDArray[np.int32]
     found: NDArray[np.uint8]
-    radius: NDArray[np.float32]
-    exponent: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    means: NDArray[np.float32]
+    radius: Singles
+    exponent: Singles
+    normals: Singles
+    means: Singles
 
 
 @jit
@@ -96,7 +97,7 @@ def guide() -> NDArray[np.uint8]:
     Row k is for means from k to k + 1 over GUIDES_PER_E. Bucket b holds the count that every uniform number in
     [b, b + 1) / BUCKETS gives, or AMBIGUOUS. The last row is LARGE.
     """
-    return np.asarray(_guide())
+    return _guide()
 
 
 def seeds(rng: Generator, rows: int) -> NDArray[np.uint64]:

@@ -3,8 +3,6 @@
 This is the hardware as it is; what a tracker believes about its camera is separate code (estimator/core/camera.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +22,7 @@ def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
     # 1.57 is just below pi / 2, where the tangent overflows.
     tangent = np.tan(np.minimum(field_rad, 1.57))
     u = np.clip(tangent / np.tan(np.radians(config.cutoff_deg)), 0, 1)
-    return np.asarray(2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2)))
+    return 2 / np.pi * (np.arccos(u) - u * np.sqrt(1 - u**2))
 
 
 def table(config: VignettingTableConfig, field_rad: Floats) -> Floats:
@@ -66,7 +64,7 @@ class Optics:
     scale: float | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig) -> Optics:
+    def from_camera(cls, camera: CameraConfig) -> "Optics":
         """The optics of a scene's camera, without seeing."""
         # Collecting area of the round pupil.
         area_m2 = np.pi / 4 * camera.pupil_m**2

@@ -8,12 +8,11 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Mount, Sources, StarSources, Trajectory
+from skysim.core.types import Floats, Ints, Mount, Sources, StarSources, Trajectory
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 
 # Number of poses in an exposure.
@@ -156,7 +155,7 @@ def project(
 
 
 def project_each(
-    sources: Sources, optics: Optics, poses: Poses, ends: NDArray[np.int64]
+    sources: Sources, optics: Optics, poses: Poses, ends: Ints
 ) -> tuple[Floats, ...]:
     """Project sources in K groups, each group at a pose of its own, at mid-exposure.
 
@@ -252,7 +251,7 @@ def _directions_each(
     normal: Floats,
     cam_from_lab: Floats,
     camera_m: Floats,
-    ends: NDArray[np.int64],
+    ends: Ints,
 ) -> tuple[Floats, Floats, Floats]:
     """As `_directions`, for sources in groups, each at a pose of its own: (N, 3), (N,) and (N,)."""
     direction = np.empty((len(place), 3))
@@ -278,9 +277,7 @@ def _directions_each(
     return direction, distance, cosine
 
 
-def in_view(
-    sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25
-) -> NDArray[np.int64]:
+def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25) -> Ints:
     """Rows of the sources within a cone about the boresight at any of these poses.
 
     The cone's half-angle is the sum of the field's half-diagonal, a fraction `reach` of it for images that reach in

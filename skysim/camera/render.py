@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
 from skysim.camera.optics import Optics
@@ -36,9 +37,18 @@ from skysim.camera.projection import (
 from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
 from skysim.camera.psf.kernel import DiskImages, disk_images
 from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
-from skysim.camera.psf.splat import Singles, add_gaussian, add_grid, add_round
+from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import (
+    Bools,
+    Floats,
+    Ints,
+    Mount,
+    Singles,
+    Sources,
+    SourceTruth,
+    Trajectory,
+)
 from skysim.sources.dome.led import Emitter, lit_moments_s
 
 # Largest motion in one piece of the exposure, in units of the image's sharpest feature (sigma).
@@ -46,13 +56,14 @@ STEP = 1.3
 MAX_PIECES = 100_000
 # Path length, in steps, up to which one piece is enough: error 1e-4 of the peak.
 SINGLE_PIECE_STEPS = 0.4
+DISK_FIELDS = len(EllipseDisk._fields)
 # An image that moves less is drawn as one point.
 STILL_PX = 1e-3
 # Pixels of patches held in memory at once, or as many as the frame has.
 MAX_PATCH_PIXELS = 1 << 20
 
 # (N,) which of N sources at `Sources.place` are occluded
-OcclusionTest = Callable[[Floats], NDArray[np.bool_]]
+OcclusionTest = Callable[[Floats], Bools]
 
 
 class Window(NamedTuple):
@@ -72,7 +83,7 @@ class Window(NamedTuple):
 
 
 def render(
-    image: NDArray[Any],
+    image: NDArray,
     sources: Sources,
     optics: Optics,
     trajectory: Trajectory,
@@ -126,7 +137,7 @@ def render(
 
 
 def truth_on_chip(
-    ids: NDArray[np.int64], tracks: Tracks, table: Floats, window: Window, rows: int
+    ids: Ints, tracks: Tracks, table: Floats, window: Window, rows: int
 ) -> SourceTruth:
     """The truth of the sources that gave light to the chip, from the table of `draw`."""
     mid_px = tracks.xy_px[len(tracks.xy_px) // 2]
@@ -190,7 +201,7 @@ def led_images(
 
 
 def draw(
-    image: NDArray[Any], tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
+    image: NDArray, tracks: Tracks, kernels: Kernels, step_px: Floats, window: Window
 ) -> Floats:
     """Integrate every source on a patch of its own and add the patches to the image.
 
@@ -221,7 +232,7 @@ def draw(
     return out
 
 
-def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> NDArray[np.int64]:
+def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> Ints:
     """(N, 4) first column, last + 1, first row, last + 1 that each image can reach; empty where it misses the chip."""
     if not xy_px.shape[1]:
         return np.zeros((0, 4), np.int64)
@@ -383,24 +394,7 @@ def _sampled(n: int, kernels: Kernels) -> Any:
     if kernels.kind[n] != ELLIPSE:
         return np.empty((0, 0, 0), np.float32)
     begin, end, waves, samples = kernels.table[n]
-    d = kernels.disk[n]
-    disk = EllipseDisk(
-        d[0],
-        d[1],
-        d[2],
-        d[3],
-        d[4],
-        d[5],
-        d[6],
-        d[7],
-        d[8],
-        d[9],
-        d[10],
-        d[11],
-        d[12],
-        d[13],
-        d[14],
-    )
+    disk = EllipseDisk(*to_fixed_tuple(kernels.disk[n], DISK_FIELDS))
     return ellipse_table(disk, kernels.tables[begin:end], waves, samples, kernels.bessel)
 
 

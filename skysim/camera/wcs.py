@@ -3,13 +3,12 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import distort, field_rad, fold_r
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.sources.stars import sky_axes
 
@@ -44,7 +43,7 @@ class Sip:
     worst_px: float
 
 
-def header(camera: OpencvCalibration, cam_from_icrs: Rotation) -> dict[str, Any]:
+def header(camera: OpencvCalibration, cam_from_icrs: Rotation) -> Record:
     """TAN-SIP header (TAN without distortion) of a pointing (Calabretta & Greisen 2002; Shupe et al. 2005).
 
     CD converts pixel offsets to degrees east (xi) and north (eta) of the tangent point. The rows of the attitude
@@ -75,9 +74,9 @@ def header(camera: OpencvCalibration, cam_from_icrs: Rotation) -> dict[str, Any]
     } | (keywords(distortion) if distortion else {})
 
 
-def keywords(distortion: Sip) -> dict[str, Any]:
+def keywords(distortion: Sip) -> Record:
     """The polynomials as FITS keywords, and their greatest error in pixels as SIPERR (not in the standard)."""
-    cards: dict[str, Any] = {"SIPERR": distortion.worst_px}
+    cards: Record = {"SIPERR": distortion.worst_px}
     for name in ("A", "B", "AP", "BP"):
         table: Coefficients = getattr(distortion, name.lower())
         cards[f"{name}_ORDER"] = max((p + q for p, q in table), default=0)

@@ -367,7 +367,7 @@ def check_tiff(path: Path, data: bytes) -> tuple[bytes, list[int], bool]:
     -------
     The file for OpenCV, in which a mosaic is a gray image; the numbers of its images; whether one is a mosaic
     """
-    pages = list[int]()
+    pages = []
     is_mosaic = False
     tiff = Tiff(data)
     with contextlib.suppress(struct.error):  # the file ends before its last directory

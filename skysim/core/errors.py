@@ -1,7 +1,5 @@
 """Errors for the user, text that is safe to print on a terminal, and interrupts that are not lost."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import weakref
@@ -51,7 +49,7 @@ class Where(NamedTuple):
         place = "" if self.line is None else f", {self.unit} {self.line}"
         return printable(f"{self.file}{place}")
 
-    def error(self, problem: object, allowed: object = "") -> InputError:
+    def error(self, problem: object, allowed: object = "") -> "InputError":
         """An error in the file, at this place."""
         return InputError(self.file, problem, allowed, self)
 
@@ -113,17 +111,17 @@ class InputError(ValueError):
         text = f"{self.subject}: {self.fault}" if self.key else self.fault
         return text if self.where is None or self.is_of_file else f"{text} ({self.where})"
 
-    def under(self, prefix: object) -> InputError:
+    def under(self, prefix: object) -> "InputError":
         """The error with the key of the enclosing section before its own key."""
         key = f"{prefix}.{self.key}" if self.key else prefix
         return InputError(key, self.problem, self.allowed, self.where)
 
-    def within(self, key: object) -> InputError:
+    def within(self, key: object) -> "InputError":
         """The error with a key whose value names the input at fault; the problem then begins with that name."""
         problem = f"{self.subject}: {self.problem}" if self.key else self.problem
         return InputError(key, problem, self.allowed, None if self.is_of_file else self.where)
 
-    def at(self, where: Where | None) -> InputError:
+    def at(self, where: Where | None) -> "InputError":
         """The error with its place in a file."""
         return InputError(self.key, self.problem, self.allowed, where)
 

@@ -7,8 +7,6 @@ read from the header, and checked, before astropy (`fits`) or OpenCV (`encoded`)
 2. `as_light` makes a picture that a tracker takes: monochrome, without a mosaic of filters, in digital numbers.
 """
 
-from __future__ import annotations
-
 import datetime
 import gzip
 import importlib.util
@@ -68,7 +66,7 @@ TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
 ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
 
 
-def read_fits_images(path: Path) -> list[ViewedImage]:
+def read_fits_images(path: Path) -> list["ViewedImage"]:
     """The first image of a FITS file, or the planes of a cube, in the machine's byte order. Raises InputError."""
     from astropy.io import fits
 
@@ -195,7 +193,7 @@ def decode_guarded(path: Path, what: str, *arguments: str) -> NDArray:
             script, *arguments, str(out), cpu_s=TILES_CPU_S, memory_bytes=TILES_BYTES
         ):
             raise InputError(path, f"not {what}: {fault}")
-        return np.asarray(np.load(out))
+        return np.load(out)
 
 
 def planes(path: Path, pixels: NDArray) -> list[NDArray]:
@@ -227,7 +225,7 @@ def planes(path: Path, pixels: NDArray) -> list[NDArray]:
 
 def header_values(*headers: Any) -> Record:
     """ViewedImage's fields other than the pixels, by the first header that has them: the image's, then the file's."""
-    found: dict[str, str] = {}
+    found = {}
     for header in reversed(headers):
         for key in ("ROWORDER", "DATE-OBS", *MOSAIC_KEYS, *EXPOSURE_KEYS, *TEMPERATURE_KEYS):
             with suppress(Exception):  # of many types, for a damaged card
@@ -381,7 +379,7 @@ def as_light(picture: ViewedImage) -> ViewedImage:
        the median difference of neighbors, in which few pixels have stars.
     """
     pixels = monochrome(picture.pixels)
-    notes = list[str]()
+    notes = []
     # 2. Masked pixels.
     is_float = pixels.dtype.kind == "f"
     if is_float and (masked := np.isnan(pixels)).any() and not masked.all():
@@ -508,7 +506,7 @@ def monochrome(image: NDArray) -> NDArray:
         return np.ascontiguousarray(image[:, :, 0])
     if image.dtype in (np.uint8, np.uint16, np.float32):
         return cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
-    return np.asarray(image[:, :, :3] @ LUMINANCE)
+    return image[:, :, :3] @ LUMINANCE
 
 
 class LiveCamera:
@@ -534,7 +532,7 @@ class LiveCamera:
                 self.source, "no camera found", "an index such as 0, a video file, a URL"
             )
         self.frame_count += 1
-        return np.asarray(frame)
+        return frame
 
     def close(self) -> None:
         """Release the camera."""

@@ -11,13 +11,10 @@ In Python the value is the equivalent standard deviation, a float, for covarianc
 float that also has its distribution. `scaled_errors` draws from either.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
@@ -69,7 +66,7 @@ class Tolerance(float):
         self.parent_sigma = parent_sigma
         return self
 
-    def __reduce__(self) -> tuple[type[Tolerance], tuple[float, float | None]]:
+    def __reduce__(self) -> tuple[type["Tolerance"], tuple[float, float | None]]:
         return Tolerance, (self.half_width, self.parent_sigma)
 
     def __eq__(self, other: object) -> bool:
@@ -87,9 +84,9 @@ class Tolerance(float):
 
         probability = ndtr(normal)
         if self.parent_sigma is None:
-            return np.asarray(self.half_width * (2 * probability - 1))
+            return self.half_width * (2 * probability - 1)
         lowest = ndtr(-self.half_width / self.parent_sigma)
-        return np.asarray(self.parent_sigma * ndtri(lowest + probability * (1 - 2 * lowest)))
+        return self.parent_sigma * ndtri(lowest + probability * (1 - 2 * lowest))
 
 
 def scaled_errors(sigma: float, normal: Floats) -> Floats:
@@ -97,11 +94,7 @@ def scaled_errors(sigma: float, normal: Floats) -> Floats:
 
     A tolerance instead of a sigma does not change the random streams.
     """
-    return (
-        sigma.from_normal(normal)
-        if isinstance(sigma, Tolerance)
-        else np.asarray(sigma * normal)
-    )
+    return sigma.from_normal(normal) if isinstance(sigma, Tolerance) else sigma * normal
 
 
 class ToleranceConfig(ConfigModel):

@@ -1,12 +1,10 @@
 """Data passed between the packages: frozen arrays with their shapes, frames and units."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +17,22 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
 Bools = NDArray[np.bool_]
+Singles = NDArray[np.float32]
 
 
 def normalized(vectors: Floats) -> Floats:
     """(..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+Columns = TypeVar("Columns")
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Objects of one class, whose fields are columns of equal length, as one: the rows of all, in their order."""
+    kind: Any = type(parts[0])
+    columns = ([getattr(part, name) for part in parts] for name in kind.__slots__)
+    return kind(*map(np.concatenate, columns))
 
 
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
@@ -64,7 +73,7 @@ class Trajectory:
     rate_body_rad_s: Floats
 
     @classmethod
-    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> Trajectory:
+    def at_rest(cls, lab_from_body: Rotation, end_s: float) -> "Trajectory":
         """A constant attitude from 0 to end_s."""
         ends = Rotation.concatenate([lab_from_body, lab_from_body])
         return cls(np.array([0.0, end_s]), ends, np.zeros((2, 3)))
@@ -72,12 +81,12 @@ class Trajectory:
     @classmethod
     def at_rate(
         cls, lab_from_body: Rotation, rate_body_rad_s: Floats, at_s: float, t_s: Floats
-    ) -> Trajectory:
+    ) -> "Trajectory":
         """A constant rate (3,) in body axes, with this attitude at the time at_s; sampled at times (N,)."""
         turned = Rotation.from_rotvec(np.outer(t_s - at_s, rate_body_rad_s))
         return cls(t_s, lab_from_body * turned, np.tile(rate_body_rad_s, (len(t_s), 1)))
 
-    def since(self, begin_s: float) -> Trajectory:
+    def since(self, begin_s: float) -> "Trajectory":
         """The same motion; if it begins after begin_s, preceded by a rotation at the rate of its start."""
         if self.t_s[0] <= begin_s:
             return self
@@ -276,7 +285,7 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
-    def take(self, which: NDArray) -> Sources:
+    def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__slots__)
@@ -328,14 +337,6 @@ def _closer(place: Floats, direction: Floats, chord: float) -> Ints:
         found[count] = n
         count += x * x + y * y + z * z <= chord * chord
     return found[:count]
-
-
-def with_sources(parts: Sequence[Sources]) -> Sources:
-    """All sources of several sets without motion, in their order."""
-    columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
-    return Sources(
-        **{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None}
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -473,7 +473,7 @@ def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int 
 
     The last key may be missing in the tree.
     """
-    keys: list[int | str] = []
+    keys = []
     for n, key in enumerate(loc):
         last = missing and n == len(loc) - 1
         if isinstance(tree, dict) and (key in tree or last):

@@ -5,9 +5,10 @@ It speaks the protocol of docs/howto/controller.md.
 
 import sys
 from functools import partial
-from typing import IO, Any
+from typing import IO
 
 from skysim.core.plugins import Respond, describe_error, serve
+from skysim.core.types import Record
 from skysim.dynamics.controllers import (
     CONTROLLERS,
     ControllerInput,
@@ -17,12 +18,12 @@ from skysim.dynamics.controllers import (
 )
 
 
-def create(name: str, tree: dict[str, Any]) -> Respond:
+def create(name: str, tree: Record) -> Respond:
     """The function with which `serve` answers a control period: the torque, or a status if the controller fails."""
     setup = ControllerSetup.of_tree(tree)
     law = build_law(CONTROLLERS.entry_points()[name].load(), setup)
 
-    def respond(inputs: dict[str, Any], _: IO[bytes]) -> dict[str, Any]:
+    def respond(inputs: Record, _: IO[bytes]) -> Record:
         try:
             torque_nm = check_torque(law(ControllerInput.of_tree(inputs)), setup.authority_nm)
         except Exception as error:

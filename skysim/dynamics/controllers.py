@@ -30,7 +30,7 @@ from skysim.core.plugins import (
     host_command,
     to_lists,
 )
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.dynamics.guidance import Reference
 from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED, ControlConfig
 
@@ -76,10 +76,9 @@ class ControllerSetup:
     seed: int
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> Record:
         """The set-up as a JSON object; arrays become lists."""
-        tree: dict[str, Any] = to_lists(asdict(self))
-        return {"skysim_controller": PROTOCOL, **tree}
+        return {"skysim_controller": PROTOCOL, **to_lists(asdict(self))}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
@@ -134,15 +133,14 @@ class ControllerInput:
         """The commanded attitude."""
         return Rotation.from_quat(self.lab_from_ref_xyzw)
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> Record:
         """The input as a JSON object; arrays become lists."""
-        tree: dict[str, Any] = to_lists(asdict(self))
-        return tree
+        return to_lists(asdict(self))
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
         """The inverse of `as_tree`."""
-        values: dict[str, Any] = {
+        values: Record = {
             name: np.array(value) if isinstance(value, list) else value
             for name, value in tree.items()
         }

@@ -9,14 +9,12 @@
 The cable's spring and the air drag depend on the state within a step. MuJoCo computes them (multibody/model.py).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 
 from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector
@@ -94,9 +92,7 @@ class AirCurrent:
     autocorrelation is rms^2 exp(-|lag| / correlation time).
     """
 
-    def __init__(
-        self, config: AirCurrentConfig, period_s: float, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, config: AirCurrentConfig, period_s: float, rng: Generator) -> None:
         self.rms_nm = np.array(config.rms_nm)
         self.decay = math.exp(-period_s / config.correlation_s)
         self.rng = rng
@@ -144,8 +140,8 @@ class DisturbanceModel:
         impulses: tuple[Impulse, ...],
         inertia_kg_m2: Floats,
         period_s: float,
-        rng: np.random.Generator,
-    ) -> DisturbanceModel:
+        rng: Generator,
+    ) -> "DisturbanceModel":
         """The disturbances that the scene switches on; period_s is the control period."""
         return cls(
             np.array(config.turbine_nm),
@@ -171,7 +167,7 @@ class DisturbanceModel:
         lab_from_body_wxyz: Floats,
         rate_body_rad_s: Floats,
         momentum_nms: Floats,
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """(K, 3) torque in body axes in each of K steps between the (K + 1,) times of a control period.
 
         Attitude (4,), rate (3,) and rotors' momentum (3,) are those at the start of the period and are held over

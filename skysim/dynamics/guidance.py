@@ -487,7 +487,7 @@ def plan(
         quaternion.from_rotation(first), start_rate_rad_s(motion, profiles), home
     )
     # 2. One leg for each maneuver.
-    legs: list[Leg] = []
+    legs = []
     splines = iter(profiles)
     for element in motion.maneuver:
         spline = next(splines) if element.kind == "profile" else None
@@ -532,7 +532,7 @@ class Impulse:
 
 def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:
     """The impulses of the bumps in order of time; a caught bump has two, equal and opposite."""
-    result: list[Impulse] = []
+    result = []
     for begin_s, bump in zip(reference.start_s, motion.maneuver, strict=False):
         if isinstance(bump, BumpConfig):
             rate_rad_s = np.radians(bump.rate_deg_s)

@@ -10,13 +10,12 @@ The unit's axes are the body's. Its outputs are increments (delta angle, delta v
 unit. They contain all motion between two samples; only its order within the interval is lost.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.random import Generator
+from numpy.typing import ArrayLike
 
 from skysim.core import quaternion
 from skysim.core.constants import (
@@ -30,7 +29,7 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats
+from skysim.core.types import Bools, Floats
 from skysim.scene.sections.vehicle import (
     AccelerometerConfig,
     GyroConfig,
@@ -70,8 +69,8 @@ class Increments:
     step_s: float
     angle_rad: Floats
     velocity_m_s: Floats
-    saturated: NDArray[np.bool_]
-    overloaded: NDArray[np.bool_]
+    saturated: Bools
+    overloaded: Bools
 
 
 def earth_rate_lab_rad_s(site: SiteConfig) -> Floats:
@@ -290,9 +289,7 @@ class Triad:
     quantum: float
     remainder: Floats = field(default_factory=lambda: np.zeros(3))
 
-    def measure(
-        self, ideal: Floats, step_s: float, normal: Floats
-    ) -> tuple[Floats, NDArray[np.bool_]]:
+    def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, Bools]:
         """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`.
 
         Parameters
@@ -334,7 +331,7 @@ def corrupt(
     remainder: Floats,
     normal: Floats,
     parameters: tuple[float, float, float, float, float, float],
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """Apply the sensor errors to increments (N, 3); markov_bias and remainder (3,) are updated in place.
 
     1. b_n = decay b_(n-1) + innovation z, exact for a Gauss-Markov process (Gelb 1974, ch. 3; `assumed`)
@@ -435,10 +432,10 @@ class Imu:
 
     gyro: Triad
     accelerometer: Triad
-    rng: np.random.Generator
+    rng: Generator
 
     @classmethod
-    def from_config(cls, config: ImuConfig, rng: np.random.Generator) -> Imu:
+    def from_config(cls, config: ImuConfig, rng: Generator) -> "Imu":
         """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
         distribution.
         """

@@ -9,8 +9,6 @@ Vibration is kinematic: MuJoCo does not simulate it, but the IMU senses it (`Mot
 images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,11 +16,12 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Bools, Floats, Ints, Trajectory
+from skysim.core.types import Bools, Floats, Ints, Trajectory, joined
 from skysim.dynamics.guidance import Reference, plan
 from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
@@ -58,12 +57,12 @@ class Sines:
     cosine_rad: Floats
 
 
-def line(config: JitterLineConfig, rng: np.random.Generator) -> Sines:
+def line(config: JitterLineConfig, rng: Generator) -> Sines:
     """One frequency: sqrt(2) rms sin(2 pi f t + phase) about each axis, with random phases."""
     return with_phases(np.array([config.frequency_hz]), np.ones(1), config.rms_arcsec, rng)
 
 
-def band(config: JitterBandConfig, rng: np.random.Generator) -> Sines:
+def band(config: JitterBandConfig, rng: Generator) -> Sines:
     """A power spectral density proportional to f^slope from from_hz to to_hz, as a sum of many sines.
 
     1. Split the band into pieces of equal frequency ratio.
@@ -97,7 +96,7 @@ def with_phases(
     frequency_hz: Floats,
     power_fraction: Floats,
     rms_arcsec: Sequence[float],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Sines:
     """Sines of (K,) frequencies and fractions of the power, with independent random phases for each axis.
 
@@ -111,7 +110,7 @@ def with_phases(
 
 
 # Spectra by kind. To add one, add a class to scene/sections/motion.py and a function here.
-SPECTRA: dict[str, Callable[[Any, np.random.Generator], Sines]] = {"line": line, "band": band}
+SPECTRA: dict[str, Callable[[Any, Generator], Sines]] = {"line": line, "band": band}
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +152,7 @@ class VibrationComponent:
 
     def active(self, t_s: Floats) -> Bools:
         """(N - 1,) whether the vibration is active between each of (N,) times and the next."""
-        return np.asarray((t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:]))
+        return (t_s[:-1] < self.end_s) & (self.begin_s < t_s[1:])
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
@@ -177,9 +176,9 @@ class Vibration:
     def draw(
         cls,
         motion: MotionConfig,
-        rng: np.random.Generator,
+        rng: Generator,
         reference: Reference | None = None,
-    ) -> Vibration:
+    ) -> "Vibration":
         """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
 
         Parameters
@@ -283,7 +282,7 @@ class Vibration:
 
 def draw_component(
     configs: Sequence[JitterPart],
-    rng: np.random.Generator,
+    rng: Generator,
     name: str,
     begin_s: float = -math.inf,
     end_s: float = math.inf,
@@ -293,17 +292,11 @@ def draw_component(
     if not active:
         return None
     return VibrationComponent(
-        concatenate([SPECTRA[config.kind](config, rng) for config in active]),
+        joined([SPECTRA[config.kind](config, rng) for config in active]),
         name,
         begin_s,
         end_s,
     )
-
-
-def concatenate(sets: Sequence[Sines]) -> Sines:
-    """The sines of several sets as one set."""
-    columns = ([getattr(sines, name) for sines in sets] for name in Sines.__slots__)
-    return Sines(*map(np.concatenate, columns))
 
 
 def subdivide(t_s: Floats, counts: Ints) -> Floats:
@@ -331,7 +324,7 @@ def rotvec_body_rate(phi: Floats, phi_rate: Floats) -> Floats:
         angle > 1e-4, (1 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1 / 6
     )
     cross = np.cross(phi, phi_rate)
-    return np.asarray(phi_rate - first * cross + second * np.cross(phi, cross))
+    return phi_rate - first * cross + second * np.cross(phi, cross)
 
 
 @jit

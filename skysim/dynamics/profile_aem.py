@@ -102,7 +102,7 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
 
 def from_xml(path: Path, lines: list[Line]) -> list[Line]:
     """The lines of an AEM in XML (CCSDS 505.0-B) as keyword = value. Raises InputError for damaged or unsafe XML."""
-    out = list[Line]()
+    out = []
     section = ""
     parser: Any = XMLPullParser(("start", "end"))
     for n, line in lines:
@@ -145,7 +145,7 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
 def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
     """The version and the segments of the message. Raises InputError for a line out of place."""
     version = ""
-    segments = list[TextSegment]()
+    segments = []
     section = ""
     for n, line in lines:
         if line.split(maxsplit=1)[0] == "COMMENT":
@@ -240,7 +240,7 @@ def quaternions(path: Path, metadata: Metadata, kind: str, numbers: Floats) -> F
     line, sequence = metadata["EULER_ROT_SEQ"] if kind.startswith("EULER") else (0, "ZXZ")
     try:
         axes = sequence.upper().translate(NUMBERED)
-        return np.asarray(Rotation.from_euler(axes, angles_deg, degrees=True).as_quat())
+        return Rotation.from_euler(axes, angles_deg, degrees=True).as_quat()
     except ValueError:
         raise Where(path, line).error(
             f"EULER_ROT_SEQ = {excerpt(sequence)}", "three axes, such as 321 or ZYX"

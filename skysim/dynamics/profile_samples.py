@@ -1,7 +1,5 @@
 """Attitude samples as read from a file or a table, and their checks. An error message names the line of the fault."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,7 +62,7 @@ class Samples:
         """Name of the rotations, such as lab_from_body."""
         return f"{self.a}_from_{self.b}"
 
-    def inverted(self) -> Samples:
+    def inverted(self) -> "Samples":
         """The same attitudes as rotations b_from_a."""
         return replace(self, a=self.b, b=self.a, a_from_b=self.a_from_b.inv())
 

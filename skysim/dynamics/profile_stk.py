@@ -46,7 +46,7 @@ def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     """
     keywords: Metadata = {}
     section = ""
-    rows = list[Words]()
+    rows = []
     inside = False
     for n, line in lines[1:]:  # the first has the version
         # Keywords and section names are not case-sensitive.

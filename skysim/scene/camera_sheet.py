@@ -439,7 +439,7 @@ def check(sheet: Sheet, answers: Answers) -> None:
     try:
         CameraConfig.model_validate(PLACEHOLDER_LENS | tree)
     except ValidationError as error:
-        faults: list[InputError] = []
+        faults = []
         for one in error.errors():
             fault = fault_of(one, CameraConfig)
             section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
@@ -478,7 +478,7 @@ def yaml_lines(camera: list[SheetLine]) -> list[str]:
     """The lines of a section `camera` in YAML, with the comment of each value."""
     from skysim.core.yaml_reader import opened_sections
 
-    lines = list[str]()
+    lines = []
     open_ = list[str]()
     for line in camera:
         *sections, last = f"camera.{line.key}".split(".")

@@ -12,8 +12,6 @@
 Every error becomes an InputError of one line with key, file and line.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import functools
@@ -326,7 +324,7 @@ def load(
     return scene
 
 
-def validate(layers: list[Layer], overrides: OverrideTexts) -> Scene:
+def validate(layers: list["Layer"], overrides: OverrideTexts) -> Scene:
     """The scene of layers and overrides: steps 2 to 4 of the module's docstring. Raises InputError."""
     tree = with_overrides(merged(layers), overrides)
     files = locations(layers)

@@ -215,7 +215,7 @@ def as_dicts(found: list[Entry]) -> list[Tree]:
 
 def text(found: list[Entry]) -> str:
     """The effective scene as YAML; each line ends with the origin of its value, and `no effect` if that is so."""
-    lines: list[tuple[str, str]] = []
+    lines = []
     open_: list[str] = []
     for path, value, origin, no_effect in found:
         *parents, key = path

@@ -4,8 +4,6 @@ The sections are defined in `vehicle`, `motion`, `light`, `leds`, `camera` and `
 `core.units`.
 """
 
-from __future__ import annotations
-
 import datetime
 import html
 import math
@@ -36,7 +34,7 @@ from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
 from skysim.scene.sections.motion import SIDEREAL, MotionConfig, PointingConfig
-from skysim.scene.sections.surroundings import Coefficient, Glow, Orbit, ThermalConfig
+from skysim.scene.sections.surroundings import Coefficients, Glow, Orbit, ThermalConfig
 from skysim.scene.sections.tracker import OWN, FilterConfig, SurveyErrorsConfig, TrackerConfig
 from skysim.scene.sections.vehicle import SiteConfig, VehicleConfig
 
@@ -71,7 +69,7 @@ class ExposureConfig(ConfigModel):
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
     @model_validator(mode="after")
-    def check_period(self) -> ExposureConfig:
+    def check_period(self) -> "ExposureConfig":
         """Check that an exposure ends before the next begins, and that the run is not too long."""
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = (
@@ -118,7 +116,7 @@ class HeadConfig(ConfigModel):
     position_m: Position
     rotation_deg: Spins
     mount_error_arcsec: Triple = (0.0, 0.0, 0.0)
-    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
     exposure: ExposureConfig | None = None
@@ -225,7 +223,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     _source: RawKeys = RawKeys()
 
     @model_validator(mode="after")
-    def check_light_source(self) -> Scene:
+    def check_light_source(self) -> "Scene":
         """Check keys that depend on the kind of light, and that the shutter reads all rows within a frame period."""
         sky = self.light.kind == "stars"
         tracker = self.tracker
@@ -277,7 +275,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def complete_layout(self) -> Scene:
+    def complete_layout(self) -> "Scene":
         """The scene with the field of view and the camera position of an optimized layout completed by its own."""
         dome = self.dome
         if dome is None or not isinstance(dome.points, OptimizedConfig):
@@ -296,7 +294,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self.model_copy(update={"light": dome.model_copy(update={"layout": layout})})
 
     @model_validator(mode="after")
-    def check_sky(self) -> Scene:
+    def check_sky(self) -> "Scene":
         """Check bodies, orbit, satellites and air.
 
         1. The ephemeris is valid at the scene's time.
@@ -346,7 +344,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_exposure_limits(self) -> Scene:
+    def check_exposure_limits(self) -> "Scene":
         """Check that every exposure that the exposure control may select ends before the next one begins."""
         control = self.tracker.exposure_control
         period_s = 1 / self.exposure.rate_hz
@@ -366,7 +364,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_control(self) -> Scene:
+    def check_control(self) -> "Scene":
         """Check that the actuators of the controller and its source of the attitude are in the scene."""
         control = self.motion.control
         imu = self.vehicle.imu
@@ -397,7 +395,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_motion(self) -> Scene:
+    def check_motion(self) -> "Scene":
         """Check the gimbals of a two-axis mount, and the control period.
 
         The mount follows profiles alone, in a laboratory. The period is a whole number of milliseconds and of IMU
@@ -450,7 +448,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         return self
 
     @model_validator(mode="after")
-    def check_heads(self) -> Scene:
+    def check_heads(self) -> "Scene":
         """Check that heads have different names, and that each makes a valid scene with its camera and tracker."""
         names = [head.name for head in self.heads]
         for n, head in enumerate(self.heads):
@@ -493,7 +491,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
         """Keys about the vehicle's body that are from a base scene with another `vehicle.model`."""
         return self._inherited
 
-    def of_head(self, n: int) -> Scene:
+    def of_head(self, n: int) -> "Scene":
         """The scene with head n as its only camera, whose noise and timing have their own seed."""
         head = self.heads[n]
         main = self.camera

@@ -26,12 +26,21 @@ from skysim.camera.detector import (
     saturation_dn,
     smear,
 )
-from skysim.camera.discs import concatenated, render_bodies
+from skysim.camera.discs import render_bodies
 from skysim.camera.glow import background, stray
 from skysim.camera.projection import in_view, project, sample_times
 from skysim.camera.render import Window, render
 from skysim.core.random_streams import DETECTOR, random_stream
-from skysim.core.types import Floats, Frame, Ints, Sources, SourceTruth, Trajectory, Truth
+from skysim.core.types import (
+    Floats,
+    Frame,
+    Ints,
+    Sources,
+    SourceTruth,
+    Trajectory,
+    Truth,
+    joined,
+)
 from skysim.simulation.lab import ColorChannel, StarCamera
 from skysim.simulation.lights.light import Beam, Exposure, Seeds, any_of, beam_of
 from skysim.simulation.timing import (
@@ -215,7 +224,7 @@ def draw_lights(image: NDArray, beam: Beam, exposure: Exposure) -> SourceTruth:
             if lit.discs:
                 bodies = render_bodies(image, lit.discs, exposed, lit.occlusion)
                 truths += [stray.as_ghosts(body, number) for body in bodies]
-    sources = concatenated(truths)
+    sources = joined(truths)
     for config in beam.glares:
         stray.add_glare(image, config)
         sources = stray.without_glare(sources, config)
@@ -240,7 +249,7 @@ def draw_colors(
         truths.append(replace(drawn, electrons=drawn.electrons * len(channel.first_px) / 4))
         for y, x in channel.first_px:
             image[y::2, x::2] = one_color[y::2, x::2]
-    every = concatenated(truths)
+    every = joined(truths)
     # In descending order of brightness, so that the first row of an id is its brightest color.
     order = np.argsort(-every.peak_e, kind="stable")
     _, first, source = np.unique(every.id[order], return_index=True, return_inverse=True)

@@ -7,8 +7,6 @@
 3. Main camera with its lights, then the further cameras (heads).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -273,19 +271,19 @@ class Lab:
         """Duration of the motion: until the longest exposure of the last frame ends, of all cameras."""
         return max(timing.duration_s(camera.scene) for camera in self.cameras)
 
-    def in_run(self, seed: int) -> Lab:
+    def in_run(self, seed: int) -> "Lab":
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""
         lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
         return replace(
             lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras)
         )
 
-    def of_camera(self, number: int) -> Lab:
+    def of_camera(self, number: int) -> "Lab":
         """The lab with only one of its cameras, which becomes the main one."""
         camera = self.cameras[number]
         return replace(self, scene=camera.scene, cameras=(camera,))
 
-    def with_scene(self, scene: Scene) -> Lab:
+    def with_scene(self, scene: Scene) -> "Lab":
         """The same hardware with a scene that has the same hardware: other trackers, exposures or times."""
         scenes = [scene, *(scene.of_head(n) for n in range(len(scene.heads)))]
         cameras = tuple(

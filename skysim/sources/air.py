@@ -1,13 +1,12 @@
 """The air over a site at a time: refraction, extinction, scintillation and seeing of stars and bodies."""
 
-from __future__ import annotations
-
 import datetime
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import erfa
 import numpy as np
+from numpy.random import Generator
 from scipy import special
 from scipy.interpolate import RectBivariateSpline
 
@@ -68,7 +67,7 @@ def variance(
     within_s = min(max(exposure_s, EXPOSURES_S[0]), EXPOSURES_S[-1])
     at_masses = spline.ev(np.log(np.clip(air_masses, 1.0, AIR_MASSES[-1])), np.log(within_s))
     # Beyond the table's longest exposure the variance falls with its inverse.
-    return np.asarray(np.exp(at_masses) * min(within_s / exposure_s, 1.0))
+    return np.exp(at_masses) * min(within_s / exposure_s, 1.0)
 
 
 @lru_cache(maxsize=8)
@@ -118,29 +117,27 @@ def hufnagel_valley(sea_m: Floats, above_m: Floats) -> Floats:
     Source: Andrews & Phillips 2005, Laser Beam Propagation through Random Media, section 12.2.
     """
     high = 0.00594 * (21 / 27) ** 2 * (1e-5 * sea_m) ** 10 * np.exp(-sea_m / 1000)
-    return np.asarray(
-        high + 2.7e-16 * np.exp(-sea_m / 1500) + 1.7e-14 * np.exp(-above_m / 100)
-    )
+    return high + 2.7e-16 * np.exp(-sea_m / 1500) + 1.7e-14 * np.exp(-above_m / 100)
 
 
 def wind(sea_m: Floats) -> Floats:
     """Bufton's wind in m/s at heights above the sea; 5 on the ground (Andrews & Phillips 2005, section 12.2)."""
-    return np.asarray(5 + 30 * np.exp(-(((sea_m - 9400) / 4800) ** 2)))
+    return 5 + 30 * np.exp(-(((sea_m - 9400) / 4800) ** 2))
 
 
 def airy(x: Floats) -> Floats:
     """2 J1(pi x) / (pi x), the amplitude that a round aperture of x cycles across passes."""
     u = np.pi * np.maximum(x, 1e-9)
-    return np.asarray(2 * special.j1(u) / u)
+    return 2 * special.j1(u) / u
 
 
 def exposure_filter(turns: Floats) -> Floats:
     """Mean of sinc^2(turns cos phi) over phi: 2 (int J0 - J1) / x, x = 2 pi turns."""
     x = 2 * np.pi * np.maximum(turns, 1e-4)
-    return np.asarray(2 * (special.itj0y0(x)[0] - special.j1(x)) / x)
+    return 2 * (special.itj0y0(x)[0] - special.j1(x)) / x
 
 
-def factors(variances: Floats, rng: np.random.Generator) -> Floats:
+def factors(variances: Floats, rng: Generator) -> Floats:
     """(N,) factors of stars' light with mean 1 and these variances, log-normal (Dravins et al. 1997, PASP 109, 173).
 
     exp(s g - s^2 / 2) with s^2 = ln(1 + variance) and g standard normal.
@@ -160,12 +157,12 @@ def air_mass(altitude_rad: Floats) -> Floats:
     Source: Pickering (2002), DIO 12, 20.
     """
     h_deg = np.degrees(np.maximum(altitude_rad, 0.0))
-    return np.asarray(1 / np.sin(np.radians(h_deg + 244 / (165 + 47 * h_deg**1.1))))
+    return 1 / np.sin(np.radians(h_deg + 244 / (165 + 47 * h_deg**1.1)))
 
 
 def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
     """Bouguer's law: the fraction 10^(-0.4 k X) of the light passes X air masses."""
-    return np.asarray(10 ** (-0.4 * extinction_mag * air_masses))
+    return 10 ** (-0.4 * extinction_mag * air_masses)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,14 +191,14 @@ class Air:
     @classmethod
     def from_config(
         cls, config: AirConfig, site: SiteConfig, stars: Catalog, band: Band
-    ) -> Air:
+    ) -> "Air":
         """The air over a site for a catalog's stars and a chip's band."""
         order = np.argsort(stars.hip)
         b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
         refraction = Refraction(weather_of(config, site, band))
         return cls(config, site, refraction, stars.hip[order], b_v, mean_wavelength_m(band))
 
-    def at(self, time: datetime.datetime) -> Sky:
+    def at(self, time: datetime.datetime) -> "Sky":
         """The sky at a time."""
         return Sky(self, time, topocentric_axes(time, self.site))
 
@@ -235,7 +232,7 @@ class Sky:
 
     def altitude_rad(self, directions: Floats) -> Floats:
         """(N,) apparent altitudes of apparent directions (N, 3)."""
-        return np.asarray(np.arcsin(np.clip(directions @ self.zenith, -1, 1)))
+        return np.arcsin(np.clip(directions @ self.zenith, -1, 1))
 
     def air_mass(self, directions: Floats) -> Floats:
         """(N,) air masses in apparent directions (N, 3)."""
@@ -245,7 +242,7 @@ class Sky:
         """(N,) whether apparent directions (N, 3) are below the skyline."""
         north, east, up = self.axes @ directions.T
         limit_rad = horizon_rad(self.air.config.horizon, np.arctan2(east, north))
-        return np.asarray(up < np.sin(limit_rad))
+        return up < np.sin(limit_rad)
 
     def points_seen(self, lights: Sources) -> Sources:
         """Lights at infinity, raised by refraction and dimmed by extinction, in their order; motions are unchanged."""
@@ -256,7 +253,7 @@ class Sky:
         return replace(lights, place=place, strength=lights.strength * passed)
 
     def twinkling(
-        self, seen: Sources, aperture_m: float, exposure_s: float, rng: np.random.Generator
+        self, seen: Sources, aperture_m: float, exposure_s: float, rng: Generator
     ) -> Sources:
         """The stars of `points_seen` with the scintillation of one exposure through an aperture of this diameter.
 

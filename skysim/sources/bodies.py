@@ -1,7 +1,5 @@
 """The bodies of a scene at a time, as light sources: points, or discs of many points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -71,9 +69,8 @@ def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
     """Spectral photon flux of a body of V = 0, in the units of `black_body_v0`."""
     # Relative to V, in which the magnitude is given.
     relative = np.array(albedo) / albedo[1]
-    return np.asarray(
-        black_body_v0(wavelength_m, temperature_k(*SUN))
-        * np.interp(wavelength_m, BANDS_M, relative)
+    return black_body_v0(wavelength_m, temperature_k(*SUN)) * np.interp(
+        wavelength_m, BANDS_M, relative
     )
 
 
@@ -186,7 +183,7 @@ class BodyLight:
         vectors = center + np.tan(self.radius_rad) * offset
         return normalized(vectors)
 
-    def overlaps(self, other: BodyLight) -> bool:
+    def overlaps(self, other: "BodyLight") -> bool:
         """Whether the disc overlaps another body's disc."""
         cosine = float(self.place.direction @ other.place.direction)
         return cosine > np.cos(self.radius_rad + other.radius_rad)

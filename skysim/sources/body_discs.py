@@ -5,8 +5,6 @@ cosine of the emission angle is mu = sqrt(1 - x^2 - y^2), and at a phase angle a
 mu0 = x sin a + mu cos a; the terminator, mu0 = 0, is half an ellipse of semi-axes 1 and |cos a|.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import lru_cache
@@ -82,7 +80,7 @@ def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     if surface.earthshine:
         light += earthlit * (surface.earthshine / float(earthlit.sum()))
         light /= 1 + surface.earthshine
-    return np.asarray(light)
+    return light
 
 
 @jit
@@ -143,7 +141,7 @@ class DiscElements(NamedTuple):
     xy: Floats
     share: Floats
 
-    def merged(self) -> DiscElements:
+    def merged(self) -> "DiscElements":
         """One element with all light, at the center of light."""
         return DiscElements((self.share @ self.xy)[None], np.array([self.share.sum()]))
 

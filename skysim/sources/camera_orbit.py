@@ -233,7 +233,7 @@ def hidden_by_earth(
     below = square - inward**2 < np.minimum(1.0, square * (1 - 1e-12))
     # Where the line enters the sphere.
     entry = inward - np.sqrt(np.maximum(1 - square + inward**2, 0.0))
-    return np.asarray((inward > 0) & below & (np.maximum(entry, 0.0) < distance_m * length))
+    return (inward > 0) & below & (np.maximum(entry, 0.0) < distance_m * length)
 
 
 def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
@@ -248,7 +248,7 @@ def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
     # Elevation above the limb in units of the Sun's angular radius.
     h_rad = limb_elevation_rad(place_m, to_sun)
     h = np.clip(h_rad * np.linalg.norm(to_sun, axis=-1) / SUN_RADIUS_M, -1, 1)
-    return np.asarray(0.5 + (h * np.sqrt(1 - h**2) + np.arcsin(h)) / np.pi)
+    return 0.5 + (h * np.sqrt(1 - h**2) + np.arcsin(h)) / np.pi
 
 
 def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
@@ -264,7 +264,7 @@ def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
     above_horizon = np.arcsin(
         np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1)
     )
-    return np.asarray(above_horizon + np.arccos(1 / np.maximum(radius, 1.0)))
+    return above_horizon + np.arccos(1 / np.maximum(radius, 1.0))
 
 
 def to_astronomical(direction: Floats) -> tuple[float, float]:

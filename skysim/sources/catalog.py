@@ -4,15 +4,13 @@ A file is ECSV (astropy reads it too): a YAML header that states the epoch and t
 per star, sorted by number. Directions are in the ICRS.
 """
 
-from __future__ import annotations
-
 import csv
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -22,7 +20,7 @@ from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, Record
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
 EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
@@ -93,13 +91,13 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def take(self, which: NDArray) -> Catalog:
+    def take(self, which: NDArray) -> "Catalog":
         """The chosen stars, by mask or index."""
         # All fields but the epoch are arrays.
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
         return replace(self, **{name: getattr(self, name)[which] for name in arrays})
 
-    def to_limit(self, limit_mag: float | None) -> Catalog:
+    def to_limit(self, limit_mag: float | None) -> "Catalog":
         """The stars with V <= limit_mag; all if it is None."""
         return self if limit_mag is None else self.take(self.v_mag <= limit_mag)
 
@@ -107,8 +105,8 @@ class Catalog:
 def write(
     path: Path,
     columns: Iterable[CatalogColumn],
-    rows: list[dict[str, Any]],
-    meta: dict[str, Any],
+    rows: list[Record],
+    meta: Record,
 ) -> None:
     """Write ECSV 1.0 atomically: YAML in the comments, then comma-separated lines.
 
@@ -136,7 +134,7 @@ def write(
             table.writerow([*(format(row[c.name], c.format) for c in columns), row["source"]])
 
 
-def header_text(datatype: list[dict[str, Any]], meta: dict[str, Any]) -> str:
+def header_text(datatype: list[Record], meta: Record) -> str:
     """The header of an ECSV file: YAML in comments."""
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
@@ -230,7 +228,7 @@ def read(name_or_path: str | Path) -> Catalog:
     )
 
 
-def read_meta_and_lines(path: Path) -> tuple[dict[str, Any], list[str]]:
+def read_meta_and_lines(path: Path) -> tuple[Record, list[str]]:
     """The header's meta, and the lines below the header, the column names first. Raises InputError."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -264,7 +262,7 @@ def catalog_error(path: Path, what: str) -> InputError:
     return InputError(path, what, "a star catalog (.ecsv) built by skysim")
 
 
-def info(name_or_path: str | Path) -> dict[str, Any]:
+def info(name_or_path: str | Path) -> Record:
     """Contents of a catalog file, for `skysim catalog info`: path, stars, and the header's meta.
 
     `sources` has the number of stars by source, `brighter_than` that brighter than each whole V.

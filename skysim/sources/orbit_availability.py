@@ -106,7 +106,7 @@ def sample(
     """
     # The stars in a field are looked up in a tree.
     tree = cKDTree(stars)
-    parts = list[SkySamples]()
+    parts = []
     places_m = {name: place_spline(name, start, float(t_s[-1])) for name in ("sun", "moon")}
     # Memory limits the number of times that are computed at once.
     for first in range(0, len(t_s), CHUNK):

@@ -5,8 +5,6 @@ SGP4's theory and its constants (WGS 72) belong to the elements, which were fitt
 whose code the package `sgp4` compiles. Formats: CCSDS 502.0-B-2 and 502.0-B-3 (OMM, OEM).
 """
 
-from __future__ import annotations
-
 import csv
 import datetime
 import io
@@ -72,7 +70,7 @@ class MeanElements(NamedTuple):
     names: tuple[str, ...]
     records: tuple[Any, ...]
 
-    def take(self, which: Iterable[int]) -> MeanElements:
+    def take(self, which: Iterable[int]) -> "MeanElements":
         """The elements of the chosen satellites."""
         rows = list(which)
         return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]
@@ -130,21 +128,15 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str
         # Both lines must be complete, and their checksums right if they have any.
         for begin, one in zip("12", pair, strict=True):
             if not one.startswith(f"{begin} ") or len(one) not in TLE_LENGTHS:
-                raise InputError(
-                    path, f"{excerpt(one)} is not line {begin} of a TLE", where=Where(path, n)
-                )
+                raise Where(path, n).error(f"{excerpt(one)} is not line {begin} of a TLE")
             if len(one) == TLE_LENGTHS[1] and checksum(one) != one[-1]:
-                raise InputError(
-                    path,
-                    f"the checksum of line {begin} is {one[-1]}; it should be {checksum(one)}",
-                    where=Where(path, n),
+                raise Where(path, n).error(
+                    f"the checksum of line {begin} is {one[-1]}; it should be {checksum(one)}"
                 )
         try:
             record = Satrec.twoline2rv(*pair)
         except (ValueError, IndexError) as error:
-            raise InputError(
-                path, f"not a TLE: {excerpt(error)}", where=Where(path, n)
-            ) from None
+            raise Where(path, n).error(f"not a TLE: {excerpt(error)}") from None
         yield usable(path, n, name, record)
 
 
@@ -184,21 +176,16 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     # Elements that SGP4 needs.
     missing = [key for key in REQUIRED if key not in texts]
     if missing:
-        raise InputError(path, f"{missing[0]} is missing", where=where)
+        raise where.error(f"{missing[0]} is missing")
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
-        raise InputError(
-            path,
-            f"EPOCH {excerpt(epoch)}",
-            "2012-06-22T21:00:00.123456",
-            where=where,
-        )
+        raise where.error(f"EPOCH {excerpt(epoch)}", "2012-06-22T21:00:00.123456")
     try:
         # sgp4 reads epochs with a fraction of a second only.
         full_epoch = epoch if "." in epoch else f"{epoch}.0"
         omm.initialize(record, OPTIONAL | texts | {"EPOCH": full_epoch})
     except (ValueError, OverflowError) as error:
-        raise InputError(path, excerpt(error), where=where) from None
+        raise where.error(excerpt(error)) from None
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 
@@ -209,9 +196,7 @@ def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
     error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
     if error or not np.isfinite(place_km).all():
         what = SGP4_ERRORS.get(error, "elements that are not numbers")
-        raise InputError(
-            path, f"SGP4 refuses these elements: {what}", where=Where(path, n, "satellite")
-        )
+        raise Where(path, n, "satellite").error(f"SGP4 refuses these elements: {what}")
     return int(record.satnum), name or str(record.satnum), record
 
 
@@ -349,7 +334,7 @@ def gravity_m_s2(position_m: Floats) -> Floats:
 def split_segments(path: str) -> list[TextSegment]:
     """The segments of an OEM file. Raises InputError for a line out of place."""
     version = ""
-    segments = list[TextSegment]()
+    segments = []
     section = ""
     for n, line in read_lines(Path(path)):
         word = line.split(maxsplit=1)[0]
@@ -360,7 +345,7 @@ def split_segments(path: str) -> list[TextSegment]:
             if word == "META_START":
                 segments.append(TextSegment({}, []))
             elif not segments:
-                raise InputError(path, f"{word} before META_START", where=Where(path, n))
+                raise Where(path, n).error(f"{word} before META_START")
         # Keywords stand in the header and in the metadata; data follow META_STOP.
         elif section in ("", "META_START"):
             key, value = keyword_value(path, n, line)

@@ -8,8 +8,6 @@ dwarfs, scaled to its V magnitude. An LED has a tabulated spectrum, a Gaussian o
 with the camera's response R (`Band`): the chip's quantum efficiency, times the lens's transmission if that is a curve.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -75,7 +73,7 @@ class Band:
     chromatic: ChromaticConfig | None = None
 
     @classmethod
-    def from_camera(cls, camera: CameraConfig, curve: str = "") -> Band:
+    def from_camera(cls, camera: CameraConfig, curve: str = "") -> "Band":
         """The response of a camera: its chip's quantum efficiency times its lens's transmission curve; cached.
 
         `curve` is the quantum efficiency of one of its colors; if empty, that of the chip. A transmission that is one
@@ -91,7 +89,7 @@ class Band:
     @classmethod
     def from_efficiency(
         cls, quantum_efficiency: float | str | EfficiencyConfig | ColorEfficiencyConfig
-    ) -> Band:
+    ) -> "Band":
         """The band of one number (flat over 400-1000 nm) or of a named curve; cached, so the same object every time.
 
         A curve with a peak is scaled to it. That of three colors is the band of the gray image that a tracker makes of
@@ -276,7 +274,7 @@ def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
     as in `complete_colors`.
     """
     stars = stellar_sequence()
-    return np.asarray(np.interp(complete_colors(b_v, v_i)[1], stars.v_i, stars.temperature_k))
+    return np.interp(complete_colors(b_v, v_i)[1], stars.v_i, stars.temperature_k)
 
 
 def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
@@ -303,14 +301,12 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
 
     # Planck's law up to a constant factor, which cancels against the mean in V.
     def power(wavelength_m: Floats) -> Floats:
-        return np.asarray(wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * kelvin)))
+        return wavelength_m**-5.0 / np.expm1(HC_K_M / (wavelength_m * kelvin))
 
     # V's zero point fixes the mean of the power in V.
     johnson_v = _read_curve(DATA / "bands" / "johnson_v.csv")
     mean = johnson_v.integral(power) / johnson_v.integral(np.ones_like)
-    return np.asarray(
-        power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None]
-    )
+    return power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None]
 
 
 @lru_cache(maxsize=64)
@@ -343,7 +339,7 @@ def star_flux_e_s_m2(
     """
     inverse_k, log_e = _black_bodies(band)
     log_v0 = np.interp(1 / temperature_k(b_v, v_i), inverse_k, log_e)
-    return np.asarray(10.0 ** (log_v0 - 0.4 * np.asarray(v_mag, dtype=float)))
+    return 10.0 ** (log_v0 - 0.4 * np.asarray(v_mag, dtype=float))
 
 
 @lru_cache(maxsize=64)
@@ -400,7 +396,7 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
                 * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
             )
 
-        return np.asarray(band.integral(weighted) / total)
+        return band.integral(weighted) / total
 
     means = [mean_of(1, column, np.zeros(())) for column in range(2)]
     spreads = [np.sqrt(mean_of(2, column, mean)) for column, mean in enumerate(means)]
@@ -429,7 +425,7 @@ def synthetic_mag(
     """
     # V is the zero point of a G2 star by definition.
     ratio = star_flux_e_s_m2(v_mag, b_v, v_i, band) / star_flux_e_s_m2(0.0, *SUN, band)
-    return np.asarray(-2.5 * np.log10(ratio))
+    return -2.5 * np.log10(ratio)
 
 
 def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
@@ -447,7 +443,7 @@ def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
     Floats
         Photo-electrons s^-1 m^-2 sr^-1
     """
-    return np.asarray(star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR)
+    return star_flux_e_s_m2(mag_arcsec2, *SUN, band) / ARCSEC2_SR
 
 
 def led_strength_e_s_sr(
@@ -493,7 +489,7 @@ def radiant_strength_e_s_sr(
             lambda wavelength_m: power(wavelength_m) * wavelength_m / HC_J_M
         )
         electrons_per_joule = electrons / total
-    return np.asarray(np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule)
+    return np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule
 
 
 def broad_spectrum(
@@ -572,4 +568,4 @@ def snr(
     signal_e = np.asarray(signal_e, dtype=float)
     # Variances of signal, background and read noise add.
     noise = np.sqrt(signal_e + area_px * (background_e + np.square(read_noise_e)))
-    return np.asarray(signal_e / noise)
+    return signal_e / noise

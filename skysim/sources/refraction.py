@@ -8,8 +8,6 @@
 3. `Refraction` tabulates R against the zenith distance without air, and turns directions toward the zenith.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -91,7 +89,7 @@ class Atmosphere:
     wet: float
 
     @classmethod
-    def from_weather(cls, weather: Weather) -> Atmosphere:
+    def from_weather(cls, weather: Weather) -> "Atmosphere":
         """The atmosphere above a site."""
         t_c = weather.temperature_c
         t0_k = weather.temperature_c + ZERO_CELSIUS_K

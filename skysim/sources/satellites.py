@@ -77,7 +77,7 @@ def phase_mag(phase_rad: Floats | float) -> Floats:
     Hejduk 2011, Specular and diffuse components in spherical satellite photometric modeling (AMOS conference).
     """
     light = np.sin(phase_rad) + (np.pi - phase_rad) * np.cos(phase_rad)
-    return np.asarray(-2.5 * np.log10(np.maximum(light, 1e-12)))
+    return -2.5 * np.log10(np.maximum(light, 1e-12))
 
 
 def magnitude(standard_mag: float, range_m: float, phase_rad: float, sunlit: float) -> float:

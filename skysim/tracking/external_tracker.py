@@ -4,8 +4,6 @@ They get the same set-up and frames as skysim's own tracker, and their answers b
 an external tracker becomes the status of a frame.
 """
 
-from __future__ import annotations
-
 import inspect
 import time
 from collections.abc import Callable, Mapping
@@ -63,7 +61,7 @@ class ExternalTracker(FrameTracker):
     @classmethod
     def start(
         cls, scene: scenes.Scene, setup: Setup, commands: Mapping[str, str]
-    ) -> ExternalTracker:
+    ) -> "ExternalTracker":
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         name = scene.tracker.name
         TRACKERS.check_name(name, commands)
@@ -152,14 +150,19 @@ class FunctionTracker(FrameTracker):
         Function from an image (H, W) to the attitude, as `tracker_interface.to_answer` takes it; or one whose first
         parameter is named `setup`, from a `Setup` to a tracker: a `tracker_interface.Tracker`, or the function that its
         method `solve` would be
+    takes_picture
+        Whether the function takes a `Picture`, with image, time, exposure and streak, as one does after its set-up
     """
 
-    def __init__(self, name: str, function: Callable[..., Any]) -> None:
+    def __init__(
+        self, name: str, function: Callable[..., Any], takes_picture: bool = False
+    ) -> None:
         self.name = name
         self.function = function
         self.takes_setup = takes_setup(function)
+        self.takes_picture = takes_picture
 
-    def set_up(self, setup: Setup) -> FunctionTracker:
+    def set_up(self, setup: Setup) -> "FunctionTracker":
         """The tracker after its set-up: a function of a `Picture`. Raises InputError if it makes none."""
         made = self.function(setup)
         solve = getattr(made, "solve", made)
@@ -169,11 +172,7 @@ class FunctionTracker(FrameTracker):
                 f"{self.name} made {type(made).__name__} of its set-up",
                 "an object with a method solve, or a function",
             )
-        return SetUpTracker(self.name, solve)
-
-    def given(self, picture: Picture) -> Any:
-        """The argument of the function: the image alone."""
-        return picture.image_dn
+        return FunctionTracker(self.name, solve, takes_picture=True)
 
     def solve_frame(
         self, frame: Frame, streak_px: tuple[float, float] | None = None
@@ -182,18 +181,11 @@ class FunctionTracker(FrameTracker):
         picture = replace(picture_of(frame, streak_px), image_dn=np.array(frame.image_dn))
         begin_s = time.perf_counter()
         try:
-            answer = check_answer(self.function(self.given(picture)))
+            given = picture if self.takes_picture else picture.image_dn
+            answer = check_answer(self.function(given))
         except Exception as error:
             errors.raise_wrapped(error)
             return Report(Attitude(f"{FAILED}{describe_error(error)}"), Centroids.empty())
         report = to_report(answer)
         report.seconds.setdefault("solve", time.perf_counter() - begin_s)
         return report
-
-
-class SetUpTracker(FunctionTracker):
-    """A tracker that has had its set-up: its function takes a `Picture`."""
-
-    def given(self, picture: Picture) -> Any:
-        """The argument of the function: image, time, exposure and streak."""
-        return picture

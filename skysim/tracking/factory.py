@@ -33,7 +33,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import NO_PROGRAMS, Programs
-from skysim.core.types import Frame, Mount, Sources
+from skysim.core.types import Frame, Mount, Record, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.tracker import OWN
 from skysim.tracking.external_tracker import (
@@ -81,7 +81,7 @@ def assumed_settings(scene: Scene) -> Settings:
     config = scene.tracker
     default = Settings()
     usual = DOME_ALGORITHMS if scene.dome else {}
-    chosen: dict[str, Any] = {}
+    chosen = Record()
     for stage, table in algorithm_tables(scene).items():
         name = getattr(config, stage) or usual.get(stage, "default")
         # Only the estimator has the list, and the scene package may not import it, so the name is checked here.
@@ -232,7 +232,7 @@ def solve_frame(
     """
     if isinstance(estimator, UserTracker):
         return estimator.solve_frame(frame, streak_px)
-    when: dict[str, Any] = {}
+    when = Record()
     if isinstance(estimator, StarTracker | CodedTracker):
         when["t_s"] = frame.t_mid_s
     if isinstance(estimator, CodedTracker):

@@ -7,11 +7,12 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
 from skysim.core.plugins import Respond, describe_error, serve
+from skysim.core.types import Record
 from skysim.tracking.tracker_interface import (
     FAILED,
     TRACKERS,
@@ -23,7 +24,7 @@ from skysim.tracking.tracker_interface import (
 )
 
 
-def receive_picture(header: dict[str, Any], frames: IO[bytes]) -> Picture:
+def receive_picture(header: Record, frames: IO[bytes]) -> Picture:
     """The frame of a header, with its pixels read from the stream."""
     image = np.frombuffer(frames.read(header["bytes"]), header["dtype"]).reshape(
         header["height_px"], header["width_px"]
@@ -41,7 +42,7 @@ def respond_by(tracker: Tracker) -> Respond:
     if not callable(getattr(tracker, "solve", None)):
         raise TypeError(f"{type(tracker).__name__} has no method solve")
 
-    def respond(header: dict[str, Any], frames: IO[bytes]) -> dict[str, Any]:
+    def respond(header: Record, frames: IO[bytes]) -> Record:
         picture = receive_picture(header, frames)
         begin_s = time.perf_counter()
         try:

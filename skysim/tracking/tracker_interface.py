@@ -30,7 +30,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, Record
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.scene.sections.tracker import OWN
 
@@ -128,10 +128,9 @@ class Setup:
     leds: Leds | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> Record:
         """The set-up as a JSON object; arrays become lists."""
-        tree: dict[str, Any] = to_lists(asdict(self))
-        return {"skysim_tracker": PROTOCOL, **tree}
+        return {"skysim_tracker": PROTOCOL, **to_lists(asdict(self))}
 
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
@@ -196,7 +195,7 @@ class Answer:
     centroids_px: Any = None
     seconds: float | None = None
 
-    def as_tree(self) -> dict[str, Any]:
+    def as_tree(self) -> Record:
         """The answer as a JSON object; entries that are None are left out."""
         values = to_lists(asdict(self))
         return {name: value for name, value in values.items() if value is not None}
@@ -327,7 +326,7 @@ NAME = re.compile(r"[a-z][a-z0-9_-]*")
 def program_commands(options: Sequence[str] | None) -> dict[str, str]:
     """Commands by name from texts `NAME=COMMAND` (trackers, controllers). Raises InputError."""
     kinds = (TRACKERS, CONTROLLERS)
-    programs: dict[str, str] = {}
+    programs = {}
     for option in options or ():
         name, equals, command = option.partition("=")
         if not equals or not NAME.fullmatch(name) or not command.strip():
@@ -461,7 +460,7 @@ class TrackerProgram(Program):
         ProgramError
             If the program has made its folder unusable.
         """
-        header: dict[str, Any] = {
+        header: Record = {
             "frame": picture.frame,
             "t_s": picture.t_s,
             "exposure_s": picture.exposure_s,

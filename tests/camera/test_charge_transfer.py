@@ -8,8 +8,7 @@ import pytest
 from skysim.camera.charge_transfer import (
     bloom,
     delayed_fractions,
-    frame_transfer_smear,
-    interline_smear,
+    smear,
     transfer_loss,
 )
 
@@ -212,10 +211,10 @@ def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
         [clocked_under_light(column, exposure_s, row_time_s) for column in rate.T]
     ).T
     light = rate * exposure_s
-    frame_transfer_smear(light, exposure_s, row_time_s)
+    smear(light, exposure_s, row_time_s)
     np.testing.assert_allclose(light, wanted, rtol=1e-12)
     single = (rate * exposure_s).astype(np.float32)
-    frame_transfer_smear(single, exposure_s, row_time_s)
+    smear(single, exposure_s, row_time_s)
     np.testing.assert_allclose(single, wanted, rtol=1e-6)
 
 
@@ -223,8 +222,8 @@ def test_a_leaking_register_smears_in_proportion_to_its_leak() -> None:
     rate = np.random.default_rng(8).uniform(0, 1e5, (40, 65))
     open_sky = rate * 0.1
     covered = rate * 0.1
-    frame_transfer_smear(open_sky, 0.1, 5e-6)
-    interline_smear(covered, 0.1, 5e-6, leak=1e-3)
+    smear(open_sky, 0.1, 5e-6)
+    smear(covered, 0.1, 5e-6, leak=1e-3)
     np.testing.assert_allclose(
         covered - rate * 0.1, 1e-3 * (open_sky - rate * 0.1), rtol=0, atol=1e-9
     )
@@ -233,7 +232,7 @@ def test_a_leaking_register_smears_in_proportion_to_its_leak() -> None:
 def test_a_bright_star_smears_only_its_column() -> None:
     light = np.zeros((100, 80), np.float32)
     light[30, 40] = 1e6
-    frame_transfer_smear(light, 0.1, 1e-6)
+    smear(light, 0.1, 1e-6)
     others = np.delete(light[:, 40], 30)
     np.testing.assert_allclose(others, 10.0, rtol=1e-6)  # 1e6 e x 1 us / 0.1 s
     assert light[30, 40] == 1e6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from skysim.camera.detector import Detector, expose
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory, with_sources
+from skysim.core.types import Floats, Mount, Sources, SourceTruth, Trajectory
 from skysim.dynamics.jitter import Vibration
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
@@ -29,6 +30,14 @@ from skysim.sources.photometry import SUN, Band, led_strength_e_s_sr, star_flux_
 from skysim.sources.stars import steady_points
 
 FLAT = Band.from_efficiency(1.0)
+
+
+def with_sources(parts: Sequence[Sources]) -> Sources:
+    """All sources of several sets without motion, in their order."""
+    columns = {name: [getattr(part, name) for part in parts] for name in Sources.__slots__}
+    return Sources(
+        **{name: np.concatenate(own) for name, own in columns.items() if own[0] is not None}
+    )
 
 
 def lens_of(collecting_m2: float = 1.0, **changes: Any) -> Optics:

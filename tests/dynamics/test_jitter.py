@@ -9,11 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Trajectory
+from skysim.core.types import Trajectory, joined
 from skysim.dynamics.jitter import (
     SPECTRA,
     Vibration,
-    concatenate,
     evaluate_sines,
     rotvec_body_rate,
 )
@@ -152,7 +151,7 @@ def test_between_the_samples_the_history_follows_the_sum() -> None:
     calm = turning(2.0, rate=(0.02, -0.01, 0.03))
     shaken = shake(calm, parts, np.random.default_rng(8))
     rng = np.random.default_rng(8)
-    sines = concatenate([SPECTRA[part.kind](part, rng) for part in parts])
+    sines = joined([SPECTRA[part.kind](part, rng) for part in parts])
     t = np.random.default_rng(9).uniform(0, 2, 5000)
     wanted = (
         evaluate_sines(t, sines.omega_rad_s, sines.sine_rad, sines.cosine_rad)[0] / ARCSEC

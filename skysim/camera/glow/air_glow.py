@@ -68,7 +68,7 @@ def airglow_nl(
     """
     masses = diffuse_air_mass(zenith_rad)
     at_zenith = NANOLAMBERT_V0 * 10 ** (-0.4 * zenith_mag_arcsec2)
-    return np.asarray(at_zenith * masses * 10 ** (-0.4 * extinction_mag * (masses - 1)))
+    return at_zenith * masses * 10 ** (-0.4 * extinction_mag * (masses - 1))
 
 
 def moonlight(sky: Sky, directions: Floats, zenith_rad: Floats) -> Floats:
@@ -110,4 +110,4 @@ def sunlight_nl(
         * scattered
         * (scattering(off_deg) * passed + 440_000 * (1 - passed))
     )
-    return np.asarray(np.minimum(twilight, day) / ERG_NL)
+    return np.minimum(twilight, day) / ERG_NL

@@ -71,7 +71,7 @@ def faint_starlight_s10(galactic_latitude_deg: Floats, fainter_than_mag: float) 
     # The part of the integral beyond the limit.
     beyond = erfc(np.sqrt(CURVATURE) * (fainter_than_mag - 10 - peak))
     whole = np.exp(ln_light + CURVATURE * peak**2) * np.sqrt(np.pi / (4 * CURVATURE))
-    return np.asarray(whole * beyond)
+    return whole * beyond
 
 
 def galactic_latitude_deg(direction_icrs: Floats) -> Floats:
@@ -177,7 +177,7 @@ def moonlight_nl(
     illuminance = 10 ** (-0.4 * magnitude)
     transmitted = 10 ** (-0.4 * extinction_mag * moon_masses)
     scattered = 1 - 10 ** (-0.4 * extinction_mag * field_masses)
-    return np.asarray(scattering(separation_deg) * illuminance * transmitted * scattered)
+    return scattering(separation_deg) * illuminance * transmitted * scattered
 
 
 def scattering(separation_deg: float | Floats) -> Floats:
@@ -189,7 +189,7 @@ def scattering(separation_deg: float | Floats) -> Floats:
     """
     rho = np.maximum(np.asarray(separation_deg, dtype=float), MOON_RADIUS_DEG)
     molecules = 10**5.36 * (1.06 + np.cos(np.radians(rho)) ** 2)
-    return np.asarray(molecules + np.maximum(10 ** (6.15 - rho / 40), 6.2e7 / rho**2))
+    return molecules + np.maximum(10 ** (6.15 - rho / 40), 6.2e7 / rho**2)
 
 
 def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
@@ -198,7 +198,7 @@ def diffuse_air_mass(zenith_rad: Floats | float) -> Floats:
     X = (1 - 0.96 sin^2 Z)^-1/2: van Rhijn's (1921) law with (R / (R + h))^2 = 0.96, h = 131 km (Garstang 1989, PASP
     101, 306; KS91 eq. 3).
     """
-    return np.asarray((1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5)
+    return (1 - 0.96 * np.sin(zenith_rad) ** 2) ** -0.5
 
 
 def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
@@ -218,9 +218,7 @@ def transmittance(
     angle_deg: float | Floats, table_deg: Sequence[float], pst: Sequence[float]
 ) -> Floats:
     """Interpolate the logarithm of a table of transmittances linearly; constant beyond its ends. Shape of angle_deg."""
-    return np.asarray(
-        np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST))))
-    )
+    return np.exp(np.interp(angle_deg, table_deg, np.log(np.maximum(pst, MIN_PST))))
 
 
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
@@ -374,7 +372,7 @@ def fill(image: NDArray, coarse: Floats, factor: float) -> None:
         Exposure in s, for electrons
     """
     if coarse.max() == coarse.min():
-        _fill_flat(image, float(coarse[0, 0]) * factor)
+        image[:] = coarse[0, 0] * factor
     else:
         _fill_bilinear(image, coarse * factor)
 
@@ -387,13 +385,6 @@ def add(image: NDArray, glow: Floats, factor: float) -> None:
         own = np.empty_like(image)
         fill(own, glow, factor)
         image += own
-
-
-@jit(parallel=True)
-def _fill_flat(image: NDArray, value: float) -> None:
-    """Set all pixels to one value."""
-    for y in numba.prange(image.shape[0]):
-        image[y, :] = value
 
 
 @jit(parallel=True)

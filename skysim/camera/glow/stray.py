@@ -171,7 +171,7 @@ def wall_glow(
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
         floor_light = spread(dome.diffuse, floor_m, up, shape)
         radiance += on_floor * dome.config.floor.share * floor_light
-    return np.asarray(radiance / np.pi * view.etendue_m2_sr()).reshape(shape)
+    return (radiance / np.pi * view.etendue_m2_sr()).reshape(shape)
 
 
 def meeting(toward: Floats, depth_m: float) -> Floats:
@@ -186,7 +186,7 @@ def spread(
     values = np.nan_to_num(diffuse.irradiance_e_s_m2(points_m, normals)).reshape(IRRADIANCE)
     places = (np.linspace(0, 1, count) for count in IRRADIANCE)
     nodes = (np.linspace(0, 1, count) for count in shape)
-    return np.asarray(RectBivariateSpline(*places, values, kx=1, ky=1)(*nodes)).ravel()
+    return RectBivariateSpline(*places, values, kx=1, ky=1)(*nodes).ravel()
 
 
 @lru_cache(maxsize=8)

@@ -22,11 +22,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, softening_sigma_px
-from skysim.camera.psf.otf import EXTENT, WINGED
-from skysim.camera.psf.splat import Singles, cubic
+from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, reach_px, softening_sigma_px
+from skysim.camera.psf.splat import cubic, reached
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 CUT_SIGMA = (
@@ -63,17 +62,6 @@ class EllipseBox(NamedTuple):
     table: Singles
 
 
-def reach_px(psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any) -> Any:
-    """Reach in pixels, pixels' corners included, of the images of disks of these largest radii.
-
-    `sigma_px` is that of a Gaussian blur in addition to the lens's own.
-    """
-    # Lens, fading wings, disk, blur, and the pixel's half diagonal.
-    radius, sigma = EXTENT[psf.kind](psf, camera)
-    fade_px = FADE_PX if psf.kind in WINGED else 0.0
-    return radius + fade_px + radius_px + CUT_SIGMA * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
-
-
 def box_half_px(reach: Any) -> Any:
     """Half widths of the boxes that hold images of this reach: whole pixels, in coarser steps for larger ones."""
     step = np.select(
@@ -86,7 +74,7 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
     """The tables of a box of 2 half + 1 pixels, with a margin for wings: step 1 of the module."""
     lens = PsfModel(psf, camera, 0.0, ())
     size = 2 * (half + ceil(lens.wing_margin_px())) + 1
-    point_like = bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0))
+    point_like = bool(half <= POINT_LIKE * reach_px(psf, camera, 0.0, 0.0, CUT_SIGMA))
     level, per_wave = ACCURACY[point_like]
     passed = passband(psf, camera, 0.0, level)
     # As many waves as the lens passes, and as many samples as they need.
@@ -390,17 +378,12 @@ def add_ellipse(
 
     All pixels of an image have the same sixteen weights, since the samples repeat with the pixels.
     """
-    height, width = patch.shape
     samples = table.shape[0]
     size = table.shape[1]
     half = size // 2 - PAD
-    # The pixels that the image covers within the patch and its rows.
     center_x = floor(x + 0.5)
     center_y = floor(y + 0.5)
-    left = max(center_x - half, 0)
-    right = min(center_x + half + 1, width)
-    top = max(center_y - half, row0, 0)
-    bottom = min(center_y + half + 1, row1, height)
+    left, right, top, bottom = reached(patch, row0, row1, center_x, center_y, half)
     if right <= left or bottom <= top:
         return
     # Place of the first pixel among the samples, and the weights of the four samples on either axis.

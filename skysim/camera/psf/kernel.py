@@ -14,11 +14,9 @@ sub-pixel position. There are three forms (`build_kernel` chooses):
    (`grid_kernel`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -26,8 +24,8 @@ from scipy import fft, special
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
-from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, Singles
-from skysim.core.types import Floats, Ints
+from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, cubic
+from skysim.core.types import Floats, Ints, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular
@@ -123,6 +121,19 @@ def build_kernel(
     return round_image or grid_kernel(model)
 
 
+def reach_px(
+    psf: Psf, camera: CameraConfig, radius_px: Any, sigma_px: Any, cut_sigma: float
+) -> Any:
+    """Reach in pixels, pixels' corners included, of the images of disks of these largest radii.
+
+    `sigma_px` is that of a Gaussian blur in addition to the lens's own; both together are cut at `cut_sigma` of theirs.
+    """
+    # Lens, fading wings, disk, blur, and the pixel's half diagonal.
+    radius, sigma = EXTENT[psf.kind](psf, camera)
+    fade_px = FADE_PX if psf.kind in WINGED else 0.0
+    return radius + fade_px + radius_px + cut_sigma * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
+
+
 @dataclass(frozen=True, slots=True)
 class PsfModel:
     """The factors of the image's convolution: a lens, an extra Gaussian, and disks."""
@@ -144,10 +155,8 @@ class PsfModel:
 
     def reach_px(self) -> float:
         """Radius of a circle that holds the image, pixels' corners included."""
-        radius, sigma = EXTENT[self.psf.kind](self.psf, self.camera)
-        fade = FADE_PX if self.psf.kind in WINGED else 0.0
-        sigma_px = float(np.hypot(sigma, self.sigma_px))
-        return radius + fade + sum(self.radii_px) + CUT_SIGMA * sigma_px + float(np.sqrt(0.5))
+        radius_px = sum(self.radii_px)
+        return float(reach_px(self.psf, self.camera, radius_px, self.sigma_px, CUT_SIGMA))
 
     def wing_margin_px(self) -> float:
         """Distance beyond the image to which wings must be followed so that aliasing is below 1e-4 of the peak."""
@@ -272,12 +281,7 @@ def interpolate_cubic(samples: Floats, factor: int) -> Floats:
     if factor == 1:
         return samples
     # Weights of the samples at -1, 0, 1 and 2 for each position s between 0 and 1.
-    s = np.arange(factor) / factor
-    a = s + 1
-    b = s
-    c = s - 1
-    d = s - 2
-    weights = np.array([-b * c * d / 6, a * c * d / 2, -a * b * d / 2, a * b * c / 6])
+    weights = np.array([cubic(s) for s in np.arange(factor) / factor]).T
     count, rows = samples.shape
     # An even function has at -1 the value that it has at 1.
     padded = np.zeros((count, rows + 3))
@@ -373,7 +377,7 @@ class DiskImages(NamedTuple):
     center: Floats
     gradient: Floats
 
-    def take(self, which: Ints) -> DiskImages:
+    def take(self, which: Ints) -> "DiskImages":
         """The images in the chosen rows."""
         return DiskImages(*(part[which] for part in self))
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.camera.psf import ellipse
-from skysim.camera.psf.kernel import QUANTUM_PX, DiskImages, Kernel, build_kernel
+from skysim.camera.psf.kernel import QUANTUM_PX, DiskImages, Kernel, build_kernel, reach_px
 from skysim.camera.psf.otf import (
     NOT_ROUND,
     WINGED,
@@ -19,9 +19,9 @@ from skysim.camera.psf.otf import (
     chromatic_sigma_px,
     field_sigma_px,
 )
-from skysim.camera.psf.splat import PER_PX, Singles
+from skysim.camera.psf.splat import PER_PX
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints
+from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 # Kinds of kernel.
@@ -352,7 +352,7 @@ def ellipse_disks(
     parts = (zero, gradient) if odd else (slope, zero)
     # With wings the reach is that of a circle, where they are faded; else that along x and y.
     radius_px = axes_px[:, 0] if winged else np.sqrt(np.maximum(xx, yy))
-    reach = ellipse.reach_px(psf, camera, radius_px + blur_px, sigma_px)
+    reach = reach_px(psf, camera, radius_px + blur_px, sigma_px, ellipse.CUT_SIGMA)
     one = np.ones_like(xx)
     half_px = ellipse.box_half_px(reach + np.abs(drawn).max(axis=1))
     disk = np.column_stack(

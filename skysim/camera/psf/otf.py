@@ -63,7 +63,7 @@ def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
     It is psf.corner_sigma_px at the farthest corner.
     """
     radius_px = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1)
-    return np.asarray(psf.corner_sigma_px * radius_px / camera.corner_px)
+    return psf.corner_sigma_px * radius_px / camera.corner_px
 
 
 def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -> Floats:
@@ -90,14 +90,14 @@ def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -
 
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
     """Transfer function of a Gaussian: exp(-2 pi^2 sigma^2 f^2)."""
-    return np.asarray(np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2)))
+    return np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2))
 
 
 def uniform_disk(radius_px: float, fx: Floats, fy: Floats) -> Floats:
     """Transfer function of a uniform disk: 2 J1(z) / z, z = 2 pi a f."""
     # The limit at 0 is 1.
     z = np.maximum(2 * np.pi * radius_px * np.hypot(fx, fy), 1e-9)
-    return np.asarray(2 * special.j1(z) / z)
+    return 2 * special.j1(z) / z
 
 
 def gaussian(psf: GaussianPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Floats:
@@ -113,7 +113,7 @@ def moffat(psf: MoffatPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -
     # K_n diverges at 0, where the product's limit is 1.
     n = psf.beta - 1
     z = np.maximum(2 * np.pi * moffat_alpha_px(psf) * np.hypot(fx, fy), 1e-6)
-    return np.asarray(2 * (z / 2) ** n * special.kv(n, z) / special.gamma(n))
+    return 2 * (z / 2) ** n * special.kv(n, z) / special.gamma(n)
 
 
 def moffat_alpha_px(psf: MoffatPsfConfig) -> float:
@@ -126,7 +126,7 @@ def airy(psf: AiryPsfConfig, camera: CameraConfig, fx: Floats, fy: Floats) -> Fl
     # Frequency over the cut-off, beyond which nothing passes.
     nu = np.minimum(airy_unit_px(psf, camera) * np.hypot(fx, fy), 1.0)
     pupil = 2 / np.pi * (np.arccos(nu) - nu * np.sqrt(1 - nu**2))
-    return np.asarray(pupil * blur(psf.sigma_px, fx, fy))
+    return pupil * blur(psf.sigma_px, fx, fy)
 
 
 def airy_unit_px(psf: AiryPsfConfig, camera: CameraConfig) -> float:
@@ -160,7 +160,7 @@ def measured(psf: MeasuredPsfConfig, camera: CameraConfig, fx: Floats, fy: Float
     wave_x = np.exp(-2j * np.pi * np.outer(x_px, distinct_fx)) * response_x
     wave_y = np.exp(-2j * np.pi * np.outer(y_px, distinct_fy)) * response_y
     product = wave_y.T @ cells @ wave_x
-    return np.asarray(product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))])
+    return product[j.reshape(np.shape(fy)), i.reshape(np.shape(fx))]
 
 
 def cell_positions_px(psf: MeasuredPsfConfig) -> tuple[Floats, Floats]:
@@ -226,7 +226,7 @@ def cell_response(u: Floats) -> Floats:
     keys = (3 * one**2 - 3 * two**2 - two + four) / np.maximum((np.pi * u) ** 2, 1e-300)
     # The cell's own integral is divided out.
     ratio = keys / np.where(np.abs(one) > 1e-6, one, np.inf)
-    return np.asarray(np.where(np.abs(u) < 1e-4, 1.0, ratio))
+    return np.where(np.abs(u) < 1e-4, 1.0, ratio)
 
 
 PSFS: dict[str, Callable[[Any, CameraConfig, Floats, Floats], Otf]] = {

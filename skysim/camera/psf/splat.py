@@ -12,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats
-
-Singles = NDArray[np.float32]
+from skysim.core.types import Floats, Singles
 
 PER_PX = 64  # entries of a radial table per pixel
 REACH_SIGMA = 6.5  # 7e-10 of a Gaussian's light is beyond
@@ -178,7 +176,6 @@ def add_grid(
         (S + 3, S + 3, N, N): grid[q, p, j, i] is the fraction in pixel (i, j) of an image centered at
         ((p - 1) / S - 1/2, (q - 1) / S - 1/2) from the middle pixel
     """
-    height, width = patch.shape
     steps = grid.shape[0] - 3
     size = grid.shape[2]
     # Nearest pixel, and position in it in steps of 1 / S.
@@ -191,23 +188,18 @@ def add_grid(
     q = min(int(phase_y), steps - 1)
     wx0, wx1, wx2, wx3 = cubic(phase_x - p)
     wy = cubic(phase_y - q)
-    # The pixels that the image covers within the patch and the rows.
-    corner_x = center_x - size // 2
-    corner_y = center_y - size // 2
-    left = max(corner_x, 0)
-    right = min(corner_x + size, width)
-    top = max(corner_y, row0, 0)
-    bottom = min(corner_y + size, row1, height)
+    half = size // 2
+    left, right, top, bottom = reached(patch, row0, row1, center_x, center_y, half)
     if right <= left or bottom <= top:
         return
     sums = np.empty(right - left, np.float32)
-    first = left - corner_x
-    last = right - corner_x
+    first = left - center_x + half
+    last = right - center_x + half
     for j in range(top, bottom):
         sums[:] = 0
         # Four rows of tables, each mixed with four weights.
         for s in range(4):
-            tables = grid[q + s, p : p + 4, j - corner_y, first:last]
+            tables = grid[q + s, p : p + 4, j - center_y + half, first:last]
             w0 = np.float32(wy[s] * wx0)
             w1 = np.float32(wy[s] * wx1)
             w2 = np.float32(wy[s] * wx2)

@@ -1,7 +1,5 @@
 """Schema of the scene section `camera`: the true hardware of lens, detector and electronics."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,6 +44,10 @@ Wavelength = Annotated[Length, Field(ge=200e-9, le=2e-6)]
 # Standard deviation of a Gaussian: one that blurs a smooth image more, and one that alone makes it smooth enough.
 Blur = Annotated[Number, Field(ge=0, le=20)]
 SampledBlur = Annotated[Number, Field(ge=0.2, le=20)]
+
+DiskRadius = Annotated[Number, Field(gt=0, le=200)]
+Side = Annotated[int, Field(ge=16, le=20000)]
+TransferLoss = Annotated[Number, Field(ge=0, le=1e-2)]
 
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
@@ -99,7 +101,7 @@ class DiskPsfConfig(PsfConfig):
     """A uniform disk, the geometric image of a defocused lens, convolved with a Gaussian blur of sigma_px."""
 
     kind: Literal["disk"]
-    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    radius_px: DiskRadius
     sigma_px: SampledBlur = 0.7
 
 
@@ -159,7 +161,7 @@ class ChromaticConfig(ConfigModel):
     ) = None
 
     @model_validator(mode="after")
-    def check_columns(self) -> ChromaticConfig:
+    def check_columns(self) -> "ChromaticConfig":
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
         for name, column in columns.items():
             if column is not None:
@@ -187,7 +189,7 @@ class GhostConfig(ConfigModel):
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
     share: Annotated[Fraction, Field(gt=0)]
-    radius_px: Annotated[Number, Field(gt=0, le=200)]
+    radius_px: DiskRadius
 
     @field_validator("magnification")
     @classmethod
@@ -231,7 +233,7 @@ class BaffleConfig(TableConfig):
     pst: Fractions
 
     @model_validator(mode="after")
-    def check_angles(self) -> BaffleConfig:
+    def check_angles(self) -> "BaffleConfig":
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
         return self
@@ -413,8 +415,8 @@ class DetectorConfig(ConfigModel):
     full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
     blooming: Literal["none", "column"] = "none"
     anti_blooming: Fraction = 0.0
-    cti_parallel: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
-    cti_serial: Annotated[Number, Field(ge=0, le=1e-2)] = 0.0
+    cti_parallel: TransferLoss = 0.0
+    cti_serial: TransferLoss = 0.0
     read_noise_e: Electrons = 0.0
     reset_noise_e: Electrons = 0.0
     column_offset_e: Electrons = 0.0
@@ -432,7 +434,7 @@ class DetectorConfig(ConfigModel):
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
     @model_validator(mode="after")
-    def check_values(self) -> DetectorConfig:
+    def check_values(self) -> "DetectorConfig":
         if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
             raise InputError(
                 "quantum_efficiency",
@@ -466,8 +468,8 @@ class CameraConfig(ConfigModel):
         Stray light of the bodies and of the Earth at their present places; none if left out
     """
 
-    width_px: Annotated[int, Field(ge=16, le=20000)]
-    height_px: Annotated[int, Field(ge=16, le=20000)]
+    width_px: Side
+    height_px: Side
     pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
     focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
     f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
@@ -495,7 +497,7 @@ class CameraConfig(ConfigModel):
     detector: DetectorConfig
 
     @model_validator(mode="after")
-    def check_focus(self) -> CameraConfig:
+    def check_focus(self) -> "CameraConfig":
         if self.focus_m <= 2 * self.focal_length_m:
             raise InputError(
                 "focus",

@@ -1,7 +1,5 @@
 """Schema of the layouts of a dome's LEDs: positions and brightness."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from collections.abc import Sequence
@@ -36,6 +34,8 @@ Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
+TapeLength = Annotated[Length, Field(ge=1e-3)]
+LimitMagnitude = Annotated[Number, Field(ge=-2, le=15)]
 
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
@@ -67,7 +67,7 @@ class BoardConfig(ConfigModel):
     types: TypeNames | None = None
 
     @model_validator(mode="after")
-    def check_leds(self) -> BoardConfig:
+    def check_leds(self) -> "BoardConfig":
         if len(set(self.leds)) < len(self.leds):
             raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
         for name, values in (("levels", self.levels), ("types", self.types)):
@@ -112,7 +112,7 @@ class PatchBoardsConfig(ConfigModel):
     hardware_seed: Seed = 0
 
     @model_validator(mode="after")
-    def check_boards(self) -> PatchBoardsConfig:
+    def check_boards(self) -> "PatchBoardsConfig":
         if not 1 <= self.lit[0] <= self.lit[1] <= HOLES:
             raise InputError(
                 "lit",
@@ -224,7 +224,7 @@ class GeodesicConfig(LitConfig):
     rotation_deg: Number = 0.0
 
     @model_validator(mode="after")
-    def check_frequency(self) -> GeodesicConfig:
+    def check_frequency(self) -> "GeodesicConfig":
         if self.class_ == "II" and self.frequency % 2:
             raise InputError("frequency", f"{self.frequency} is odd, with class: II", "even")
         return self
@@ -250,8 +250,8 @@ class StringConfig(LitConfig):
     """
 
     kind: Literal["string"]
-    pitch_m: Annotated[Length, Field(ge=1e-3)]
-    spacing_m: Annotated[Length, Field(ge=1e-3)]
+    pitch_m: TapeLength
+    spacing_m: TapeLength
     winding: Literal["latitude", "spiral", "meridian"] = "latitude"
     pitch_error: NumberError = 0.0
     glue_scatter_m: LengthError = 0.0
@@ -314,7 +314,7 @@ class CelestialConfig(ConfigModel):
     cap_deg: Cap
     catalog: str = "hipparcos_hp6.5"
     count: Count | None = None
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    limit_mag: LimitMagnitude | None = None
     brightness: Literal["v", "band"] = "band"
     brightest_mag: Number | None = None
     camera_m: Position
@@ -325,7 +325,7 @@ class CelestialConfig(ConfigModel):
     hardware_seed: Seed = 0
 
     @model_validator(mode="after")
-    def check_star_selection(self) -> CelestialConfig:
+    def check_star_selection(self) -> "CelestialConfig":
         if (self.count is None) == (self.limit_mag is None):
             raise InputError("", "celestial takes either count or limit_mag")
         if not 1900 <= self.epoch.year <= 2100:
@@ -358,7 +358,7 @@ class ListedConfig(DimmedConfig):
     types: TypeNames | None = None
 
     @model_validator(mode="after")
-    def check_positions(self) -> ListedConfig:
+    def check_positions(self) -> "ListedConfig":
         lists = [
             each
             for each in (self.positions_m, self.directions_deg, self.file)
@@ -435,7 +435,7 @@ class FibersConfig(ConfigModel):
     aiming: AimingConfig | None = None
 
     @model_validator(mode="after")
-    def check_aiming(self) -> FibersConfig:
+    def check_aiming(self) -> "FibersConfig":
         laser = self.aiming
         if laser and not (
             self.radius_variation
@@ -570,7 +570,7 @@ class ProjectorConfig(LensDisplayConfig):
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
     @model_validator(mode="after")
-    def check_aim(self) -> ProjectorConfig:
+    def check_aim(self) -> "ProjectorConfig":
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
             raise InputError(

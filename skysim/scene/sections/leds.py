@@ -1,7 +1,5 @@
 """Schema of the LED type of a dome: emission lobe, drive, brightness."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -34,6 +32,9 @@ from skysim.core.units import (
     with_unit,
 )
 
+Distance = Literal[3, 5, 7, 11]
+ClockError = Annotated[NumberError, Field(le=10_000)]
+
 
 class CosineLobeConfig(ConfigModel):
     """Radiant intensity proportional to cos^exponent of the angle from the normal; 1 is Lambert's law."""
@@ -50,7 +51,7 @@ class LobeTableConfig(TableConfig):
     intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
     @model_validator(mode="after")
-    def check_axis(self) -> LobeTableConfig:
+    def check_axis(self) -> "LobeTableConfig":
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
         return self
@@ -142,8 +143,8 @@ class ClockConfig(ConfigModel):
         Standard deviation of the frequency drift per hour, or its tolerance; drawn by the scene's seed
     """
 
-    offset_ppm: Annotated[NumberError, Field(le=10_000)] = 50.0
-    drift_ppm_h: Annotated[NumberError, Field(le=10_000)] = 1.0
+    offset_ppm: ClockError = 50.0
+    drift_ppm_h: ClockError = 1.0
 
 
 class CodeConfig(ConfigModel):
@@ -207,14 +208,14 @@ class BchCodeConfig(TriggeredCodeConfig):
     """The shortest BCH code with enough words for the LEDs and this designed distance."""
 
     kind: Literal["bch"]
-    distance: Literal[3, 5, 7, 11] = 5
+    distance: Distance = 5
 
 
 class CyclicCodeConfig(CodeConfig):
     """Words of a cyclic BCH code that differ at all shifts, so they can be read without knowing where a word begins."""
 
     kind: Literal["cyclic"]
-    distance: Literal[3, 5, 7, 11] = 7
+    distance: Distance = 7
 
 
 Code = Annotated[
@@ -380,12 +381,12 @@ class LedConfig(LedLightConfig):
     code: Code | None = None
     pwm_period_s: Duration = 1e-3
 
-    def of_type(self, name: str) -> LedConfig:
+    def of_type(self, name: str) -> "LedConfig":
         """The LED with brightness and color of one of its types; itself for an empty name."""
         return self.model_copy(update=dict(self.types[name])) if name else self
 
     @model_validator(mode="after")
-    def check_code(self) -> LedConfig:
+    def check_code(self) -> "LedConfig":
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
             raise InputError(
                 "code.bit_time",

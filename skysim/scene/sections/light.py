@@ -6,8 +6,6 @@ literal `kind`, which `simulation.lights.registry.register` adds with its functi
 point of the group `skysim.lights` with the name of the kind, which names the module that registers it.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -41,6 +39,7 @@ from skysim.core.units import (
 from skysim.scene.sections.layouts import (
     Layout,
     LensDisplayConfig,
+    LimitMagnitude,
     OnPoints,
     PatchBoardsConfig,
     Points,
@@ -240,7 +239,7 @@ class RoomConfig(ConfigModel):
     thickness_m: Annotated[Length, Field(ge=0)] = 0.0
 
     @model_validator(mode="after")
-    def check_limits(self) -> RoomConfig:
+    def check_limits(self) -> "RoomConfig":
         if self.height_m is not None and self.bearing_height_m is None:
             raise InputError(
                 "", "height requires bearing_height, the bearing's center above the floor"
@@ -342,7 +341,7 @@ class DomeConfig(ConfigModel):
         return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
     @model_validator(mode="after")
-    def check_layout(self) -> DomeConfig:
+    def check_layout(self) -> "DomeConfig":
         """Check that the layout fits the LEDs' controller, types and drive, and the surface."""
         layout = self.layout
         kind = layout.kind
@@ -457,7 +456,7 @@ class CollimatedDisplayConfig(LensDisplayConfig):
 
     kind: Literal["collimated_display"]
     catalog: str = SKY
-    limit_mag: Annotated[Number, Field(ge=-2, le=15)] | None = None
+    limit_mag: LimitMagnitude | None = None
     axis_ra_deg: RightAscension
     axis_dec_deg: Declination
     roll_deg: Number = 0.0
@@ -471,7 +470,7 @@ Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
 # The scene section `lights`: further lights.
 
 PLUGINS = PluginKind("light", "skysim.lights", "lights.kind", ())
-CONFIGS: dict[str, type[LightConfig]] = {}  # schemas of the kinds that were added
+CONFIGS: dict[str, type["LightConfig"]] = {}  # schemas of the kinds that were added
 
 
 def check_kind(kind: str) -> str:
@@ -493,8 +492,8 @@ class LightConfig(ConfigModel):
     @model_validator(mode="wrap")
     @classmethod
     def validate_by_kind(
-        cls, value: Any, handler: ModelWrapValidatorHandler[LightConfig]
-    ) -> LightConfig:
+        cls, value: Any, handler: ModelWrapValidatorHandler["LightConfig"]
+    ) -> "LightConfig":
         """Validate a section with the class of its `kind` when called on the base class."""
         kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
         if kind not in CONFIGS and kind in PLUGINS.entry_points():

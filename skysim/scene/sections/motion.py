@@ -1,7 +1,5 @@
 """Schema of the scene section `motion`: start, maneuver, attitude controller and jitter."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -24,7 +22,7 @@ from skysim.core.units import (
     Positive,
     RightAscension,
     Spins,
-    Time,
+    TimeLimit,
     Triple,
 )
 from skysim.core.yaml_reader import existing_file
@@ -75,12 +73,15 @@ Start = Annotated[
 ]
 
 
+AxesRms = tuple[NotNegative, NotNegative, NotNegative]
+
+
 class JitterLineConfig(ConfigModel):
     """A vibration at one frequency: rms_arcsec about each axis of the body, with random phases."""
 
     kind: Literal["line"]
     frequency_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    rms_arcsec: AxesRms
 
 
 class JitterBandConfig(ConfigModel):
@@ -89,11 +90,11 @@ class JitterBandConfig(ConfigModel):
     kind: Literal["band"]
     from_hz: Positive
     to_hz: Positive
-    rms_arcsec: tuple[NotNegative, NotNegative, NotNegative]
+    rms_arcsec: AxesRms
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
     @model_validator(mode="after")
-    def check_frequencies(self) -> JitterBandConfig:
+    def check_frequencies(self) -> "JitterBandConfig":
         if self.from_hz >= self.to_hz:
             raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
         return self
@@ -137,7 +138,7 @@ class SlewConfig(AttitudeConfig):
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
-    def check_rate(self) -> SlewConfig:
+    def check_rate(self) -> "SlewConfig":
         if self.rate_deg_s is not None and self.duration_s is not None:
             raise InputError("duration", "given beside rate_deg_s", "one of the two")
         return self
@@ -187,7 +188,7 @@ class ChirpConfig(ConfigModel):
     sweep: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
-    def check_frequencies(self) -> ChirpConfig:
+    def check_frequencies(self) -> "ChirpConfig":
         if self.from_hz == self.to_hz:
             raise InputError(
                 "",
@@ -261,7 +262,7 @@ class BumpConfig(ConfigModel):
     caught_after_s: Duration | None = None
 
     @model_validator(mode="after")
-    def check_catch_time(self) -> BumpConfig:
+    def check_catch_time(self) -> "BumpConfig":
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
             raise InputError(
                 "caught_after", f"{self.caught_after_s:g} s is before the impulse ends"
@@ -284,6 +285,9 @@ Maneuver = Annotated[
 ]
 
 
+Stored = Annotated[Momentum, Field(gt=0)]
+
+
 class DesaturationConfig(ConfigModel):
     """Unloading of momentum from wheels or CMGs by the fans.
 
@@ -295,12 +299,12 @@ class DesaturationConfig(ConfigModel):
         Stored momentum over the torque of the fans, within their limits
     """
 
-    start_nms: Annotated[Momentum, Field(gt=0)]
-    stop_nms: Annotated[Momentum, Field(gt=0)]
+    start_nms: Stored
+    stop_nms: Stored
     time_s: Duration = 10.0
 
     @model_validator(mode="after")
-    def check_thresholds(self) -> DesaturationConfig:
+    def check_thresholds(self) -> "DesaturationConfig":
         if self.stop_nms >= self.start_nms:
             raise InputError(
                 "stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s"
@@ -336,7 +340,7 @@ class ControlConfig(ConfigModel):
 
     law: LawName = "pid"
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
-    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
+    time_limit_s: TimeLimit = 10.0
     actuators: ActuatorsName = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
     rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
@@ -346,9 +350,9 @@ class ControlConfig(ConfigModel):
     desaturation: DesaturationConfig | None = None
 
     @model_validator(mode="after")
-    def check_options(self) -> ControlConfig:
+    def check_options(self) -> "ControlConfig":
         """Refuse keys that have no effect with the law."""
-        unused: list[str] = []
+        unused = []
         if self.law in BUILT_IN_LAWS:
             unused = ["options", "time_limit_s"]
         elif self.law == PRESCRIBED:
@@ -405,7 +409,7 @@ class MotionConfig(ConfigModel):
         return self.control is not None and self.control.law == PRESCRIBED
 
     @model_validator(mode="after")
-    def check_motion(self) -> MotionConfig:
+    def check_motion(self) -> "MotionConfig":
         if self.rate_deg_s == SIDEREAL and self.control is not None:
             raise InputError(
                 "rate_deg_s", "sidereal conflicts with a controller", "no control"

@@ -1,7 +1,5 @@
 """Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, satellites, `background`."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal, Self
 
@@ -111,6 +109,7 @@ class AirConfig(ConfigModel):
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
+Coefficients = tuple[Coefficient, Coefficient, Coefficient]
 
 
 class SteadyTemperatureConfig(ConfigModel):
@@ -181,7 +180,7 @@ class ThermalConfig(ConfigModel):
     dome_ppm_k: Coefficient = 0.0
     anchor_height_m: Length = 0.0
     creep_m: Position = (0.0, 0.0, 0.0)
-    mount_arcsec_k: tuple[Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0)
+    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
     lens_ppm_k: Coefficient = 0.0
 
     @property
@@ -190,7 +189,7 @@ class ThermalConfig(ConfigModel):
         return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
 
     @model_validator(mode="after")
-    def check_effect(self) -> ThermalConfig:
+    def check_effect(self) -> "ThermalConfig":
         if not self.has_effect:
             raise InputError(
                 "",

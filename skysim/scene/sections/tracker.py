@@ -1,7 +1,5 @@
 """Schema of the scene sections `tracker` and `filter`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -22,6 +20,7 @@ from skysim.core.units import (
     Seed,
     Spins,
     Time,
+    TimeLimit,
 )
 from skysim.core.yaml_reader import existing_file
 
@@ -66,6 +65,9 @@ class TotalStationConfig(ConfigModel):
     leveling_sigma_arcsec: NumberError = 0.0
 
 
+PlaceError = Annotated[LengthError, Field(le=0.1)]
+
+
 class SurveyErrorsConfig(ConfigModel):
     """Errors of the survey of LEDs and camera, drawn once from their own seed, which also draws `light.surface.error`.
 
@@ -91,8 +93,8 @@ class SurveyErrorsConfig(ConfigModel):
 
     rotation_deg: Spins = (0.0, 0.0, 0.0)
     surface_seed: Seed | None = None
-    led_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
-    lever_sigma_m: Annotated[LengthError, Field(le=0.1)] = 0.0
+    led_sigma_m: PlaceError = 0.0
+    lever_sigma_m: PlaceError = 0.0
     focal_length_sigma_m: LengthError = 0.0
     instrument: TotalStationConfig | None = None
     seed: Seed = 0
@@ -126,7 +128,7 @@ class ExposureControlConfig(ConfigModel):
     saturated_px: Annotated[int, Field(ge=0)] = 1
 
     @model_validator(mode="after")
-    def check_limits(self) -> ExposureControlConfig:
+    def check_limits(self) -> "ExposureControlConfig":
         if self.shortest_s > self.longest_s:
             raise InputError(
                 "shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s"
@@ -235,7 +237,7 @@ class TrackerConfig(ConfigModel):
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = OWN
     options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
-    time_limit_s: Annotated[Time, Field(ge=1e-3, le=3600)] = 10.0
+    time_limit_s: TimeLimit = 10.0
     detector: str | None = None
     centroider: str | None = None
     identifier: str | None = None
@@ -266,7 +268,7 @@ class TrackerConfig(ConfigModel):
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
     @model_validator(mode="after")
-    def check_assumed(self) -> TrackerConfig:
+    def check_assumed(self) -> "TrackerConfig":
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise InputError(
                 "survey.lever_sigma",
@@ -372,7 +374,7 @@ class FilterConfig(ConfigModel):
     time_tag_sigma_s: Delay = 0.0
 
     @model_validator(mode="after")
-    def check_drift(self) -> FilterConfig:
+    def check_drift(self) -> "FilterConfig":
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
             raise InputError(
                 "mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0"

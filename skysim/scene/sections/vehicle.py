@@ -1,7 +1,5 @@
 """Schema of the scene section `vehicle`: body, bearing, actuators, sensors and disturbances."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -36,6 +34,8 @@ from skysim.core.units import (
 ActuatorsName = Literal["ideal", "wheels", "fans", "cmgs"]
 TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
+Friction = Annotated[Damping, Field(ge=0)]
+LagTime = Annotated[Time, Field(ge=5e-3)]
 
 
 class WheelsConfig(ConfigModel):
@@ -58,13 +58,13 @@ class WheelsConfig(ConfigModel):
     torque_limit_nm: TorqueLimit = 0.5
     speed_limit_rpm: Positive = 3000.0
     coulomb_nm: TorqueLevel = 0.0
-    viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
+    viscous_nms: Friction = 0.0
     static_imbalance_kg_m: Annotated[Imbalance, Field(ge=0)] = 0.0
     dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
     start_rpm: tuple[Number, ...] = ()
 
     @model_validator(mode="after")
-    def check_speeds(self) -> WheelsConfig:
+    def check_speeds(self) -> "WheelsConfig":
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         return self
@@ -82,7 +82,7 @@ class FansConfig(ConfigModel):
     """
 
     thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
-    time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.2
+    time_constant_s: LagTime = 0.2
 
 
 class CmgsConfig(ConfigModel):
@@ -104,7 +104,7 @@ class CmgsConfig(ConfigModel):
 
     rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
     gimbal_rate_limit_deg_s: Positive = 60.0
-    gimbal_time_constant_s: Annotated[Time, Field(ge=5e-3)] = 0.01
+    gimbal_time_constant_s: LagTime = 0.01
     steering: Literal["pseudo_inverse", "singularity_robust"] = "singularity_robust"
     start_deg: tuple[Number, ...] = ()
     rotor_torque_limit_nm: TorqueLimit | None = None
@@ -129,7 +129,7 @@ class TrimConfig(ConfigModel):
     step_m: PositiveLength = 1e-6
 
     @model_validator(mode="after")
-    def check_positions(self) -> TrimConfig:
+    def check_positions(self) -> "TrimConfig":
         if any(abs(position_m) > self.travel_m for position_m in self.position_m):
             raise InputError("position", f"beyond travel {1e3 * self.travel_m:g} mm")
         return self
@@ -138,7 +138,7 @@ class TrimConfig(ConfigModel):
 class DragConfig(ConfigModel):
     """Air drag about each body axis independently: T = -(viscous + quadratic |rate|) rate."""
 
-    viscous_nms: Annotated[Damping, Field(ge=0)] = 0.0
+    viscous_nms: Friction = 0.0
     quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0
 
 
@@ -307,7 +307,7 @@ class VehicleConfig(ConfigModel):
     gimbals: GimbalsConfig | None = None
 
     @model_validator(mode="after")
-    def check_body(self) -> VehicleConfig:
+    def check_body(self) -> "VehicleConfig":
         inertia = self.inertia_kg_m2
         if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(

@@ -368,7 +368,7 @@ def image_shape(length_key: int, radius_key: int) -> tuple[Floats, ...]:
 
 def gauss(x: Floats) -> Floats:
     """The normal density."""
-    return np.asarray(np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi))
+    return np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
 
 
 def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:

@@ -99,11 +99,11 @@ def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats |
         # Derivative of the image by a position in lab axes.
         gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()
         own_m2 = dome[1].covariance_m2[view.row]
-        return np.asarray(gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2))
+        return gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2)
     sigma_m = context.beliefs.led_sigma_m
     if not sigma_m:
         return None
-    return np.asarray(sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2))
+    return sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)
 
 
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:

@@ -7,7 +7,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
@@ -414,8 +414,8 @@ def tracker_beliefs(plan: Plan) -> Fact:
 
 def expected_error(plan: Plan) -> Fact:
     """Expected cross and roll error, 1 sigma, and their causes, the largest first."""
-    lines: list[str] = []
-    values: dict[str, Any] = {}
+    lines = []
+    values = Record()
     for key, what, sampled in (
         ("frames", "at the frames", plan.frames),
         ("reach", "in reach", plan.reach),
@@ -512,7 +512,7 @@ def requirements(plan: Plan) -> Fact | None:
     )
     sizes = {"cross": cross, "roll": roll, "angle": np.hypot(cross, roll)}
     lines = []
-    values: dict[str, Any] = {}
+    values = Record()
     for name, limit in plan.scene.require.items():
         limits = re.findall(r"([a-z]+)_arcsec_([\d.]+)", name)
         quantile = re.fullmatch(r"([a-z]+)_arcsec_(?:median|[a-z]+(\d+))", name)

@@ -10,13 +10,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.dynamics import guidance
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -51,7 +51,7 @@ class Check(NamedTuple):
     facts: list[Fact]
     findings: list[str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Record:
         """The check as a JSON object."""
         numbers = {
             fact.name.replace(" ", "_"): {"text": fact.lines, **fact.values}

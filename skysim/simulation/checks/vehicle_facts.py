@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.core.units import significant
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.actuators import PREFIXES
@@ -29,7 +29,7 @@ class Fact(NamedTuple):
 
     name: str
     lines: list[str]
-    values: dict[str, Any]
+    values: Record
 
 
 def numbers(values: Any, digits: int) -> str:
@@ -48,7 +48,7 @@ def mass_properties(plan: Plan) -> Fact:
         ("center_of_mass_m", mass.center_m, "center of mass {} mm", 1e3),
     )
     texts = []
-    values: dict[str, Any] = {}
+    values = Record()
     for key, number, text, scale in quantities:
         origin = Path(config.model).name if getattr(config, key) is None else "scene"
         texts.append(f"{text.format(numbers(scale * number, 4))} ({origin})")
@@ -73,7 +73,7 @@ def actuators(plan: Plan) -> Fact | None:
     if trim := config.trim:
         rows.append(("trim", f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
     lines = []
-    values: dict[str, Any] = {}
+    values = Record()
     for key, limit, members, spun_rpm in rows:
         values[key] = {"names": list(members.names), "axes": members.axes.T.tolist()}
         texts = [f"along ({numbers(axis, 3)})" for axis in members.axes.T]

@@ -9,8 +9,6 @@ with lens the standard deviation of the Gaussian that has the peak of the lens's
 defocus the radii of uniform disks. `peak_share` is the share of the light in the brightest pixel.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -98,7 +96,7 @@ class View(NamedTuple):
         """(n,) variances of the lens's image, without LED, defocus and motion."""
         return self.sigma_px**2 - (self.disk_px**2 + self.defocus_px**2) / 4
 
-    def take(self, which: NDArray) -> View:
+    def take(self, which: NDArray) -> "View":
         """The lights selected by a mask or by indices."""
         return View(*(column[which] for column in self))
 
@@ -132,7 +130,7 @@ class CameraModel(NamedTuple):
     exposure_s: float
 
     @classmethod
-    def of(cls, lab: Lab) -> CameraModel:
+    def of(cls, lab: Lab) -> "CameraModel":
         """The main camera of a lab, with the background at its initial attitude."""
         camera = lab.scene.camera
         detector = lab.scene.camera.detector

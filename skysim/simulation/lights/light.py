@@ -10,8 +10,6 @@ an exposure through them in this order:
 The renderer draws the final beam, and `simulation.checks` predicts from it.
 """
 
-from __future__ import annotations
-
 import datetime
 import itertools
 from collections.abc import Callable, Iterable, Sequence
@@ -210,7 +208,7 @@ class Lit(NamedTuple):
     hidden_by: tuple[Occluder, ...] = ()
     satellites: tuple[SatelliteTruth, ...] = ()
 
-    def behind(self, occluder: Occluder) -> Lit:
+    def behind(self, occluder: Occluder) -> "Lit":
         """The same light with one more occluder."""
         if occluder.whole and self.discs:
             hidden = occluder.hides(centers_of(self.discs).place)
@@ -240,17 +238,17 @@ class Beam(NamedTuple):
     paths: tuple[Optics, ...]
     glares: tuple[GlareConfig, ...] = ()
 
-    def plus(self, lit: Lit) -> Beam:
+    def plus(self, lit: Lit) -> "Beam":
         """The beam with one more light, which becomes an occluder of the lights before it if it hides."""
         occluder = lit.hides
         before = self.changed(lambda one: one.behind(occluder)) if occluder else self
         return before._replace(lits=(*before.lits, lit))
 
-    def changed(self, change: Callable[[Lit], Lit]) -> Beam:
+    def changed(self, change: Callable[[Lit], Lit]) -> "Beam":
         """The beam with a function applied to each light."""
         return self._replace(lits=tuple(change(lit) for lit in self.lits))
 
-    def blurred(self, blur_px: float) -> Beam:
+    def blurred(self, blur_px: float) -> "Beam":
         """The beam with the blur of the air in its image, a Gaussian of this standard deviation."""
         image, *ghosts = self.paths
         return self._replace(paths=(replace(image, blur_px=blur_px), *ghosts))

@@ -6,8 +6,6 @@
    magnitudes (`led_levels`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +39,7 @@ class ProjectedStars(NamedTuple):
     shown_mag: Floats
     place_m: Floats
 
-    def take(self, which: slice | Ints) -> ProjectedStars:
+    def take(self, which: slice | Ints) -> "ProjectedStars":
         """Select stars by index."""
         return ProjectedStars(*(column[which] for column in self))  # type: ignore[arg-type]
 

@@ -106,8 +106,8 @@ def symbols_of(words: Words, bits: int) -> Words:
     return (digits @ (1 << np.arange(bits)[::-1])).astype(np.uint8)
 
 
-def readable(words: Words, levels: int) -> Words:
-    """The words that contain the highest level and another one."""
+def readable(words: Words, levels: int = 2) -> Words:
+    """The words that contain the highest level and another one: of two levels, both a one and a zero."""
     return words[(words.max(axis=1) == levels - 1) & (words.min(axis=1) < levels - 1)]
 
 
@@ -137,7 +137,7 @@ def gray(count: int) -> Words:
     """(count, bits) numbers n in the reflected binary code, n xor n / 2; the least distance is 1."""
     bits = data_bits(count)
     number = np.arange(2**bits)
-    return without_constant(bits_of(number ^ number >> 1, bits))[:count]
+    return readable(bits_of(number ^ number >> 1, bits))[:count]
 
 
 def hamming(count: int) -> Words:
@@ -273,15 +273,9 @@ def data_bits(count: int) -> int:
     return max((count + 1).bit_length(), 2)
 
 
-def without_constant(words: Words) -> Words:
-    """The words that have both a one and a zero."""
-    ones = words.sum(axis=1)
-    return words[(ones > 0) & (ones < words.shape[1])]
-
-
 def balanced(words: Words) -> Words:
     """The words that have both a one and a zero, those with as many ones as zeros first."""
-    words = without_constant(words)
+    words = readable(words)
     excess = np.abs(2 * words.sum(axis=1, dtype=np.int64) - words.shape[1])
     return words[np.argsort(excess, kind="stable")]
 

@@ -6,8 +6,6 @@ with offset and drift (`Clocks`). An exposure that crosses a bit's edge gets the
 it. The drive's pulses are much faster than a bit; the code scales their light.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
@@ -66,7 +64,7 @@ class Clocks:
         hardware_seed: int,
         seed: int,
         stream: int = LED_CLOCKS,
-    ) -> Clocks:
+    ) -> "Clocks":
         """Draw the offsets from the hardware's seed, and drifts and switch-on times from the run's."""
         offset_ppm = scaled_errors(
             config.offset_ppm, random_stream(hardware_seed, stream).standard_normal(count)

@@ -374,7 +374,7 @@ def on_chip_m(config: LensDisplayConfig, own: Floats) -> tuple[Floats, Bools]:
     chip_m = config.focal_length_m * tangent * (1 + config.distortion * tangent2)
     half_m = np.array(config.pixels) * config.pitch_m / 2
     unfolded = 1 + 3 * config.distortion * tangent2[:, 0] > 0
-    return chip_m, np.asarray(in_front & unfolded & np.all(np.abs(chip_m) <= half_m, axis=1))
+    return chip_m, in_front & unfolded & np.all(np.abs(chip_m) <= half_m, axis=1)
 
 
 def undistortion(config: LensDisplayConfig, chip_m: Floats) -> Floats:

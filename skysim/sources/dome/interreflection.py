@@ -92,7 +92,7 @@ def diffuse_light(
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)
-    total = np.asarray(np.linalg.solve(np.eye(len(transfer)) - transfer, direct))
+    total = np.linalg.solve(np.eye(len(transfer)) - transfer, direct)
     # Lambertian patches of this irradiance have the radiance rho E / pi.
     strength = patches.reflectance * total * patches.area_m2 / np.pi
     linear = np.linspace(0, 1, 2)
@@ -160,7 +160,7 @@ def kernel(patches: Patches) -> Floats:
     cos_to = -np.einsum("ijk,jk->ij", offset, patches.normal)
     values = np.maximum(cos_from, 0) * np.maximum(cos_to, 0) / (np.pi * square**2)
     np.fill_diagonal(values, values[np.arange(len(values)), square.argmin(axis=1)])
-    return np.asarray(values)
+    return values
 
 
 def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
@@ -168,8 +168,8 @@ def irradiance(points_m: Floats, normals: Floats, emitters: Emitters) -> Floats:
 
     E = sum over emitters of I(theta) cos(phi) / d^2.
     """
-    return np.asarray(
-        _irradiance(np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters)
+    return _irradiance(
+        np.ascontiguousarray(points_m), np.ascontiguousarray(normals), *emitters
     )
 
 

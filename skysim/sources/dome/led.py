@@ -4,14 +4,13 @@ A drive converts the level of each LED to a pulse train (`DRIVES`). `lit_moments
 exposure.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import ceil, exp, floor, log, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
@@ -50,7 +49,7 @@ FALLOFF: dict[str, Falloff] = {"inverse_square": inverse_square}
 
 def cosine_lobe(config: CosineLobeConfig, cos_emission: Floats) -> Floats:
     """Relative radiant intensity cos^m of the emission angle; m = 1 is a Lambertian disk."""
-    return np.asarray(np.maximum(cos_emission, 0.0) ** config.exponent)
+    return np.maximum(cos_emission, 0.0) ** config.exponent
 
 
 def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
@@ -59,7 +58,7 @@ def table_lobe(config: LobeTableConfig, cos_emission: Floats) -> Floats:
     Constant within the first angle, zero beyond the last.
     """
     angle_deg = np.degrees(np.arccos(np.clip(cos_emission, -1.0, 1.0)))
-    return np.asarray(np.interp(angle_deg, config.angle_deg, config.intensity, right=0.0))
+    return np.interp(angle_deg, config.angle_deg, config.intensity, right=0.0)
 
 
 # Arguments: its section of the scene, cosine of the angle from the LED's normal. Intensity is 1 on the normal.
@@ -85,7 +84,7 @@ class Emitter:
     lobe: Lobe = field(default_factory=CosineLobeConfig)
 
     @classmethod
-    def from_config(cls, led: LedConfig) -> Emitter:
+    def from_config(cls, led: LedConfig) -> "Emitter":
         """The emitter of a scene's LED section."""
         return cls(led.falloff, led.lobe)
 
@@ -229,13 +228,13 @@ class PulseTrains(NamedTuple):
     clock: Ints
 
 
-def direct(_led: LedConfig, inputs: DriveInput, _rng: np.random.Generator) -> PulseTrains:
+def direct(_led: LedConfig, inputs: DriveInput, _rng: Generator) -> PulseTrains:
     """Direct current: the LED is always lit, and its level scales its strength."""
     ones = np.ones(len(inputs.level))
     return PulseTrains(ones, 0 * ones, ones, inputs.level, inputs.board)
 
 
-def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def pwm(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """Hardware PWM: V_avg = D V_max, D = t_on / T (thesis, eqs 35 and 36), with T = led.pwm_period_s.
 
     The channels of a board have random phases and share its oscillator.
@@ -248,7 +247,7 @@ def pwm(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTr
     )
 
 
-def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def sequential(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """Software PWM of a controller that lights its LEDs one after another: D_i = t_on,i / sum T (thesis, eq. 37).
 
     Each LED of a controller has a slot T and is lit for the fraction `level` of it; the controller's cycle is the sum
@@ -284,7 +283,7 @@ def sequential(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> 
     )
 
 
-def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> PulseTrains:
+def refresh(led: LedConfig, inputs: DriveInput, rng: Generator) -> PulseTrains:
     """A panel whose rows are lit one after another once a frame, each for duty / rate.
 
     A row is delayed by its position on the panel, `row` / rate. A gray level is in the strength, because the liquid
@@ -307,7 +306,7 @@ def refresh(led: LedConfig, inputs: DriveInput, rng: np.random.Generator) -> Pul
 
 
 # Drives by kind: (the LED section, the drive's input, the hardware's random stream) to the pulse trains.
-DRIVES: dict[str, Callable[[LedConfig, DriveInput, np.random.Generator], PulseTrains]] = {
+DRIVES: dict[str, Callable[[LedConfig, DriveInput, Generator], PulseTrains]] = {
     "direct": direct,
     "pwm": pwm,
     "sequential": sequential,

@@ -122,7 +122,7 @@ def reflectance(config: ReflectionConfig, cosine: Floats) -> Floats:
     refracted = np.sqrt(1 - (1 - cosine**2) / n**2)
     r_s = (cosine - n * refracted) / (cosine + n * refracted)
     r_p = (n * cosine - refracted) / (n * cosine + refracted)
-    return np.asarray((r_s**2 + r_p**2) / 2)
+    return (r_s**2 + r_p**2) / 2
 
 
 def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:
@@ -240,4 +240,4 @@ def cosines_to_grid(toward: Floats, grid: Floats) -> Floats:
     """(K,) numbers that are positive for directions within the cone about the grid's middle that contains the grid."""
     middle = grid.reshape(-1, 3).mean(axis=0)
     middle /= np.linalg.norm(middle)
-    return np.asarray(toward @ middle - (grid @ middle).min() * (1 - 1e-12))
+    return toward @ middle - (grid @ middle).min() * (1 - 1e-12)

@@ -5,12 +5,10 @@ one, `thickness` outside. The rim and the apex are among the samples, and betwee
 shell bulges by 1.5e-4 of its radius at most.
 """
 
-from typing import Any
-
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, Record
 from skysim.scene.sections.light import RoomConfig
 from skysim.sources.dome.surface import Plane, Surface, directions
 
@@ -57,7 +55,7 @@ def check_room(room: RoomConfig, surface: Surface, cap_deg: float) -> None:
         check_door(room, room.door_m, found["part_m"], surface, cap_deg)
 
 
-def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
+def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> Record:
     """Sizes of a dome in its room in m, as a dict.
 
     `extent_m`: (3,) along x, y, z, thickness included. `top_m`, `rim_m`: heights above the floor, if the room has
@@ -67,7 +65,7 @@ def fit(room: RoomConfig, surface: Surface, cap_deg: float) -> dict[str, Any]:
     points_m = shell_m(room, surface, cap_deg, ALL_ROUND_RAD)
     low_m = points_m.min(axis=0)
     high_m = points_m.max(axis=0)
-    found: dict[str, Any] = {"extent_m": (high_m - low_m).tolist()}
+    found: Record = {"extent_m": (high_m - low_m).tolist()}
     if room.bearing_height_m is not None:
         found["top_m"] = room.bearing_height_m + float(high_m[2])
         found["rim_m"] = room.bearing_height_m + float(low_m[2])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, normalized
+from skysim.core.types import Bools, Floats, Record, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -396,7 +396,7 @@ class Radial(Surface):
         )
 
 
-def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> dict[str, Any]:
+def pose_and_rim(config: light.SurfaceConfig, center_m: float) -> Record:
     """Arguments common to all surfaces: center, rim, tilt, survey error.
 
     center_m is the height of the surface's center above the bearing. Own and lab frame differ by it before the tilt.

@@ -22,14 +22,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats
-
-Ints = NDArray[np.int64]
+from skysim.core.types import Floats, Ints, normalized
 
 
 class Fields(NamedTuple):
@@ -113,8 +110,7 @@ def fields_about(
     up = place_m / range_m[:, None]
     center = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
     # Image axes: x = y_lab x boresight, which is defined because the tilt stays below 90 deg.
-    across = np.cross([0.0, 1.0, 0.0], up[center])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = normalized(np.cross([0.0, 1.0, 0.0], up[center]))
     x_m = across @ place_m.T
     y_m = np.cross(up[center], across) @ place_m.T
     ahead_m = up[center] @ place_m.T - height_m
@@ -283,7 +279,7 @@ def unique_levels(
 
 def neighbors(position_m: Floats, nearest: int) -> Ints:
     """(N, nearest) the nearest LEDs of each, by increasing azimuth about its direction from the bearing."""
-    direction = position_m / np.linalg.norm(position_m, axis=1, keepdims=True)
+    direction = normalized(position_m)
     near = KDTree(direction).query(direction, nearest + 1)[1][:, 1:]
     offset = direction[near] - direction[:, None]
     # Two axes across the direction; any two serve, since the comparison is of all turns.

@@ -20,12 +20,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.jit import jit
-from skysim.core.types import Floats
-
-Ints = NDArray[np.int64]
+from skysim.core.types import Floats, Ints
 
 # Prior information, rad^-2, that keeps M invertible when too few LEDs are in view.
 PRIOR_INFORMATION = 1e-6

@@ -181,10 +181,7 @@ def parse_row(path: Path, number: int, line: str, names: list[str]) -> list[floa
         row = []
     level = dict(zip(names, row, strict=False)).get("level", 1.0)
     if len(row) != len(names) or not np.all(np.isfinite(row)) or not 0 < level <= 1:
-        raise InputError(
-            path,
-            f"{line!r} is not an LED",
-            f"{len(names)} numbers, a level above 0 and at most 1",
-            where=Where(path, number),
+        raise Where(path, number).error(
+            f"{line!r} is not an LED", f"{len(names)} numbers, a level above 0 and at most 1"
         )
     return row

@@ -21,13 +21,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Ints
-from skysim.scene.sections import layouts
+from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.layouts.fisher import (
     Visibility,
@@ -102,7 +103,7 @@ class PlacementScore(NamedTuple):
         Tail variance of the best even layout, the unit of `tail_variance`
     """
 
-    config: layouts.OptimizedConfig
+    config: OptimizedConfig
     R_body_from_lab: Floats
     reference: float = 1.0
 
@@ -125,7 +126,7 @@ class PlacementScore(NamedTuple):
             np.sum(total_information(place_m, self.R_body_from_lab, *geometry)[:, 6] < 2)
         )
 
-    def score(self, place_m: Floats, rng: np.random.Generator) -> tuple[bool, bool, float]:
+    def score(self, place_m: Floats, rng: Generator) -> tuple[bool, bool, float]:
         """Sort key of layouts; less is better.
 
         In this order: whether an even layout is better in the worst attitudes; whether an attitude was found that
@@ -141,10 +142,10 @@ class PlacementScore(NamedTuple):
 
 
 def optimize_places(
-    config: layouts.OptimizedConfig,
+    config: OptimizedConfig,
     sites_m: Floats,
     starts_m: Sequence[Floats],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Floats:
     """(N, 3) sites in m at which config.count LEDs make the worst attitudes within the tilt as good as possible.
 
@@ -193,7 +194,7 @@ def optimize_places(
 
 
 def even_layouts(
-    config: layouts.OptimizedConfig, sites_m: Floats, starts_m: Sequence[Floats]
+    config: OptimizedConfig, sites_m: Floats, starts_m: Sequence[Floats]
 ) -> list[Floats]:
     """The starts that keep the spacing, and a Poisson-disk sample of the sites if there is room for it.
 
@@ -217,11 +218,11 @@ def even_layouts(
 
 
 def descend(
-    config: layouts.OptimizedConfig,
+    config: OptimizedConfig,
     place_m: Floats,
     sites_m: Floats,
     visible: float,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> list[Floats]:
     """Layouts reached by descent from place_m, (N, 3) sites each: one per KEEP_EVERY generations, and the last.
 
@@ -277,9 +278,7 @@ def descend(
     return [*candidates, place_m]
 
 
-def visible_fraction(
-    config: layouts.OptimizedConfig, sites_m: Floats, rng: np.random.Generator
-) -> float:
+def visible_fraction(config: OptimizedConfig, sites_m: Floats, rng: Generator) -> float:
     """Mean fraction of the sites in the field of view, over random attitudes.
 
     Multiplied by the number of LEDs, it is the mean number of LEDs in a field.
@@ -291,10 +290,10 @@ def visible_fraction(
 
 
 def hardest_attitudes(
-    config: layouts.OptimizedConfig,
+    config: OptimizedConfig,
     place_m: Floats,
     geometry: tuple[Floats, Floats],
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Floats:
     """(H, 3, 3) attitudes R_body_from_lab with the highest costs for these LEDs, seen with this `camera_geometry`.
 
@@ -328,9 +327,7 @@ def hardest_attitudes(
     return hardest
 
 
-def sample_attitudes(
-    config: layouts.OptimizedConfig, count: int, rng: np.random.Generator
-) -> Floats:
+def sample_attitudes(config: OptimizedConfig, count: int, rng: Generator) -> Floats:
     """(A, 3, 3) R_body_from_lab: boresights uniform over the cap of the tilt, yaw uniform; a shifted R3 lattice."""
     # R3 sequence: the multiples of 1/g, 1/g^2 and 1/g^3 modulo 1 fill the unit cube evenly.
     unit = (rng.random(3) + np.arange(count)[:, None] / GOLDEN ** np.arange(1, 4)) % 1
@@ -341,19 +338,19 @@ def sample_attitudes(
 
 
 def camera_geometry(
-    config: layouts.OptimizedConfig, field_fraction: float = 1.0
+    config: OptimizedConfig, field_fraction: float = 1.0
 ) -> tuple[Floats, Floats]:
     """(3,) entrance pupil on the body, m, and (2,) tangents of half the field, scaled by `field_fraction`."""
     return np.array(config.camera_m), field_fraction * tan_half(config)
 
 
-def tan_half(config: layouts.OptimizedConfig) -> Floats:
+def tan_half(config: OptimizedConfig) -> Floats:
     """(2,) tangents of half the field's width and height."""
     assert config.field_deg is not None, "completed by the scene"
     return np.tan(np.radians(config.field_deg) / 2)
 
 
-def field_reach_rad(config: layouts.OptimizedConfig, surface: Surface) -> float:
+def field_reach_rad(config: OptimizedConfig, surface: Surface) -> float:
     """Greatest angle from the zenith, at the bearing, that the field of any attitude reaches; at most the cap.
 
     Rays around the cone that encloses the field are intersected with the surface, for boresights at the greatest tilt
@@ -427,7 +424,7 @@ def try_moves(
 # Ambiguity between fields of view.
 
 
-def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambiguity:
+def layout_ambiguity(config: OptimizedConfig, place_m: Floats) -> Ambiguity:
     """Ambiguity of the layout (`ambiguity`), for a round field of the same area as the camera's."""
     # A circle of the area 4 tan(w/2) tan(h/2).
     radius_rad = math.atan(math.sqrt(4 * float(np.prod(tan_half(config))) / math.pi))
@@ -442,7 +439,7 @@ def layout_ambiguity(config: layouts.OptimizedConfig, place_m: Floats) -> Ambigu
 
 
 def reduce_ambiguity(
-    scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: np.random.Generator
+    scorer: PlacementScore, place_m: Floats, sites_m: Floats, rng: Generator
 ) -> Floats:
     """Move LEDs in ambiguous fields to free sites nearby, where that reduces `excess_overlap`; return the layout.
 
