@@ -432,7 +432,7 @@ class DomeTracker(FrameTracker):
         own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
-            own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
+            own_rad2 = by_place @ self.leds.covariance_m2[star] @ by_place.mT
         # The rest of each ray's variance is noise of the frame.
         variance_rad2 = np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)
         noise_rad2 = systematic.isotropic(np.sqrt(variance_rad2))

@@ -419,7 +419,7 @@ def prediction_by_others(
         (K, 2) residuals r, (K, 2, 3) Jacobians J and (K, 2, 2) inverse covariances W, for the
         attitude that fits all stars
     """
-    weighted = np.swapaxes(jacobian, 1, 2) @ information
+    weighted = jacobian.mT @ information
     each = weighted @ jacobian
     others = each.sum(axis=0) - each
     # N - J^T W J, inverted with a unit diagonal and a small term against singular matrices
@@ -428,7 +428,7 @@ def prediction_by_others(
     covariance = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
     moved = (covariance @ weighted @ residual[:, :, None])[:, :, 0]
     alone = residual + np.einsum("kij,kj->ki", jacobian, moved)
-    return alone, jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return alone, jacobian @ covariance @ jacobian.mT
 
 
 def mean_information(information: Floats, residual: Floats, spread: Floats) -> Floats:
