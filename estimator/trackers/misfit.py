@@ -192,8 +192,7 @@ def identify(
     # A few stars may fit by luck within gates that are too narrow for the others.
     if len(solution.star) == len(detections.sigma) and solution.chi2 < DOUBTFUL:
         return solution, 1.0
-    x, y, z, w = solution.cam_from_ref_xyzw
-    return widened(solution, matrix_of((x, y, z, w)), detections, stars)
+    return widened(solution, matrix_of(solution.cam_from_ref_xyzw), detections, stars)
 
 
 @jit
@@ -260,8 +259,7 @@ def with_floor(
         Detections with the errors of the search, whose floor is searched_px
     """
     # 1. Rows
-    x, y, z, w = solution.cam_from_ref_xyzw
-    R = matrix_of((x, y, z, w))
+    R = matrix_of(solution.cam_from_ref_xyzw)
     size = 4 if detections.focal_uncertainty > 0 else 3
     count = 2 * len(solution.star)
     rows = np.empty((size + 1, count))

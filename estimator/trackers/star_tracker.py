@@ -602,7 +602,7 @@ class StarTracker(FrameTracker):
                 return solution, variance
             # The larger errors have found the attitude; the residuals tell the errors.
             claimed = self.detections(centroids, self.sigma_px(centroids))
-            R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+            R_cam_from_ref = matrix_of(solution.cam_from_ref_xyzw)
             found = star_evidence.evaluate(
                 claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
             )
@@ -657,7 +657,7 @@ class StarTracker(FrameTracker):
             if whole and solution.chi2 < misfit.DOUBTFUL and known:
                 return Refit(solution, camera, 1.0, detections=detections)
             if known and not self.camera.row_time_s:
-                R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+                R_cam_from_ref = matrix_of(solution.cam_from_ref_xyzw)
                 solution, variance = misfit.widened(
                     solution, R_cam_from_ref, detections, self.sky
                 )
