@@ -164,10 +164,7 @@ def _quads(
                     ):
                         continue
                     if total < len(found):
-                        found[total, 0] = a
-                        found[total, 1] = b
-                        found[total, 2] = near[k]
-                        found[total, 3] = near[m]
+                        found[total] = a, b, near[k], near[m]
                         code[total, :2] = place[k]
                         code[total, 2:] = place[m]
                         arrange(code[total], found[total])
@@ -206,9 +203,7 @@ def _stars_between(
 @jit
 def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float, float]:
     """A star's coordinates along B to A and across, in chords of A and B; `frame` is that of `vectors.pair_frame`."""
-    along = frame[0, 2] * star[0] + frame[1, 2] * star[1] + frame[2, 2] * star[2]
-    across = frame[0, 1] * star[0] + frame[1, 1] * star[1] + frame[2, 1] * star[2]
-    return along / length, across / length
+    return vectors.dot(frame[:, 2], star) / length, vectors.dot(frame[:, 1], star) / length
 
 
 @jit

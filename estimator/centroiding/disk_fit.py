@@ -129,8 +129,7 @@ def _fit(
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[RADIUS]))
         # 3. At most one pixel per step, and a quarter of a pixel in the edge's width.
         scale = min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300))
-        for k in range(len(p)):
-            p[k] += scale * step[k]
+        p += scale * step
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
         if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHTNESS] <= 0:
             return
@@ -147,12 +146,9 @@ def _write_disk(factor: Floats, p: Floats, pixels: int, column: Floats, out: Flo
     """Write x, y, sigma of the position, flux and radius of a disk; `column` (6,) is a work array."""
     xx, yy, _ = least_squares.position_covariance(factor, column)
     variance = (xx + yy) / 2 * least_squares.misfit_factor(factor[6, 6], pixels - 6)
-    out[0] = p[X]
-    out[1] = p[Y]
-    out[2] = sqrt(variance + MODEL_PX**2)
-    out[4] = p[RADIUS]
     # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
-    out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+    flux = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+    out[:] = p[X], p[Y], sqrt(variance + MODEL_PX**2), flux, p[RADIUS]
 
 
 @jit

@@ -170,10 +170,8 @@ def gaussian_windowed(
                 sampling_error2 = (
                     sampling_variance(second_moment / total) * (total / slope) ** 2
                 )
-                out[n, 0] = cx
-                out[n, 1] = cy
-                out[n, 3] = flux
-                out[n, 2] = sqrt(moment_variance / slope**2 + sampling_error2)
+                sigma = sqrt(moment_variance / slope**2 + sampling_error2)
+                out[n] = cx, cy, sigma, flux
                 break
     return out
 

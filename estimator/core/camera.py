@@ -273,7 +273,7 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """Apply the distortion to (N, 2) tangents."""
     out = np.empty_like(tangent)
     for n in range(len(tangent)):
-        out[n, 0], out[n, 1] = _distort(tangent[n, 0], tangent[n, 1], distortion)
+        out[n] = _distort(tangent[n, 0], tangent[n, 1], distortion)
     return out
 
 
@@ -305,8 +305,7 @@ def undistorted(
             y = y + measured_y - distorted_y
             if max(abs(measured_x - distorted_x), abs(measured_y - distorted_y)) < 1e-15:
                 break
-        out[n, 0] = x
-        out[n, 1] = y
+        out[n] = x, y
     return out
 
 

@@ -51,9 +51,16 @@ def norm(u: Vector) -> float:
 
 
 @jit
+def squared_chord(u: Vector, v: Vector) -> float:
+    """Return the squared length of u - v."""
+    difference = (u[0] - v[0], u[1] - v[1], u[2] - v[2])
+    return dot(difference, difference)
+
+
+@jit
 def chord(u: Vector, v: Vector) -> float:
     """Return the chord |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
-    return norm((u[0] - v[0], u[1] - v[1], u[2] - v[2]))
+    return sqrt(squared_chord(u, v))
 
 
 @jit

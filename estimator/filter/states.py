@@ -263,14 +263,14 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     y = scale * y
     z = scale * z
     a, b, c, d = q
-    q[0] = a * w - b * x - c * y - d * z
-    q[1] = a * x + b * w + c * z - d * y
-    q[2] = a * y - b * z + c * w + d * x
-    q[3] = a * z + b * y - c * x + d * w
+    q[:] = (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
     # Rounding would otherwise accumulate in the norm.
-    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    for i in range(4):
-        q[i] /= norm
+    q /= math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
 
 
 # CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless

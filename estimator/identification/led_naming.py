@@ -204,8 +204,7 @@ def _alike(
             # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
-                    pairs[found, 0] = a
-                    pairs[found, 1] = b
+                    pairs[found] = a, b
                 found += 1
     return found
 

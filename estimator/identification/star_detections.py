@@ -223,9 +223,7 @@ def detections_of(
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
         # The inverse of [xx xy; xy yy] is [yy -xy; -xy xx] / (xx yy - xy^2).
         scale = focal_px**2 / (xx * yy - xy * xy)
-        weight[n, 0] = yy * scale
-        weight[n, 1] = xx * scale
-        weight[n, 2] = -xy * scale
+        weight[n] = yy * scale, xx * scale, -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
     tangent = undistorted(
         lights.xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
@@ -318,10 +316,7 @@ def chosen(detections: Detections, rows: NDArray) -> Detections:
 @jit
 def gates_of(detections: Detections, factor: float) -> Floats:
     """(N,) matching radii in tangents: `factor` times GATE_SIGMA standard deviations."""
-    gates = np.empty(len(detections.sigma))
-    for n in range(len(gates)):
-        gates[n] = factor * GATE_SIGMA * detections.sigma[n]
-    return gates
+    return factor * GATE_SIGMA * detections.sigma
 
 
 @jit

@@ -83,10 +83,7 @@ def _search(
         for c in range(2, d):
             for b in range(1, c):
                 for a in range(b):
-                    quad[0] = a
-                    quad[1] = b
-                    quad[2] = c
-                    quad[3] = d
+                    quad[:] = a, b, c, d
                     candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate

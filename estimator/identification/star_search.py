@@ -396,8 +396,7 @@ def _close(
                 if wanted[q, 2] * vectors.dot(vectors.row(star, i), normal) < 0:
                     continue
                 if found < len(closed):
-                    closed[found, 0] = i
-                    closed[found, 1] = k
+                    closed[found] = i, k
                     found += 1
             if count < len(hub_star):
                 hub_star[count] = i

@@ -264,9 +264,7 @@ def _scale_tangents(rays: Floats, factor: float) -> Floats:
         x = rays[n, 0] / z * factor
         y = rays[n, 1] / z * factor
         length = sqrt(x * x + y * y + 1)
-        out[n, 0] = x / length
-        out[n, 1] = y / length
-        out[n, 2] = 1 / length
+        out[n] = x / length, y / length, 1 / length
     return out
 
 

@@ -36,6 +36,7 @@ from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
+from estimator.core.vectors import dot
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
     DirectMatch,
@@ -283,23 +284,17 @@ def _agrees(
 @jit
 def planar_features(u: Floats, v: Floats, w: Floats) -> tuple[float, float]:
     """Area and polar moment of the planar triangle of three unit vectors, with Heron's area from squared sides."""
-    a2 = 2 - 2 * _dot(v, w)
-    b2 = 2 - 2 * _dot(u, w)
-    c2 = 2 - 2 * _dot(u, v)
+    a2 = 2 - 2 * dot(v, w)
+    b2 = 2 - 2 * dot(u, w)
+    c2 = 2 - 2 * dot(u, v)
     area = sqrt(max(4 * a2 * b2 - (a2 + b2 - c2) ** 2, 0.0)) / 4
     return area, area * (a2 + b2 + c2) / 36
 
 
 @jit
-def _dot(u: Floats, v: Floats) -> float:
-    """Scalar product of two vectors."""
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@jit
 def spherical_area(u: Floats, v: Floats, w: Floats) -> float:
     """Area (the excess) of a spherical triangle, sr."""
-    cosines = _dot(u, v) + _dot(u, w) + _dot(v, w)
+    cosines = dot(u, v) + dot(u, w) + dot(v, w)
     return 2 * atan2(abs(triple(u, v, w)), 1 + cosines)
 
 
