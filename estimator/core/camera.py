@@ -221,7 +221,7 @@ class Camera:
         return distorted(tangent, self.distortion) * focal_px + self.center_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
-        """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
+        """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side; NaN is not."""
         x, y = checks.floats("xy_px", xy_px, (None, 2)).T
         low = margin_px - 0.5
         right = self.width_px - 0.5 - margin_px

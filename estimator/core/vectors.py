@@ -75,10 +75,9 @@ def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     bisector = _unit((u[0] + v[0], u[1] + v[1], u[2] + v[2]))
     normal = _unit(cross(u, v))
     third = cross(bisector, normal)
-    for k in range(3):
-        out[k, 0] = bisector[k]
-        out[k, 1] = normal[k]
-        out[k, 2] = third[k]
+    out[:, 0] = bisector
+    out[:, 1] = normal
+    out[:, 2] = third
 
 
 @jit
@@ -116,10 +115,9 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     part = dot(first, (x, y, z))
     second = _unit((x - part * first[0], y - part * first[1], z - part * first[2]))
     third = cross(first, second)
-    for c in range(3):
-        matrix[0, c] = first[c]
-        matrix[1, c] = second[c]
-        matrix[2, c] = third[c]
+    matrix[0] = first
+    matrix[1] = second
+    matrix[2] = third
 
 
 @jit

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
+from estimator.core.vectors import dot, rotate
 from estimator.filter.error_models import GyroModel, TrackerModel
 
 # Compiled propagation by gyro samples.
@@ -100,10 +101,7 @@ def remove_errors(
     angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats
 ) -> None:
     """Fill `out` (3,) with the rotation A (a - T b) of a measured angle a, with the effective time T and the bias b."""
-    for i in range(3):
-        out[i] = 0.0
-        for j in range(3):
-            out[i] += inverse[i, j] * (angle[j] - effective_s * values[3 + j])
+    out[:] = rotate(inverse, angle - effective_s * values[3:6])
 
 
 @jit
@@ -180,13 +178,11 @@ def fill_rows(
     columns
         (9,) state number of each element of M, row by row; -1 for no state
     """
+    rows[:, :3] = exponential[:, :3]
     for i in range(3):
         for j in range(3):
-            rows[i, j] = exponential[i, j]
             # -(J A)_ij
-            total = 0.0
-            for k in range(3):
-                total += exponential[i, 3 + k] * inverse[k, j]
+            total = dot(exponential[i, 3:], inverse[:, j])
             rows[i, 3 + j] = effective_s * total
             for k in range(3):
                 if columns[3 * j + k] >= 0:

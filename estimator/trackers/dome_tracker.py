@@ -226,7 +226,7 @@ class DomeTracker(FrameTracker):
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
             body_from_lab = self.lever.cam_from_body.inv() * cam_from_lab
             xy_px = project(body_from_lab, position_m, self.lever, self.camera)
-            fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
+            fields.append(xy_px[self.camera.contains(xy_px, 2.0)])
         xy_px = max(fields, key=len)
         warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
         self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
@@ -562,5 +562,5 @@ class DomeTracker(FrameTracker):
         """Return mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         # An LED whose center is just off the chip may still have light on it.
-        inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
+        inside = np.flatnonzero(self.camera.contains(xy, -30.0))
         return mutual_nearest(centroids.xy_px, xy[inside], radius_px, inside)

@@ -114,8 +114,7 @@ def count_near(
     R_ref_from_cam = R_cam_from_ref.T.copy()
     count = 0
     matched = np.zeros(len(gates), np.bool_)
-    for n in observed:
-        matched[n] = True
+    matched[observed] = True
     for n in range(len(gates)):
         if matched[n]:
             continue
