@@ -82,7 +82,7 @@ def _fit_rotation(
 ) -> tuple[Rotation, float, Floats]:
     """Return body_from_lab, the focal ratio (1 unless `with_focal`), and the covariance of both in camera axes."""
     R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()  # updated in place
-    lever_cam_m = lever.cam_from_body.apply(lever.camera_body_m)
+    lever_cam_m = lever.pupil_cam_m
     ratio, step_rad, covariance_cam = _fitted_rotation(
         rays_cam,
         sigma_rad,

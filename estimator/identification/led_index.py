@@ -109,7 +109,7 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     ImageError
         If there are no pairs.
     """
-    radius = np.linalg.norm(leds.position_m, axis=1)
+    radius = leds.radius_m
     median_m = float(np.median(radius))
     lever_m = float(np.linalg.norm(lever.camera_body_m))
     # The greatest angle between two LEDs in one field.
@@ -132,7 +132,7 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
         np.ascontiguousarray(leds.position_m, dtype=float),
         radius,
         median_m,
-        lever.cam_from_body.apply(lever.camera_body_m),
+        lever.pupil_cam_m,
         float(scaling_error),
         inner,
         float(4 * half_size[0] * half_size[1]),

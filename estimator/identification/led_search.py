@@ -245,13 +245,9 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
         penalty = 0
         for end in range(2):
             # Each end costs 3 if it is not matched, and 1 if it is shared.
-            is_matched = False
-            for n in best.observed:
-                is_matched = is_matched or n == pairs[other, end]
-            penalty += 3 * (not is_matched)
-            penalty += (
-                pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
-            )
+            light = pairs[other, end]
+            penalty += 3 * (not (best.observed == light).any())
+            penalty += light == pairs[rank, 0] or light == pairs[rank, 1]
         if penalty < cost:
             best_rank = other
             cost = penalty

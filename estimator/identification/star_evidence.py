@@ -528,9 +528,7 @@ def _ways_dex(lights: int, matched: int) -> float:
 @jit
 def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
     """Fraction of the stars that are at least as bright as the faintest detection; 1 if magnitudes are unknown."""
-    faintest = mag[0]
-    for value in mag:
-        faintest = max(faintest, value)
+    faintest = mag.max()
     if not np.isfinite(faintest):
         return 1.0
     return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(

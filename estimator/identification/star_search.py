@@ -269,8 +269,7 @@ def _no_links(stars: int) -> Links:
 @jit
 def _clear(links: Links) -> None:
     """Remove all entries."""
-    for n in range(links.total[0]):
-        links.last[links.hub[n]] = 0
+    links.last[links.hub[: links.total[0]]] = 0
     links.total[0] = 0
 
 

@@ -106,7 +106,7 @@ def star_identifier(
     """
     radius = leds.radius_m
     median_radius_m = float(np.median(radius))
-    pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
+    pupil_m = lever.pupil_cam_m
     corners = camera.rays(camera.corners_px)
     points = on_sphere(corners, pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
@@ -250,7 +250,7 @@ class DomeTracker(FrameTracker):
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
-        lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        lever_cam_m = self.lever.pupil_cam_m
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
         return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
@@ -448,7 +448,7 @@ class DomeTracker(FrameTracker):
         common errors, of which those of a survey by the camera contain lever and lens.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
-        ray_cam = place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        ray_cam = place_cam - self.lever.pupil_cam_m
         view = systematic.geometry(place_cam, ray_cam)
         common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:

@@ -43,6 +43,7 @@ from estimator.identification.direct_match import (
     angle,
     match_field,
     no_match,
+    smart_triangles,
     to_star_match,
     triple,
 )
@@ -135,18 +136,13 @@ spherical_triangle = partial(triangle, True)
 def search(rays: Floats, index: PairIndex, options: TriangleOptions) -> DirectMatch:
     """The compiled search: steps 1 to 5; the empty match if none is accepted."""
     tried = np.zeros(2, np.int64)  # catalog triangles, angles compared
-    count = 0
-    # 1. Triangles (i, i + dj, i + dj + dk), i running fastest, so that one false star costs little.
-    for dj in range(1, options.base - 1):
-        for dk in range(1, options.base - dj):
-            for i in range(options.base - dj - dk):
-                if count >= options.triangles or tried[1] >= options.checks:
-                    return no_match()
-                count += 1
-                corners = np.array([i, i + dj, i + dj + dk])
-                match = _catalog_triangles(rays, index, corners, options, tried)
-                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
-                    return match
+    # 1. Triangles in an order in which one false star costs little.
+    for corners in smart_triangles(options.base)[: options.triangles]:
+        if tried[1] >= options.checks:
+            break
+        match = _catalog_triangles(rays, index, corners, options, tried)
+        if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+            return match
     return no_match()
 
 
