@@ -57,14 +57,10 @@ def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
 @jit
 def weights(sigma_rad: Floats) -> Floats:
     """Return (N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
-    out = np.empty(len(sigma_rad))
-    for n in range(len(out)):
-        if (
-            not 1e-150 < sigma_rad[n] < 1e150
-        ):  # so that its square neither overflows nor underflows
-            raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
-        out[n] = 1 / sigma_rad[n] ** 2
-    return out
+    # Its square neither overflows nor underflows.
+    if not ((sigma_rad > 1e-150) & (sigma_rad < 1e150)).all():
+        raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
+    return 1 / sigma_rad**2
 
 
 @jit

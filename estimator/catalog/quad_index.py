@@ -107,7 +107,7 @@ def _locally_bright(
     near = np.empty(len(xyz), np.int64)
     chosen = np.empty(len(xyz), np.bool_)
     for n in range(len(xyz)):
-        found = within(cells, xyz, xyz[n, 0], xyz[n, 1], xyz[n, 2], radius, near)
+        found = within(cells, xyz, *vectors.row(xyz, n), radius, near)
         # The smaller row is the brighter star.
         chosen[n] = np.sum(near[:found] < n) < count
     return np.flatnonzero(chosen).astype(np.int32)
@@ -145,7 +145,7 @@ def _quads(
     place = np.empty((NEIGHBORS, 2))
     for a in range(len(xyz)):
         star_a = vectors.row(xyz, a)
-        reached = within(cells, xyz, star_a[0], star_a[1], star_a[2], longest, around)
+        reached = within(cells, xyz, *star_a, longest, around)
         candidates = np.sort(around[:reached])[:NEIGHBORS]
         # A and B.
         for b in candidates:
@@ -195,7 +195,7 @@ def _stars_between(
         farther = max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c))
         if farther < length and c != b:
             near[count] = c
-            place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
+            place[count] = in_frame(frame, star_c, length)
             count += 1
     return count
 

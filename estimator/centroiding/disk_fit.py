@@ -40,7 +40,6 @@ def fit_all(
     """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disk."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
-    buffer = np.empty(len(xy), np.int64)
     p = np.empty(6)
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
@@ -54,7 +53,7 @@ def fit_all(
         y1 = boxes[n, 3] + MARGIN_PX
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
-        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        neighbor_rows = neighbors(boxes, n, x0, y0, x1, y1)
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         # Initial values: the radius of a disk of the blob's area, and the mean brightness.

@@ -83,7 +83,6 @@ def fit_all(
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
-    buffer = np.empty(len(xy), np.int64)
     p = np.empty(7)
     width_px = 0.9
     for n in range(len(xy)):
@@ -109,7 +108,7 @@ def fit_all(
         p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         capacity = (2 * half_x + 1) * (2 * half_y + 1)
         pixels = np.empty((3, capacity))
-        near = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        near = neighbors(boxes, n, x0, y0, x1, y1)
         offsets = _offsets_of_others(xy, near, n, p)
         count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
         data = pixels[:, :count]

@@ -135,8 +135,10 @@ class Camera:
                 "from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS
             )
             if not 0 < fov_rad <= WIDEST_RAD:
+                guess = "; degrees?" if 0 < fov_rad < math.inf else ";"
+                degrees = f"{math.degrees(fov_rad):.0f}°"
                 raise ImageError(
-                    f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}"
+                    f"from_fov: fov {fov_rad:g} rad is {degrees}{guess} allowed: {_FIELDS}"
                 )
         else:
             fov_deg = checks.number(

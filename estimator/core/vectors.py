@@ -128,7 +128,7 @@ def quaternion_xyzw(R: Floats) -> Floats:
     a small number; the result is normalized.
     """
     # Largest diagonal element, against the trace
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    trace = np.trace(R)
     q = np.empty(4)
     i = 0 if R[0, 0] >= R[1, 1] else 1
     i = i if R[i, i] >= R[2, 2] else 2
@@ -144,4 +144,4 @@ def quaternion_xyzw(R: Floats) -> Floats:
         q[j] = R[j, i] + R[i, j]
         q[k] = R[k, i] + R[i, k]
         q[3] = R[k, j] - R[j, k]
-    return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    return q / sqrt(np.sum(q**2))

@@ -266,7 +266,7 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
         a * z + b * y - c * x + d * w,
     )
     # Rounding would otherwise accumulate in the norm.
-    q /= math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    q /= math.sqrt(np.sum(q**2))
 
 
 # CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless

@@ -286,16 +286,7 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
         cell = row * CELLS + column
         rank[n] = used[cell]
         used[cell] += 1
-    keep = np.zeros(len(places), np.bool_)
-    taken = 0
-    level = 0
-    while taken < count:
-        for n in range(len(places)):
-            if rank[n] == level and taken < count:
-                keep[n] = True
-                taken += 1
-        level += 1
-    return np.flatnonzero(keep)
+    return np.sort(np.argsort(rank, kind="mergesort")[:count])
 
 
 @jit
@@ -365,6 +356,5 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
 @jit
 def field_area(detections: Detections) -> float:
     """Area of the sensor, tangents squared."""
-    return (detections.field[1] - detections.field[0]) * (
-        detections.field[3] - detections.field[2]
-    )
+    left, right, top, bottom = detections.field
+    return (right - left) * (bottom - top)

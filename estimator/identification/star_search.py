@@ -217,11 +217,8 @@ def _pair_costs(detections: Detections) -> tuple[Floats, NDArray]:
                 crowd[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
             cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
-    for a in range(total):
-        for b in range(a + 1, total):
-            cost[a, b] *= crowd[a] * crowd[b]
             cost[b, a] = cost[a, b]
-    return cost, np.argsort((np.arange(total) + 1) * crowd)
+    return cost * np.outer(crowd, crowd), np.argsort((np.arange(total) + 1) * crowd)
 
 
 class Links(NamedTuple):

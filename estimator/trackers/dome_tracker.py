@@ -151,8 +151,7 @@ def assumed_directions(
     lab_from_cam = lab_from_body * lever.cam_from_body.inv()
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
-    points_m = normalized(points_m)
-    return lab_from_cam.inv().apply(points_m)
+    return lab_from_cam.inv().apply(normalized(points_m))
 
 
 # Each entry maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the

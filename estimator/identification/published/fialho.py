@@ -29,6 +29,7 @@ lattice of LEDs, use `saa`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -162,33 +163,37 @@ def search_options(
     )
 
 
-def fialho_1(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+def _identify(
+    min_fraction: float,
+    optimized: bool,
+    retries: bool,
+    vectors_cam: Floats,
+    index: PairIndex,
+    tolerance_rad: float,
+    **options: Any,
 ) -> StarMatch | None:
-    """The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
-    settings = replace(Options(**options), boresight_ref=None)
-    return _identify(
-        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False
-    )
-
-
-def fialho_2(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
-) -> StarMatch | None:
-    """One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
-    return _identify(
-        vectors_cam, index, tolerance_rad, Options(**options), MIN_FRACTION_BASIC, True, False
-    )
-
-
-def fialho_3(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
-) -> StarMatch | None:
-    """Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
+    """Identify stars with the parameters of one version; only an optimized one has a prior boresight."""
     settings = Options(**options)
-    return _identify(
-        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_FALSE_STARS, True, True
-    )
+    if not optimized:
+        settings = replace(settings, boresight_ref=None)
+    parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
+    settings.require_known_focal("fialho")
+    count = len(vectors_cam)
+    if count < MIN_MATCHES:
+        return None
+    rays = np.ascontiguousarray(vectors_cam)
+    match = search(rays, settings.magnitudes(count), index, parameters)
+    return to_star_match(match, settings.by_paper)
+
+
+fialho_1 = partial(_identify, MIN_FRACTION_BASIC, False, False)
+"""The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
+
+fialho_2 = partial(_identify, MIN_FRACTION_BASIC, True, False)
+"""One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
+
+fialho_3 = partial(_identify, MIN_FRACTION_FALSE_STARS, True, True)
+"""Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
 
 
 def fialho_4(
@@ -236,26 +241,6 @@ VERSIONS: dict[str, Callable[..., StarMatch | None]] = {
     "fialho_3": fialho_3,
     "fialho_4": fialho_4,
 }
-
-
-def _identify(
-    vectors_cam: Floats,
-    index: PairIndex,
-    tolerance_rad: float,
-    settings: Options,
-    min_fraction: float,
-    optimized: bool,
-    retries: bool,
-) -> StarMatch | None:
-    """Identify stars with the parameters of one version."""
-    parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
-    settings.require_known_focal("fialho")
-    count = len(vectors_cam)
-    if count < MIN_MATCHES:
-        return None
-    rays = np.ascontiguousarray(vectors_cam)
-    match = search(rays, settings.magnitudes(count), index, parameters)
-    return to_star_match(match, settings.by_paper)
 
 
 @jit
