@@ -211,8 +211,7 @@ def arrange(code: NDArray, star: NDArray) -> None:
     """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the module's order, in place."""
     # Exchange A and B: half a turn.
     if code[0] + code[2] < 0:
-        for k in range(4):
-            code[k] = -code[k]
+        code[:] = -code
         star[0], star[1] = star[1], star[0]
     # Exchange C and D.
     if code[0] > code[2]:

@@ -294,8 +294,7 @@ def undistorted(
     percent it converges to 1e-15 in a few tens of iterations.
     """
     out = np.empty(xy_px.shape)
-    k1, k2, p1, p2, k3 = distortion
-    no_distortion = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
+    no_distortion = distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
     for n in range(len(out)):
         measured_x = (xy_px[n, 0] - center_x_px) / focal_px
         measured_y = (xy_px[n, 1] - center_y_px) / (aspect * focal_px)

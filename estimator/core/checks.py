@@ -191,10 +191,10 @@ def first_bad(good: NDArray[np.bool_]) -> int:
     return int(np.argmin(good))
 
 
-def excerpt(value: object, most: int = 60) -> str:
-    """Return a value's text in one line of at most `most` characters."""
+def excerpt(value: object) -> str:
+    """Return a value's text in one line of at most 60 characters."""
     text = " ".join((str(value) if isinstance(value, Exception) else repr(value)).split())
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return text if len(text) <= 60 else f"{text[:59]}…"
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.core.vectors import dot, rotate
+from estimator.core.vectors import dot, norm, rotate
 from estimator.filter.error_models import GyroModel, TrackerModel
 
 # Compiled propagation by gyro samples.
@@ -112,9 +112,7 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
     """
     if sample[4] == MISSING:
         return outage_rad
-    return (
-        max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
-    )
+    return np.abs(sample[1:4]).max() if sample[4] == SATURATED else 0.0
 
 
 @jit
@@ -224,7 +222,7 @@ def transition(p: Floats, effective_s: float, out: Floats) -> None:
     exp(-[p]) = I - (sin p / p) [p] + ((1 - cos p) / p^2) [p]^2 (Rodrigues), and
     J(p) = I - ((1 - cos p) / p^2) [p] + ((p - sin p) / p^3) [p]^2.
     """
-    square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    square = dot(p, p)
     # Below 1e-6 a series, whose error in `out` is below 1e-16: the quotients would lose digits.
     if square < 1e-6:
         sine = 1 - square / 6
@@ -252,7 +250,7 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     q = ref_from_body_wxyz
     # Quaternion (w, x, y, z) of the rotation vector: (cos(p / 2), sin(p / 2) p / |p|)
     x, y, z = rotation_rad
-    half = math.sqrt(x * x + y * y + z * z) / 2
+    half = norm(rotation_rad) / 2
     scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
     w = math.cos(half)
     x = scale * x

@@ -178,11 +178,8 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
     The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
     """
-    trace = 0.0
     # trace(R1^T R2) = sum of the products of the elements.
-    for i in range(3):
-        for j in range(3):
-            trace += first.R_cam_from_ref[i, j] * second.R_cam_from_ref[i, j]
+    trace = np.sum(first.R_cam_from_ref * second.R_cam_from_ref)
     return second.dex > -np.inf and trace > 2.99
 
 

@@ -36,7 +36,7 @@ from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
-from estimator.core.vectors import dot
+from estimator.core.vectors import dot, norm
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
     DirectMatch,
@@ -300,7 +300,7 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
 
     The small triangles' own planar moments are added (Steiner), so that few of them are enough.
     """
-    center = (u + v + w) / sqrt(np.sum((u + v + w) ** 2))
+    center = _unit(u + v + w)
     total = 0.0
     for i in range(SPLIT):
         for j in range(SPLIT - i):
@@ -309,7 +309,7 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
                 x = _node(u, v, w, i + 1, j)
                 y = _node(u, v, w, i, j + 1)
                 z = _node(u, v, w, i + upper, j + upper)
-                middle = (x + y + z) / sqrt(np.sum((x + y + z) ** 2))
+                middle = _unit(x + y + z)
                 own = planar_features(x, y, z)[1]
                 total += angle(center, middle) ** 2 * spherical_area(x, y, z) + own
     return total
@@ -319,4 +319,10 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
 def _node(u: Floats, v: Floats, w: Floats, i: int, j: int) -> Floats:
     """The direction i steps of SPLIT from u to v and j steps to w."""
     node = u + (v - u) * (i / SPLIT) + (w - u) * (j / SPLIT)
-    return node / sqrt(np.sum(node**2))
+    return _unit(node)
+
+
+@jit
+def _unit(u: Floats) -> Floats:
+    """The unit vector along u."""
+    return u / norm(u)
