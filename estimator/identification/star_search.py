@@ -180,7 +180,7 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
     """
     # trace(R1^T R2) = sum of the products of the elements.
     trace = np.sum(first.R_cam_from_ref * second.R_cam_from_ref)
-    return second.dex > -np.inf and trace > 2.99
+    return bool(second.dex > -np.inf and trace > 2.99)
 
 
 @jit

@@ -183,5 +183,5 @@ def _measure(
     for n in range(len(box_px)):
         x0, y0, x1, y1 = box_px[n]
         saturated = image[y0 : y1 + 1, x0 : x1 + 1] >= saturation_dn
-        overexposed += np.count_nonzero(saturated) > allowed
+        overexposed += int(np.count_nonzero(saturated)) > allowed
     return total / image.size, overexposed
