@@ -179,6 +179,11 @@ class Lever:
     cam_from_body: Rotation
     sigma_m: float = 0.0
 
+    @property
+    def pupil_cam_m(self) -> Floats:
+        """(3,) position of the entrance pupil, from the bearing center, in camera axes."""
+        return self.cam_from_body.apply(self.camera_body_m)
+
 
 def on_sphere(rays_body: Floats, camera_body_m: Floats, radius_m: Floats | float) -> Floats:
     """Return (N, 3) intersections of rays from the camera with a sphere about the bearing center, in the body frame.

@@ -106,7 +106,7 @@ def _with_covariance(
     weight = (radius / (sigma_rad * distance_m)) ** 2  # k
     # 1. Columns of G: derivative of a point's term k a x d by a shift along each axis.
     across_point = np.eye(3) - np.einsum("ni,nj->nij", d, d)
-    gradient = np.cross(a[:, None, :], np.swapaxes(across_point, 1, 2)).swapaxes(1, 2)
+    gradient = np.cross(a[:, None, :], across_point.mT).mT
     gradient *= (weight / radius)[:, None, None]
     # 2. Hessian
     gradient_along_ray = np.einsum("nij,nj->ni", gradient, rays_body)

@@ -126,10 +126,10 @@ def at_middle_row(
     # 2. Error of the centroid
     motion = tangent_motion(rays, sight)
     gain = error_gain(camera, motion @ rate.rate_rad_s)
-    covariance_px2 = gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2)
+    covariance_px2 = gain @ covariance_of(centroids) @ gain.mT
     # 3. Error of the rate
     by_rate = camera.focal_px * motion * delay_s[:, None, None]
-    covariance_px2 += by_rate @ rate.covariance_rad2_s2 @ np.swapaxes(by_rate, 1, 2)
+    covariance_px2 += by_rate @ rate.covariance_rad2_s2 @ by_rate.mT
     sigma_px = np.sqrt(np.trace(covariance_px2, axis1=1, axis2=2) / 2)
     return replace(
         centroids, xy_px=moved_px, sigma_px=sigma_px, covariance_px2=covariance_px2
@@ -284,7 +284,7 @@ def _fit(
         before = rate
         # 1. Least squares
         by_rate = motion * factor[:, None, None]
-        weighted = np.swapaxes(by_rate, 1, 2) @ information * keep[:, None, None]
+        weighted = by_rate.mT @ information * keep[:, None, None]
         normal = np.sum(weighted @ by_rate, axis=0) + np.eye(3) / MAX_RATE_RAD_S**2
         rate = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, chord))
         # 2. Signs

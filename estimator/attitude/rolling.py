@@ -127,9 +127,7 @@ def _rows(
     delay_s = camera.row_delays_s(centroids.xy_px)
     # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
     gain = error_gain(camera, -jacobian @ rate)
-    error_rad2 = (
-        gain @ covariance_of(centroids) @ np.swapaxes(gain, 1, 2) / camera.focal_px**2
-    )
+    error_rad2 = gain @ covariance_of(centroids) @ gain.mT / camera.focal_px**2
     # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
     by_rotation = jacobian @ turn.as_matrix()
     by_rate = -delay_s[:, None, None] * jacobian
@@ -146,7 +144,7 @@ def _normal_equations(rows: list[_Rows], keep: list[Bools]) -> tuple[Floats, Flo
     normal = np.zeros((6, 6))
     gradient = np.zeros(6)
     for (residual, slopes, information), kept in zip(rows, keep, strict=True):
-        weighted = np.swapaxes(slopes, 1, 2) @ information * kept[:, None, None]
+        weighted = slopes.mT @ information * kept[:, None, None]
         normal += np.sum(weighted @ slopes, axis=0)
         gradient += np.einsum("nij,nj->i", weighted, residual)
     return normal, gradient
@@ -198,7 +196,7 @@ def rate_covariance_rad2(
         (3, 3) covariance C of the rate
     """
     information = camera.focal_px**2 * np.linalg.inv(covariance_of(centroids))  # W
-    products = np.swapaxes(jacobian, 1, 2) @ information @ jacobian  # J^T W J
+    products = jacobian.mT @ information @ jacobian  # J^T W J
     delay_s = camera.row_delays_s(centroids.xy_px)[:, None, None]
     gain = np.linalg.solve(np.sum(products, axis=0), np.sum(products * delay_s, axis=0))
     return gain @ covariance_rad2_s2 @ gain.T

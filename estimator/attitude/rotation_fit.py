@@ -82,7 +82,7 @@ def _fit_rotation(
 ) -> tuple[Rotation, float, Floats]:
     """Return body_from_lab, the focal ratio (1 unless `with_focal`), and the covariance of both in camera axes."""
     R_cam_from_lab = (lever.cam_from_body * body_from_lab).as_matrix()  # updated in place
-    lever_cam_m = lever.cam_from_body.apply(lever.camera_body_m)
+    lever_cam_m = lever.pupil_cam_m
     ratio, step_rad, covariance_cam = _fitted_rotation(
         rays_cam,
         sigma_rad,
@@ -162,10 +162,12 @@ def _residual_rows(
 ) -> None:
     """Fill `rows` (4 or 5, 2 N): derivatives of the tangents by the rotation (and log ratio), then the residuals.
 
+    Even columns are those of the tangents x, odd ones those of y.
+
     The tangent x = rho q_x / q_z has the gradient d = rho (1/q_z, 0, -q_x/q_z^2) with respect to q. A small rotation w
     moves q by w x b, so that dx = d . (w x b) = w . (b x d): the three derivatives are b x d. The same holds for y.
     """
-    last = len(rows) - 1
+    pairs = rows.reshape(len(rows), -1, 2)
     for n in range(len(rays_cam)):
         bx, by, bz = rotate(R, row(position_m, n))  # b = A P
         qx = bx - lever_cam_m[0]
@@ -174,20 +176,16 @@ def _residual_rows(
         x = ratio * qx / qz
         y = ratio * qy / qz
         scale = ratio / qz
-        # b x d for the tangents x (even columns) and y (odd columns)
-        rows[0, 2 * n] = -by * x / qz
-        rows[0, 2 * n + 1] = -by * y / qz - bz * scale
-        rows[1, 2 * n] = bz * scale + bx * x / qz
-        rows[1, 2 * n + 1] = bx * y / qz
-        rows[2, 2 * n] = -by * scale
-        rows[2, 2 * n + 1] = bx * scale
+        # b x d for both tangents
+        pairs[0, n] = -by * x / qz, -by * y / qz - bz * scale
+        pairs[1, n] = bz * scale + bx * x / qz, bx * y / qz
+        pairs[2, n] = -by * scale, bx * scale
         # The derivative of rho (q_x / q_z) with respect to log rho is the tangent itself.
-        if last == 4:
-            rows[3, 2 * n] = x
-            rows[3, 2 * n + 1] = y
+        if len(rows) == 5:
+            pairs[3, n] = x, y
         # Residuals: measured minus predicted tangents
-        rows[last, 2 * n] = rays_cam[n, 0] / rays_cam[n, 2] - x
-        rows[last, 2 * n + 1] = rays_cam[n, 1] / rays_cam[n, 2] - y
+        u, v, w = row(rays_cam, n)
+        pairs[-1, n] = u / w - x, v / w - y
 
 
 def tangent_gradients(q: Floats) -> Floats:

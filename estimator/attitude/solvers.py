@@ -19,16 +19,28 @@ from estimator.core.vectors import quaternion_xyzw
 Solver = Callable[..., Rotation]
 
 
-def triad(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by TRIAD (Black 1964; in the form optimal for two stars, Markley 2002), from the best pair.
-
-    Of more than two stars it uses the pair with the smallest variance about the worst axis: two accurate stars that are
-    far apart (`wahba.best_pair`). The covariance is that of the pair: covariance(..., solver="triad"). Arguments and
-    errors are those of `quest`.
-    """
+def _solve_pair(
+    refined: bool, vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats
+) -> Rotation:
+    """Solve for the attitude of the best pair, and if wanted refine the solution on all vectors."""
     cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
     kernel.profile(cam, ref, weight)  # raises ValueError for unusable or parallel directions
-    return rotation(kernel.raw_triad(cam, ref, weight))
+    R_cam_from_ref = kernel.raw_triad(cam, ref, weight)
+    if refined:
+        kernel.refine(R_cam_from_ref, cam, ref, weight)
+    return rotation(R_cam_from_ref)
+
+
+triad = partial(_solve_pair, False)
+"""Return cam_from_ref by TRIAD (Black 1964; in the form optimal for two stars, Markley 2002), from the best pair.
+
+Of more than two stars it uses the pair with the smallest variance about the worst axis: two accurate stars that are
+far apart (`wahba.best_pair`). The covariance is that of the pair: covariance(..., solver="triad"). Arguments and
+errors are those of `quest`.
+"""
+
+least_squares = partial(_solve_pair, True)
+"""Return cam_from_ref by Gauss-Newton on the vectors from TRIAD's solution. Arguments and errors as `quest`."""
 
 
 def _solve_profile(
@@ -68,15 +80,6 @@ esoq2 = partial(_solve_profile, kernel.raw_esoq2)
 
 svd = partial(_solve_profile, kernel.raw_svd)
 """Return cam_from_ref by singular value decomposition (Markley 1988), refined. Arguments and errors as `quest`."""
-
-
-def least_squares(vectors_cam: Floats, vectors_ref: Floats, sigma_rad: Floats) -> Rotation:
-    """Return cam_from_ref by Gauss-Newton on the vectors from TRIAD's solution. Arguments and errors as `quest`."""
-    cam, ref, weight = _checked_arrays(vectors_cam, vectors_ref, sigma_rad)
-    kernel.profile(cam, ref, weight)  # raises ValueError, as in `triad`
-    R_cam_from_ref = kernel.raw_triad(cam, ref, weight)
-    kernel.refine(R_cam_from_ref, cam, ref, weight)
-    return rotation(R_cam_from_ref)
 
 
 SOLVERS: dict[str, Solver] = {

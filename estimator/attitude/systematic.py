@@ -90,7 +90,7 @@ def response(view: Geometry, sigma_rad: Floats) -> Floats:
     """
     weighted = view.jacobian / sigma_rad[:, None, None] ** 2
     information = np.einsum("kia,kib->ab", weighted, view.jacobian)  # the inverse of S
-    return np.linalg.solve(information, np.moveaxis(weighted, 2, 1))
+    return np.linalg.solve(information, weighted.mT)
 
 
 def residual_products(view: Geometry, sigma_rad: Floats, error_rad: Floats) -> Floats:

@@ -57,14 +57,10 @@ def wahba(cam: Floats, ref: Floats, weight: Floats) -> tuple[Floats, Floats]:
 @jit
 def weights(sigma_rad: Floats) -> Floats:
     """Return (N,) 1 / sigma^2. Raises ValueError for a sigma that is not finite and above 0."""
-    out = np.empty(len(sigma_rad))
-    for n in range(len(out)):
-        if (
-            not 1e-150 < sigma_rad[n] < 1e150
-        ):  # so that its square neither overflows nor underflows
-            raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
-        out[n] = 1 / sigma_rad[n] ** 2
-    return out
+    # Its square neither overflows nor underflows.
+    if not ((sigma_rad > 1e-150) & (sigma_rad < 1e150)).all():
+        raise ValueError("a sigma_rad is not usable; allowed: finite, above 0")
+    return 1 / sigma_rad**2
 
 
 @jit
@@ -94,13 +90,9 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         for i in range(3):
             for j in range(3):
                 B[i, j] += weight[n] * cam[n, i] * ref[n, j]
+    B /= total
     # A single NaN or infinity makes the sum of the elements non-finite.
-    entries = 0.0
-    for i in range(3):
-        for j in range(3):
-            B[i, j] /= total
-            entries += B[i, j]
-    if not isfinite(entries):
+    if not isfinite(B.sum()):
         raise ValueError("a direction is NaN or infinite; allowed: unit vectors")
     if length_error > LENGTH_TOLERANCE:
         raise ValueError("a direction is not of unit length; allowed: unit vectors")
@@ -114,10 +106,8 @@ def profile(cam: Floats, ref: Floats, weight: Floats) -> Floats:
 @jit
 def _sine2(vectors: Floats, m: int, n: int) -> float:
     """Squared sine of the angle between unit vectors m and n, from their cross product."""
-    x = vectors[m, 1] * vectors[n, 2] - vectors[m, 2] * vectors[n, 1]
-    y = vectors[m, 2] * vectors[n, 0] - vectors[m, 0] * vectors[n, 2]
-    z = vectors[m, 0] * vectors[n, 1] - vectors[m, 1] * vectors[n, 0]
-    return x * x + y * y + z * z
+    normal = cross(row(vectors, m), row(vectors, n))
+    return dot(normal, normal)
 
 
 @jit
@@ -167,11 +157,9 @@ def _cofactor(matrix: Floats, i: int, j: int) -> float:
 def _rotated_profile(B: Floats, axis: int) -> Floats:
     """Return the profile for a reference frame rotated by 180 degrees about axis 0, 1 or 2; unchanged for 3."""
     out = B.copy()
-    if axis < 3:
-        for j in range(3):
-            if j != axis:
-                for i in range(3):
-                    out[i, j] = -out[i, j]
+    for j in range(3):
+        if axis < 3 and j != axis:
+            out[:, j] *= -1
     return out
 
 
@@ -195,7 +183,7 @@ def _symmetric(B: Floats) -> tuple[Floats, Floats, float]:
     Shuster's attitude matrix A(q) is the transpose of the active rotation matrix used here, hence the sign of z.
     """
     z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
-    return B + B.T, z, B[0, 0] + B[1, 1] + B[2, 2]
+    return B + B.T, z, np.trace(B)
 
 
 @jit
@@ -234,20 +222,10 @@ def _quest_once(B: Floats, x: float) -> Quaternion:
         kappa += _cofactor(S, j, j)
     alpha = x * x - trace * trace + kappa
     gamma = (x + trace) * alpha - det
-    Sz = _matrix_vector(S, z)
-    SSz = _matrix_vector(S, Sz)
+    Sz = np.array(rotate(S, z))
+    SSz = np.array(rotate(S, Sz))
     v = alpha * z + (x - trace) * Sz + SSz
     return v[0], v[1], v[2], gamma
-
-
-@jit
-def _matrix_vector(matrix: Floats, v: Floats) -> Floats:
-    """Return the product (3,) of a (3, 3) matrix and a vector."""
-    out = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            out[i] += matrix[i, j] * v[j]
-    return out
 
 
 @jit
@@ -265,18 +243,16 @@ def raw_esoq2(B: Floats) -> Floats:
     # 1. A rotation by 180 degrees about an axis keeps that diagonal element and negates the two others.
     x = largest_eigenvalue(B)
     frame = 3
-    least = B[0, 0] + B[1, 1] + B[2, 2]
+    least = np.trace(B)
     for axis in range(3):
-        trace = 2 * B[axis, axis] - (B[0, 0] + B[1, 1] + B[2, 2])
+        trace = 2 * B[axis, axis] - np.trace(B)
         if trace < least:
             frame = axis
             least = trace
     # 2. M = (x - tr)((x + tr) I - S) - z z^T
     S, z, trace = _symmetric(_rotated_profile(B, frame))
-    M = np.empty((3, 3))
+    M = -(x - trace) * S - np.outer(z, z)
     for i in range(3):
-        for j in range(3):
-            M[i, j] = -(x - trace) * S[i, j] - z[i] * z[j]
         M[i, i] += (x - trace) * (x + trace)
     # 3. Row i of the cofactors of M is the cross product of the two other rows.
     e = np.zeros(3)
@@ -287,9 +263,7 @@ def raw_esoq2(B: Floats) -> Floats:
         w = _cofactor(M, i, 2)
         if u * u + v * v + w * w > length2:
             length2 = u * u + v * v + w * w
-            e[0] = u
-            e[1] = v
-            e[2] = w
+            e[:] = u, v, w
     # 4. Quaternion
     q = (x - trace) * e[0], (x - trace) * e[1], (x - trace) * e[2], dot(z, e)
     return matrix_of(_undo_rotation(q, frame))
@@ -303,14 +277,12 @@ def raw_davenport(B: Floats) -> Floats:
     """
     S, z, trace = _symmetric(B)
     K = np.empty((4, 4))
+    K[:3, :3] = S - trace * np.eye(3)
+    K[3, :3] = z
+    K[:3, 3] = z
     K[3, 3] = trace
-    for i in range(3):
-        for j in range(3):
-            K[i, j] = S[i, j]
-        K[i, i] -= trace
-        K[i, 3] = K[3, i] = z[i]
     _, vectors = np.linalg.eigh(K)  # in the order of increasing eigenvalues
-    return matrix_of((vectors[0, 3], vectors[1, 3], vectors[2, 3], vectors[3, 3]))
+    return matrix_of(vectors[:, 3])
 
 
 @jit
@@ -322,13 +294,8 @@ def raw_svd(B: Floats) -> Floats:
     U, _, Vt = np.linalg.svd(B)
     # The determinants are 1 or -1: their product keeps A a rotation rather than a reflection.
     determinant = np.linalg.det(U) * np.linalg.det(Vt)
-    R = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            R[i, j] = (
-                U[i, 0] * Vt[0, j] + U[i, 1] * Vt[1, j] + determinant * U[i, 2] * Vt[2, j]
-            )
-    return R
+    R = np.outer(U[:, 0], Vt[0]) + np.outer(U[:, 1], Vt[1])
+    return R + np.outer(determinant * U[:, 2], Vt[2])
 
 
 @jit
@@ -381,15 +348,10 @@ def raw_triad(cam: Floats, ref: Floats, weight: Floats) -> Floats:
         c = np.cross(b[k], b3)
         s = np.cross(r[k], r3)
         weight_k = weight[m] if k == 0 else weight[n]
-        for i in range(3):
-            for j in range(3):
-                along[i, j] += weight_k * (b[k, i] * r[k, j] + c[i] * s[j])
+        along += weight_k * (b[k].reshape(3, 1) * r[k] + c.reshape(3, 1) * s)
     # 3. `along` is l times a rotation of the plane: the sum of its squared entries is 2 l^2.
     scale = sqrt(2 / (along**2).sum())
-    for i in range(3):
-        for j in range(3):
-            along[i, j] = scale * along[i, j] + b3[i] * r3[j]
-    return along
+    return scale * along + b3.reshape(3, 1) * r3
 
 
 @jit
@@ -431,8 +393,7 @@ def refine(R_cam_from_ref: Floats, cam: Floats, ref: Floats, weight: Floats) -> 
             _add_information(normal, a, w)
         # 2. Step
         _factorize(normal)
-        for i in range(3):
-            step[i] = gradient[i]
+        step[:] = gradient
         least_squares.cholesky_solve(normal, step)
         # 3. Rotation
         rotate_in_place(step, R)
@@ -463,10 +424,7 @@ def attitude_covariance(cam: Floats, weight: Floats) -> Floats:
     for j in range(3):
         least_squares.cholesky_solve(factor, out[j])
     # Rounding leaves it slightly asymmetric.
-    for i in range(3):
-        for j in range(i):
-            out[i, j] = out[j, i] = (out[i, j] + out[j, i]) / 2
-    return out
+    return (out + out.T) / 2
 
 
 @jit
@@ -477,18 +435,12 @@ def _factorize(information: Floats) -> None:
 
 
 @jit
-def matrix_of(q: Quaternion) -> Floats:
-    """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any norm."""
+def matrix_of(q: Quaternion | Floats) -> Floats:
+    """Return the (3, 3) rotation matrix of a quaternion (x, y, z, w) of any norm, a tuple or an array."""
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
     R = np.empty((3, 3))
-    R[0, 0] = 1 - s * (y * y + z * z)
-    R[0, 1] = s * (x * y - z * w)
-    R[0, 2] = s * (x * z + y * w)
-    R[1, 0] = s * (x * y + z * w)
-    R[1, 1] = 1 - s * (x * x + z * z)
-    R[1, 2] = s * (y * z - x * w)
-    R[2, 0] = s * (x * z - y * w)
-    R[2, 1] = s * (y * z + x * w)
-    R[2, 2] = 1 - s * (x * x + y * y)
+    R[0] = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
+    R[1] = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
+    R[2] = s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)
     return R

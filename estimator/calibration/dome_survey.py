@@ -255,14 +255,14 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 4. Covariances, misfit, and noise
-            covariances = bundle_covariance.covariance(_terms(subset), fitted)
+            covariances = bundle_covariance.covariance(subset.terms, fitted)
             if fit_noise:
                 check_redundancy(subset, covariances)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
-        common = bundle_covariance.common_errors(_terms(subset), subset.bundle)
+        common = bundle_covariance.common_errors(subset.terms, subset.bundle)
     except LinAlgError:
         # A singular matrix raises the same ValueError as a nearly singular one
         covariances = None
@@ -271,11 +271,6 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
     return _Fit(subset, keep, converged, covariances, misfit, scale, common)
-
-
-def _terms(subset: Subset) -> ba.NormalEquations:
-    """Return the normal equations of a fitted subset."""
-    return ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:

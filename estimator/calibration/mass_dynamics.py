@@ -528,4 +528,4 @@ def momentum_scale(
     """Return R J0 J^-1 R^T, (K, 3, 3): it converts a momentum to that of the assumed inertia at the same rate."""
     R_lab_from_body = states.rotation.as_matrix()
     scale = np.linalg.solve(inverse_inertia(record, assumed), inverse_inertia(record, values))
-    return R_lab_from_body @ scale @ R_lab_from_body.transpose(0, 2, 1)
+    return R_lab_from_body @ scale @ R_lab_from_body.mT

@@ -172,11 +172,7 @@ def considered(
             continue
         # 1. K_n
         fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
-        gain = (
-            covariance
-            @ (by_bias - fitted).transpose(0, 2, 1)
-            @ np.linalg.inv(record.varying_rad2)
-        )
+        gain = covariance @ (by_bias - fitted).mT @ np.linalg.inv(record.varying_rad2)
         # 2. K_n L_n
         varying.append(gain @ symmetric_root(record.varying_rad2 - record.noise_rad2))
         constant.append(gain @ symmetric_root(record.covariance_rad2 - record.varying_rad2))
@@ -204,7 +200,7 @@ def considered(
 def symmetric_root(matrix: Floats) -> Floats:
     """Return the (N, 3, 3) symmetric roots of positive semi-definite matrices."""
     values, axes = np.linalg.eigh(matrix)
-    return axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.transpose(0, 2, 1)
+    return axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.mT
 
 
 def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
@@ -238,7 +234,7 @@ def reduced(
     # 1. Residuals and slopes
     rows = whitened_links(record, states, lab, values, prior)
     # 2. Normal equations; columns are the state before, the state after, the parameters and the residual.
-    products = rows.transpose(0, 2, 1) @ rows
+    products = rows.mT @ rows
     before = slice(0, STATE)
     after = slice(STATE, 2 * STATE)
     rest = slice(2 * STATE, None)
@@ -284,13 +280,13 @@ def whitened_links(
     scale = np.tile(np.eye(STATE), (len(misfit), 1, 1))
     scale[:, MOMENTUM, MOMENTUM] = momentum_scale(record, before, values, prior.values)
     R_lab_from_body = before.rotation.as_matrix()
-    in_body = R_lab_from_body.transpose(0, 2, 1) @ misfit[:, MOMENTUM]
+    in_body = R_lab_from_body.mT @ misfit[:, MOMENTUM]
     turned = np.einsum(
         "ijp,kjl->kip", inertia_matrix(np.eye(6)), inverse_inertia(record, values) @ in_body
     )
     rows[:, MOMENTUM, 2 * STATE : 2 * STATE + 6] -= R_lab_from_body @ turned
     # Division by the Cholesky factor of the noise
-    noise = scale @ link.noise @ scale.transpose(0, 2, 1)
+    noise = scale @ link.noise @ scale.mT
     return np.linalg.inv(np.linalg.cholesky(noise)) @ scale @ rows
 
 

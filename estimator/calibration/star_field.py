@@ -393,10 +393,8 @@ def _normal_equations(
     rotation_blocks = np.zeros((frames, 3, 3))
     coupling = np.zeros((frames, 3, LENS))
     rhs = np.zeros((frames, 3))
-    np.add.at(
-        rotation_blocks, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_rotation
-    )
-    np.add.at(coupling, sightings.frame, by_rotation.transpose(0, 2, 1) @ weighted_lens)
+    np.add.at(rotation_blocks, sightings.frame, by_rotation.mT @ weighted_rotation)
+    np.add.at(coupling, sightings.frame, by_rotation.mT @ weighted_lens)
     np.add.at(
         rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual)
     )
@@ -507,7 +505,7 @@ def _report(
     terms = _normal_equations(problem, sightings, np.ones(len(sightings.frame)))
     through, _, matrix = _eliminate_attitudes(terms, 0.0)
     covariance = _solve_scaled(matrix, np.eye(LENS))
-    by_lens = through @ covariance @ through.transpose(0, 2, 1)
+    by_lens = through @ covariance @ through.mT
     attitude_covariance = np.linalg.inv(terms.rotation_blocks) + by_lens
     attitude_covariance[~tied] = np.nan
     # Residuals

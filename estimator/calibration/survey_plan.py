@@ -79,8 +79,7 @@ class SurveyModel:
         rows = []
         for attitude in body_from_lab:
             xy_px = project(attitude, self.leds.position_m, self.lever, self.camera)
-            # An LED behind the camera is put far outside.
-            rows.append(self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), margin_px))
+            rows.append(self.camera.contains(xy_px, margin_px))
         return np.array(rows)
 
 
@@ -128,10 +127,9 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyA
         If the attitudes do not determine the unknowns.
     """
     bundle, sightings = _bundle(model, body_from_lab, seen)
-    subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
-    terms = ba.normal_equations(subset.bundle, subset.sightings, np.ones(len(subset.index)))
+    subset = connected_subset(bundle, sightings)
     try:
-        covariance = bundle_covariance.covariance(terms, subset.bundle)
+        covariance = bundle_covariance.covariance(subset.terms, subset.bundle)
     except LinAlgError:
         raise ValueError(
             "survey: the attitudes do not determine the unknowns; take more of them"
@@ -153,7 +151,7 @@ def measurable(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> Bool
     bundle, sightings = _bundle(model, body_from_lab, seen)
     measured = np.zeros(len(bundle.position_m), dtype=bool)
     try:
-        subset = connected_subset(bundle, sightings, np.ones(len(sightings.led), dtype=bool))
+        subset = connected_subset(bundle, sightings)
         measured[subset.led] = True
     except ValueError:
         pass

@@ -34,6 +34,11 @@ class Subset:
     frame: Ints
     index: Ints
 
+    @property
+    def terms(self) -> ba.NormalEquations:
+        """Normal equations of its least-squares fit."""
+        return ba.normal_equations(self.bundle, self.sightings, np.ones(len(self.index)))
+
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
         """Return the full bundle with the adjusted values of this subset inserted."""
         # Lights and frames outside of the subset keep their values.
@@ -58,7 +63,9 @@ class Unconnected(ValueError):
         self.frames = frames
 
 
-def connected_subset(full: Bundle, sightings: Sightings, keep: np.ndarray) -> Subset:
+def connected_subset(
+    full: Bundle, sightings: Sightings, keep: np.ndarray | bool = True
+) -> Subset:
     """Return the subset that the sightings determine.
 
     1. Remove lights seen in fewer than two frames or without crossing rays, and frames that see fewer than two of the

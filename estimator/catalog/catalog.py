@@ -283,18 +283,16 @@ def read(path: str | Path) -> StarCatalog:
     try:
         state = Path(path).stat()
     except (OSError, TypeError, ValueError):
-        return _read(path)  # raises the error
-    return _kept(path, state.st_dev, state.st_ino, state.st_mtime_ns)
+        return _read.__wrapped__(path)  # raises the error
+    return _read(path, state.st_dev, state.st_ino, state.st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=4)
-def _kept(path: str | Path, *_state: int) -> StarCatalog:
-    """The catalog of a file in this state. The last four are kept, because reading one takes 0.1 s."""
-    return _read(path)
+def _read(path: str | Path, *_state: int) -> StarCatalog:
+    """Read a catalog file in a state, and sort the stars by brightness.
 
-
-def _read(path: str | Path) -> StarCatalog:
-    """Read a catalog file, and sort the stars by brightness."""
+    The last four are kept, because reading one takes 0.1 s.
+    """
     table, epoch_yr = columns(path, COLUMNS)
     return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 

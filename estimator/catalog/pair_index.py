@@ -10,7 +10,7 @@ without a search:
 
 The separations are nearly enough linear in their rank that the range holds only a few pairs too many. The neighbor
 lists give the stars at a given separation from one star: for each star they hold the other stars of its pairs,
-sorted by separation, and are searched by bisection (`first_neighbor`).
+sorted by separation, and are searched by bisection (`neighbor_range`).
 """
 
 from typing import NamedTuple
@@ -195,19 +195,13 @@ def magnitude_range(index: PairIndex, magnitude: float, gate: float) -> tuple[in
 
 
 @jit
-def first_neighbor(index: PairIndex, star: int, low_rad: float) -> int:
-    """The position in `neighbor` of a star's first neighbor at `low_rad` or farther, by bisection."""
-    return first_from(index.separation_rad, index.first[star], index.first[star + 1], low_rad)
-
-
-@jit
 def neighbor_range(
     index: PairIndex, star: int, low_rad: float, high_rad: float
 ) -> tuple[int, int]:
     """The half-open range in `neighbor` of a star's neighbors at the angles [low, high]."""
-    begin = first_neighbor(index, star, low_rad)
-    beyond = np.nextafter(high_rad, np.inf)
-    end = first_from(index.separation_rad, begin, index.first[star + 1], beyond)
+    last = index.first[star + 1]
+    begin = first_from(index.separation_rad, index.first[star], last, low_rad)
+    end = first_from(index.separation_rad, begin, last, np.nextafter(high_rad, np.inf))
     return begin, end
 
 

@@ -107,7 +107,7 @@ def _locally_bright(
     near = np.empty(len(xyz), np.int64)
     chosen = np.empty(len(xyz), np.bool_)
     for n in range(len(xyz)):
-        found = within(cells, xyz, xyz[n, 0], xyz[n, 1], xyz[n, 2], radius, near)
+        found = within(cells, xyz, *vectors.row(xyz, n), radius, near)
         # The smaller row is the brighter star.
         chosen[n] = np.sum(near[:found] < n) < count
     return np.flatnonzero(chosen).astype(np.int32)
@@ -145,7 +145,7 @@ def _quads(
     place = np.empty((NEIGHBORS, 2))
     for a in range(len(xyz)):
         star_a = vectors.row(xyz, a)
-        reached = within(cells, xyz, star_a[0], star_a[1], star_a[2], longest, around)
+        reached = within(cells, xyz, *star_a, longest, around)
         candidates = np.sort(around[:reached])[:NEIGHBORS]
         # A and B.
         for b in candidates:
@@ -164,10 +164,7 @@ def _quads(
                     ):
                         continue
                     if total < len(found):
-                        found[total, 0] = a
-                        found[total, 1] = b
-                        found[total, 2] = near[k]
-                        found[total, 3] = near[m]
+                        found[total] = a, b, near[k], near[m]
                         code[total, :2] = place[k]
                         code[total, 2:] = place[m]
                         arrange(code[total], found[total])
@@ -198,7 +195,7 @@ def _stars_between(
         farther = max(vectors.chord(star_a, star_c), vectors.chord(star_b, star_c))
         if farther < length and c != b:
             near[count] = c
-            place[count, 0], place[count, 1] = in_frame(frame, star_c, length)
+            place[count] = in_frame(frame, star_c, length)
             count += 1
     return count
 
@@ -206,9 +203,7 @@ def _stars_between(
 @jit
 def in_frame(frame: Floats, star: vectors.Vector, length: float) -> tuple[float, float]:
     """A star's coordinates along B to A and across, in chords of A and B; `frame` is that of `vectors.pair_frame`."""
-    along = frame[0, 2] * star[0] + frame[1, 2] * star[1] + frame[2, 2] * star[2]
-    across = frame[0, 1] * star[0] + frame[1, 1] * star[1] + frame[2, 1] * star[2]
-    return along / length, across / length
+    return vectors.dot(frame[:, 2], star) / length, vectors.dot(frame[:, 1], star) / length
 
 
 @jit
@@ -216,8 +211,7 @@ def arrange(code: NDArray, star: NDArray) -> None:
     """Bring a quad's code (4,) and its stars A, B, C, D (4,) into the module's order, in place."""
     # Exchange A and B: half a turn.
     if code[0] + code[2] < 0:
-        for k in range(4):
-            code[k] = -code[k]
+        code[:] = -code
         star[0], star[1] = star[1], star[0]
     # Exchange C and D.
     if code[0] > code[2]:

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
+from estimator.core.vectors import row, squared_chord
 
 # Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.
 
@@ -138,10 +139,7 @@ def within(
             end = cells.first[low + edge_cell(z + chord, side) + 1]
             for entry in range(begin, end):
                 s = cells.row[entry]
-                dx = vectors[s, 0] - x
-                dy = vectors[s, 1] - y
-                dz = vectors[s, 2] - z
-                if dx * dx + dy * dy + dz * dz <= chord * chord:
+                if squared_chord(row(vectors, s), (x, y, z)) <= chord * chord:
                     if count < len(out):
                         out[count] = s
                     count += 1
@@ -184,10 +182,7 @@ def nearest(
             end = cell_first[low + edge_cell(z + gate, side) + 1]
             for entry in range(begin, end):
                 s = cell_row[entry]
-                dx = vectors[s, 0] - x
-                dy = vectors[s, 1] - y
-                dz = vectors[s, 2] - z
-                distance2 = dx * dx + dy * dy + dz * dz
+                distance2 = squared_chord(row(vectors, s), (x, y, z))
                 if distance2 < closest2:
                     best = s
                     closest2 = distance2

@@ -22,7 +22,7 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
 from estimator.detection.classify import VOTING_BLOBS, streaks_px
-from estimator.detection.detect import check_pixel_type, to_native
+from estimator.detection.detect import check_monochrome, to_native
 
 Centroider = Callable[..., Centroids]  # (image, blobs, gain_e_dn, priors)
 
@@ -68,38 +68,66 @@ of the squared profile, which is narrower by the square root of 2 (`moments.squa
 """
 
 
-def gaussian_window(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
+def _fitted(
+    fit: Callable[..., Floats],
+    image: NDArray,
+    blobs: Blobs,
+    gain_e_dn: float = 1.0,
+    priors: FramePriors = NO_PRIORS,
 ) -> Centroids:
-    """Measure the center c of a Gaussian window w that is also the center of gravity in it: sum(w I (x - c)) = 0.
-
-    This is SExtractor's XWIN (Bertin & Arnouts 1996), but solved by Newton's method, and with a window of twice the
-    star's variance (`moments.gaussian_windowed`). The variance is
-    var(c) = sum(w^2 (x - c)^2 (I / g + noise^2)) / sum(w I (1 - (x - c)^2 / s^2))^2 plus the mean square of the
-    S-curve. The error is an eighth above the minimum, for faint and for bright stars. A blob for which the iteration
-    does not converge keeps its center of gravity.
-    """
+    """Run a fit; a blob that it does not describe keeps its center of gravity. Parameters as in `_moments`."""
     image = prepare(image, blobs, gain_e_dn, priors)
+    rows = fit(image, blobs, gain_e_dn, priors)
+    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
+
+
+def _fit_windows(
+    image: NDArray, blobs: Blobs, gain_e_dn: float, _priors: FramePriors
+) -> Floats:
+    """Return the rows of `moments.gaussian_windowed`."""
     sky = blobs.background
-    rows = moments.gaussian_windowed(
+    return moments.gaussian_windowed(
         image, blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
     )
-    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
 
 
-def gaussian_fit(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
-) -> Centroids:
-    """Fit a Gaussian integrated over each pixel by weighted least squares: x, y, flux, sigma and sky level are free.
+gaussian_window = partial(_fitted, _fit_windows)
+"""Measure the center c of a Gaussian window w that is also the center of gravity in it: sum(w I (x - c)) = 0.
 
-    Gauss-Newton runs on a 7x7 window around the blob's center; see `estimator.centroiding.gaussian_fit` for the model
-    I = b + F gx gy. A pixel's weight is 1 / (noise^2 + F gx gy / g); with equal weights the error of a bright star
-    would be 4/3 of the photon-noise limit. Saturated pixels are excluded: the wings determine the position. A blob that
-    the model does not fit (no convergence, larger than the window) keeps its center of gravity.
-    """
-    image = prepare(image, blobs, gain_e_dn, priors)
-    rows = _fit_gaussians(image, blobs, gain_e_dn, priors)
-    return _to_centroids(_with_fallback(rows, image, blobs, gain_e_dn))
+This is SExtractor's XWIN (Bertin & Arnouts 1996), but solved by Newton's method, and with a window of twice the
+star's variance (`moments.gaussian_windowed`). The variance is
+var(c) = sum(w^2 (x - c)^2 (I / g + noise^2)) / sum(w I (1 - (x - c)^2 / s^2))^2 plus the mean square of the
+S-curve. The error is an eighth above the minimum, for faint and for bright stars. A blob for which the iteration
+does not converge keeps its center of gravity.
+"""
+
+
+def _fit_gaussians(
+    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
+) -> Floats:
+    """Return the rows of `gaussian_fit.fit_all`."""
+    sky = blobs.background
+    return gaussian.fit_all(
+        image,
+        blobs.xy_px,
+        blobs.flux,
+        blobs.box_px,
+        blobs.peak,
+        sky.level,
+        sky.noise,
+        float(gain_e_dn),
+        priors.saturation,
+    )
+
+
+gaussian_fit = partial(_fitted, _fit_gaussians)
+"""Fit a Gaussian integrated over each pixel by weighted least squares: x, y, flux, sigma and sky level are free.
+
+Gauss-Newton runs on a 7x7 window around the blob's center; see `estimator.centroiding.gaussian_fit` for the model
+I = b + F gx gy. A pixel's weight is 1 / (noise^2 + F gx gy / g); with equal weights the error of a bright star
+would be 4/3 of the photon-noise limit. Saturated pixels are excluded: the wings determine the position. A blob that
+the model does not fit (no convergence, larger than the window) keeps its center of gravity.
+"""
 
 
 def streak(
@@ -234,16 +262,8 @@ def _acceleration(ahead: Floats, variances: Floats) -> tuple[float, float]:
     return q * m, q * (v + (FADING_MODEL**2 + 1 - q) * m**2)
 
 
-def disk(
-    image: NDArray, blobs: Blobs, gain_e_dn: float = 1.0, priors: FramePriors = NO_PRIORS
-) -> Centroids:
-    """Fit a uniform disk with a blurred edge, the image of a nearby LED, by weighted least squares.
-
-    Center, radius, edge width, brightness and sky are free (`disk_fit`). Only the edge carries information about the
-    position, so a saturated disk is measured as accurately as any other; its saturated pixels are excluded. A blob that
-    is too small or not a disk keeps its center of gravity.
-    """
-    image = prepare(image, blobs, gain_e_dn, priors)
+def _fit_disks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
+    """Return x, y, sigma and flux of `disk_fit.fit_all`."""
     sky = blobs.background
     rows = disk_fit.fit_all(
         image,
@@ -256,7 +276,16 @@ def disk(
         float(gain_e_dn),
         priors.saturation,
     )
-    return _to_centroids(_with_fallback(rows[:, :4], image, blobs, gain_e_dn))
+    return rows[:, :4]
+
+
+disk = partial(_fitted, _fit_disks)
+"""Fit a uniform disk with a blurred edge, the image of a nearby LED, by weighted least squares.
+
+Center, radius, edge width, brightness and sky are free (`disk_fit`). Only the edge carries information about the
+position, so a saturated disk is measured as accurately as any other; its saturated pixels are excluded. A blob that
+is too small or not a disk keeps its center of gravity.
+"""
 
 
 def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> NDArray:
@@ -268,14 +297,10 @@ def prepare(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors)
         For another type, a gain that is not above 0, or blobs beyond the image: compiled loops do
         not check their indices.
     """
-    check_pixel_type(image)
+    check_monochrome(image)
     checks.of_type("blobs", blobs, Blobs)
     checks.of_type("priors", priors, FramePriors)
     checks.number("gain_e_dn", gain_e_dn, 1e-300, np.inf, "above 0; inf without photon noise")
-    if image.ndim != 2:
-        raise ImageError(
-            f"an image of shape {image.shape}; allowed: monochrome, (height, width)"
-        )
     # Boxes within the image: x0, y0 of 0 or more, x1, y1 below its size
     edge = np.array([image.shape[1], image.shape[0]] * 2)
     if len(blobs) and not (
@@ -305,24 +330,6 @@ CENTROIDERS: dict[str, Centroider] = {
     "streak": streak,
     "disk": disk,
 }
-
-
-def _fit_gaussians(
-    image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
-) -> Floats:
-    """Return the rows of `gaussian_fit.fit_all`."""
-    sky = blobs.background
-    return gaussian.fit_all(
-        image,
-        blobs.xy_px,
-        blobs.flux,
-        blobs.box_px,
-        blobs.peak,
-        sky.level,
-        sky.noise,
-        float(gain_e_dn),
-        priors.saturation,
-    )
 
 
 def _fit_streaks(

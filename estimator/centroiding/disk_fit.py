@@ -40,7 +40,6 @@ def fit_all(
     """Fit every blob: (N, 5) x, y, sigma of the position, flux, radius; NaN if it is not a disk."""
     height, width = image.shape
     out = np.full((len(xy), 5), np.nan)
-    buffer = np.empty(len(xy), np.int64)
     p = np.empty(6)
     for n in range(len(xy)):
         p[X], p[Y] = xy[n]
@@ -54,7 +53,7 @@ def fit_all(
         y1 = boxes[n, 3] + MARGIN_PX
         if x0 < 0 or y0 < 0 or x1 >= width or y1 >= height:
             continue
-        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        neighbor_rows = neighbors(boxes, n, x0, y0, x1, y1)
         sky = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         sigma = interpolate(noise, height, width, xy[n, 1], xy[n, 0]) / FILTERED_NOISE
         # Initial values: the radius of a disk of the blob's area, and the mean brightness.
@@ -129,8 +128,7 @@ def _fit(
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[RADIUS]))
         # 3. At most one pixel per step, and a quarter of a pixel in the edge's width.
         scale = min(1.0, 1 / max(largest_step, 4 * abs(step[EDGE]), 1e-300))
-        for k in range(len(p)):
-            p[k] += scale * step[k]
+        p += scale * step
         p[EDGE] = min(max(p[EDGE], 0.25), 0.6 * p[RADIUS])
         if hypot(p[X] - start_x, p[Y] - start_y) > start_radius / 2 or p[BRIGHTNESS] <= 0:
             return
@@ -147,12 +145,9 @@ def _write_disk(factor: Floats, p: Floats, pixels: int, column: Floats, out: Flo
     """Write x, y, sigma of the position, flux and radius of a disk; `column` (6,) is a work array."""
     xx, yy, _ = least_squares.position_covariance(factor, column)
     variance = (xx + yy) / 2 * least_squares.misfit_factor(factor[6, 6], pixels - 6)
-    out[0] = p[X]
-    out[1] = p[Y]
-    out[2] = sqrt(variance + MODEL_PX**2)
-    out[4] = p[RADIUS]
     # Total flux of a blurred disk: A pi (R^2 + w^2), as the edge is symmetric about R.
-    out[3] = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+    flux = p[BRIGHTNESS] * pi * (p[RADIUS] ** 2 + p[EDGE] ** 2)
+    out[:] = p[X], p[Y], sqrt(variance + MODEL_PX**2), flux, p[RADIUS]
 
 
 @jit

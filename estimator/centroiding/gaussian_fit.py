@@ -133,8 +133,7 @@ def _fit(
         largest_step = max(abs(step[X]), abs(step[Y]), abs(step[WIDTH]))
         # 3. Steps of more than half a pixel are shortened: the model is too nonlinear for them.
         scale = min(1.0, 0.5 / max(largest_step, 1e-300))
-        for k in range(len(p)):
-            p[k] += scale * step[k]
+        p += scale * step
         if abs(p[X] - start_x) > 2 or abs(p[Y] - start_y) > 2 or p[FLUX] <= 0:
             return False
         p[WIDTH] = min(max(p[WIDTH], MIN_SIGMA_PX), MAX_SIGMA_PX)
@@ -152,10 +151,7 @@ def _write_star(factor: Floats, p: Floats, pixels: int, column: Floats, out: Flo
     """Write x, y, sigma of the position and flux of a star; `column` (5,) is a work array."""
     xx, yy, _ = least_squares.position_covariance(factor, column)
     inflation = least_squares.misfit_factor(factor[5, 5], pixels - 5)
-    out[0] = p[X]
-    out[1] = p[Y]
-    out[2] = sqrt((xx + yy) / 2 * inflation)
-    out[3] = p[FLUX]
+    out[:] = p[X], p[Y], sqrt((xx + yy) / 2 * inflation), p[FLUX]
 
 
 @jit

@@ -74,10 +74,9 @@ def _weighted_mean(
     """Compute the mean position weighted by a power of the light, 1 or 2, in each box and a margin."""
     height, width = image.shape
     out = np.zeros((len(boxes), 4))
-    buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         x0, y0, x1, y1 = _window(boxes[n], margin, width, height)
-        neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        neighbor_rows = neighbors(boxes, n, x0, y0, x1, y1)
         light = np.zeros((y1 - y0 + 1, x1 - x0 + 1))
         own = np.zeros_like(light)
         for y in range(y0, y1 + 1):
@@ -140,7 +139,6 @@ def gaussian_windowed(
     """
     height, width = image.shape
     out = np.full((len(boxes), 4), np.nan)
-    buffer = np.empty(len(boxes), np.int64)
     for n in range(len(boxes)):
         cx, cy = xy[n]
         s2 = 1.0
@@ -148,7 +146,7 @@ def gaussian_windowed(
         for iteration in range(MAX_ITERATIONS):
             # 1. Moments
             total, mx, my, second_moment, moment_variance, flux = _window_moments(
-                image, boxes, buffer, n, level, cx, cy, s2, gain_e_dn, sigma2
+                image, boxes, n, level, cx, cy, s2, gain_e_dn, sigma2
             )
             # 2. Newton's step, of at most 0.7 px, with the mean of both coordinates' derivatives
             slope = total - second_moment / s2
@@ -170,10 +168,8 @@ def gaussian_windowed(
                 sampling_error2 = (
                     sampling_variance(second_moment / total) * (total / slope) ** 2
                 )
-                out[n, 0] = cx
-                out[n, 1] = cy
-                out[n, 3] = flux
-                out[n, 2] = sqrt(moment_variance / slope**2 + sampling_error2)
+                sigma = sqrt(moment_variance / slope**2 + sampling_error2)
+                out[n] = cx, cy, sigma, flux
                 break
     return out
 
@@ -182,7 +178,6 @@ def gaussian_windowed(
 def _window_moments(
     image: NDArray,
     boxes: Ints,
-    buffer: Ints,
     n: int,
     level: Floats,
     cx: float,
@@ -195,8 +190,6 @@ def _window_moments(
 
     Parameters
     ----------
-    buffer
-        (N,) work array
     s2, sigma2
         Variance of the window, and n^2 of one pixel
 
@@ -212,7 +205,7 @@ def _window_moments(
     y0 = max(round(cy - reach), 0)
     x1 = min(round(cx + reach), width - 1)
     y1 = min(round(cy + reach), height - 1)
-    neighbor_rows = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+    neighbor_rows = neighbors(boxes, n, x0, y0, x1, y1)
     total = mx = my = second_moment = moment_variance = flux = 0.0
     for y in range(y0, y1 + 1):
         for x in range(x0, x1 + 1):
@@ -255,17 +248,12 @@ def sampling_variance(variance_px2: float) -> float:
 
 
 @jit
-def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int, buffer: Ints) -> int:
-    """Write to `buffer` the other blobs whose boxes overlap a window; return their number."""
-    count = 0
-    for m in range(len(boxes)):
-        disjoint = (
-            boxes[m, 0] > x1 or boxes[m, 2] < x0 or boxes[m, 1] > y1 or boxes[m, 3] < y0
-        )
-        if m != n and not disjoint:
-            buffer[count] = m
-            count += 1
-    return count
+def neighbors(boxes: Ints, n: int, x0: int, y0: int, x1: int, y1: int) -> Ints:
+    """Rows of the other blobs whose boxes overlap a window around blob n."""
+    beside = (boxes[:, 0] <= x1) & (boxes[:, 2] >= x0)
+    overlaps = beside & (boxes[:, 1] <= y1) & (boxes[:, 3] >= y0)
+    overlaps[n] = False
+    return np.flatnonzero(overlaps)
 
 
 @jit

@@ -83,7 +83,6 @@ def fit_all(
     """
     height, width = image.shape
     out = np.full((len(xy), OUTPUTS), np.nan)
-    buffer = np.empty(len(xy), np.int64)
     p = np.empty(7)
     width_px = 0.9
     for n in range(len(xy)):
@@ -109,7 +108,7 @@ def fit_all(
         p[SKY] = interpolate(level, height, width, xy[n, 1], xy[n, 0])
         capacity = (2 * half_x + 1) * (2 * half_y + 1)
         pixels = np.empty((3, capacity))
-        near = buffer[: neighbors(boxes, n, x0, y0, x1, y1, buffer)]
+        near = neighbors(boxes, n, x0, y0, x1, y1)
         offsets = _offsets_of_others(xy, near, n, p)
         count = _select_pixels(image, offsets, (x0, y0, x1, y1), saturation, p, pixels)
         data = pixels[:, :count]
@@ -280,8 +279,7 @@ def _apply_step(step: Floats, p: Floats) -> float:
     largest_step = max(abs(step[X]), abs(step[Y]), abs(step[LENGTH]))
     end_shift = abs(step[ANGLE]) * p[LENGTH] / 2
     scale = min(1.0, 1 / max(largest_step, end_shift, 2 * abs(step[WIDTH]), 1e-300))
-    for k in range(len(p)):
-        p[k] += scale * step[k]
+    p += scale * step
     p[WIDTH] = min(max(p[WIDTH], 0.3), 4.0)
     return largest_step
 
@@ -304,18 +302,16 @@ def _write_streak(
     out: Floats,
 ) -> None:
     """Write x, y, flux, dx, dy of a streak, and xx, yy, xy of its center's covariance."""
-    out[0] = p[X]
-    out[1] = p[Y]
-    out[2] = p[FLUX]
-    out[3] = p[LENGTH] * cos(p[ANGLE])
-    out[4] = p[LENGTH] * sin(p[ANGLE])
-    out[5], out[6], out[7] = least_squares.position_covariance(factor, column)
+    dx = p[LENGTH] * cos(p[ANGLE])
+    dy = p[LENGTH] * sin(p[ANGLE])
+    out[:5] = p[X], p[Y], p[FLUX], dx, dy
+    out[5:8] = least_squares.position_covariance(factor, column)
     out[5:8] *= misfit
     # The variance along the streak becomes a covariance in x and y: times (dx, dy)^T (dx, dy) / L^2.
     end_variance = end_variance_px2 / p[LENGTH] ** 2
-    out[5] += end_variance * out[3] ** 2
-    out[6] += end_variance * out[4] ** 2
-    out[7] += end_variance * out[3] * out[4]
+    out[5] += end_variance * dx**2
+    out[6] += end_variance * dy**2
+    out[7] += end_variance * dx * dy
 
 
 @jit
@@ -367,11 +363,7 @@ def _own_vector(
     s = sin(angle)
     slopes = np.array([[c, -length * s], [s, length * c]])
     own = slopes @ own @ slopes.T.copy()
-    out[0] = length * c
-    out[1] = length * s
-    out[2] = own[0, 0]
-    out[3] = own[1, 1]
-    out[4] = own[0, 1]
+    out[:] = length * c, length * s, own[0, 0], own[1, 1], own[0, 1]
 
 
 @jit

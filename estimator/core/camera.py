@@ -135,8 +135,10 @@ class Camera:
                 "from_fov: fov_rad", fov_rad, -math.inf, math.inf, _FIELDS
             )
             if not 0 < fov_rad <= WIDEST_RAD:
+                guess = "; degrees?" if 0 < fov_rad < math.inf else ";"
+                degrees = f"{math.degrees(fov_rad):.0f}°"
                 raise ImageError(
-                    f"from_fov: {checks.angle_guess('fov', fov_rad)} allowed: {_FIELDS}"
+                    f"from_fov: fov {fov_rad:g} rad is {degrees}{guess} allowed: {_FIELDS}"
                 )
         else:
             fov_deg = checks.number(
@@ -221,7 +223,7 @@ class Camera:
         return distorted(tangent, self.distortion) * focal_px + self.center_px
 
     def contains(self, xy_px: Floats, margin_px: float = 0.0) -> np.ndarray:
-        """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side."""
+        """Return (N,) whether each pixel position is on the sensor, shrunk by the margin on every side; NaN is not."""
         x, y = checks.floats("xy_px", xy_px, (None, 2)).T
         low = margin_px - 0.5
         right = self.width_px - 0.5 - margin_px
@@ -273,7 +275,7 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """Apply the distortion to (N, 2) tangents."""
     out = np.empty_like(tangent)
     for n in range(len(tangent)):
-        out[n, 0], out[n, 1] = _distort(tangent[n, 0], tangent[n, 1], distortion)
+        out[n] = _distort(tangent[n, 0], tangent[n, 1], distortion)
     return out
 
 
@@ -292,8 +294,7 @@ def undistorted(
     percent it converges to 1e-15 in a few tens of iterations.
     """
     out = np.empty(xy_px.shape)
-    k1, k2, p1, p2, k3 = distortion
-    no_distortion = k1 == 0 and k2 == 0 and p1 == 0 and p2 == 0 and k3 == 0
+    no_distortion = distortion == (0.0, 0.0, 0.0, 0.0, 0.0)
     for n in range(len(out)):
         measured_x = (xy_px[n, 0] - center_x_px) / focal_px
         measured_y = (xy_px[n, 1] - center_y_px) / (aspect * focal_px)
@@ -305,8 +306,7 @@ def undistorted(
             y = y + measured_y - distorted_y
             if max(abs(measured_x - distorted_x), abs(measured_y - distorted_y)) < 1e-15:
                 break
-        out[n, 0] = x
-        out[n, 1] = y
+        out[n] = x, y
     return out
 
 

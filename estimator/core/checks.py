@@ -6,7 +6,6 @@ array, or an int in place of a float, would cause a compilation of seconds.
 """
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any, NamedTuple
@@ -187,36 +186,15 @@ def row_numbers(what: str, value: object, below: int) -> NDArray[np.int64]:
     return array.astype(np.int64, copy=False)
 
 
-def row_pairs(*columns: tuple[str, object, int]) -> list[NDArray[np.int64]]:
-    """Return columns of row numbers of equal lengths, each given as (name, rows, number of existing rows).
-
-    Raises ImageError for different lengths, and as `row_numbers`.
-    """
-    arrays = [row_numbers(*column) for column in columns]
-    if len({len(array) for array in arrays}) > 1:
-        lengths = ", ".join(
-            f"{len(array)} of {name}"
-            for (name, *_), array in zip(columns, arrays, strict=True)
-        )
-        raise ImageError(f"{lengths}; allowed: equal numbers of both")
-    return arrays
-
-
 def first_bad(good: NDArray[np.bool_]) -> int:
     """Return the index of the first False."""
     return int(np.argmin(good))
 
 
-def angle_guess(what: str, value_rad: float) -> str:
-    """Return a text that converts an angle too large for radians to degrees, for a message."""
-    guess = "; degrees?" if 0 < value_rad < math.inf else ";"
-    return f"{what} {value_rad:g} rad is {math.degrees(value_rad):.0f}°{guess}"
-
-
-def excerpt(value: object, most: int = 60) -> str:
-    """Return a value's text in one line of at most `most` characters."""
+def excerpt(value: object) -> str:
+    """Return a value's text in one line of at most 60 characters."""
     text = " ".join((str(value) if isinstance(value, Exception) else repr(value)).split())
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return text if len(text) <= 60 else f"{text[:59]}…"
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:

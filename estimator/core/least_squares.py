@@ -75,8 +75,7 @@ def step(normal: Floats, out: Floats) -> float:
     if not cholesky(normal[:count, :count]):
         return np.nan
     # N dp = g
-    for i in range(count):
-        out[i] = normal[count, i]
+    out[:] = normal[count, :count]
     cholesky_solve(normal, out)
     # g^T dp
     fall = 0.0

@@ -51,9 +51,16 @@ def norm(u: Vector) -> float:
 
 
 @jit
+def squared_chord(u: Vector, v: Vector) -> float:
+    """Return the squared length of u - v."""
+    difference = (u[0] - v[0], u[1] - v[1], u[2] - v[2])
+    return dot(difference, difference)
+
+
+@jit
 def chord(u: Vector, v: Vector) -> float:
     """Return the chord |u - v| of two unit vectors: 2 sin(angle / 2), never larger than the angle."""
-    return norm((u[0] - v[0], u[1] - v[1], u[2] - v[2]))
+    return sqrt(squared_chord(u, v))
 
 
 @jit
@@ -68,10 +75,9 @@ def pair_frame(u: Vector, v: Vector, out: Floats) -> None:
     bisector = _unit((u[0] + v[0], u[1] + v[1], u[2] + v[2]))
     normal = _unit(cross(u, v))
     third = cross(bisector, normal)
-    for k in range(3):
-        out[k, 0] = bisector[k]
-        out[k, 1] = normal[k]
-        out[k, 2] = third[k]
+    out[:, 0] = bisector
+    out[:, 1] = normal
+    out[:, 2] = third
 
 
 @jit
@@ -109,10 +115,9 @@ def rotate_in_place(w: Floats, matrix: Floats) -> None:
     part = dot(first, (x, y, z))
     second = _unit((x - part * first[0], y - part * first[1], z - part * first[2]))
     third = cross(first, second)
-    for c in range(3):
-        matrix[0, c] = first[c]
-        matrix[1, c] = second[c]
-        matrix[2, c] = third[c]
+    matrix[0] = first
+    matrix[1] = second
+    matrix[2] = third
 
 
 @jit
@@ -123,7 +128,7 @@ def quaternion_xyzw(R: Floats) -> Floats:
     a small number; the result is normalized.
     """
     # Largest diagonal element, against the trace
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    trace = np.trace(R)
     q = np.empty(4)
     i = 0 if R[0, 0] >= R[1, 1] else 1
     i = i if R[i, i] >= R[2, 2] else 2
@@ -139,4 +144,4 @@ def quaternion_xyzw(R: Floats) -> Floats:
         q[j] = R[j, i] + R[i, j]
         q[k] = R[k, i] + R[i, k]
         q[3] = R[k, j] - R[j, k]
-    return q / sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    return q / sqrt(np.sum(q**2))

@@ -49,7 +49,7 @@ FLOAT_STEPS = 65535  # quantization steps assumed over the range of an image of 
 FILTERED_NOISE = 0.375
 
 
-def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
+def estimate_background(image: NDArray) -> Background:
     """Estimate the sigma-clipped mean and standard deviation of the 3x3-filtered image, tile by tile.
 
     The noise is measured on the filtered image itself, so correlated noise (JPEG, demosaicing) is included. Its least
@@ -58,7 +58,7 @@ def estimate_background(image: NDArray, tile_px: int = TILE_PX) -> Background:
     simulated frame without noise a threshold below that would join stars by the wings of their images and by readout
     smear.
     """
-    tile_px = min(tile_px, *image.shape)
+    tile_px = min(TILE_PX, *image.shape)
     sum_type = accumulator_type(image.dtype)
     # float32 represents 16 times a 16-bit pixel exactly.
     sample_type = np.float64 if sum_type == np.float64 else np.float32

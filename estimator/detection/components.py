@@ -202,9 +202,7 @@ def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
         runs[count - 1, 2] = x
         return count
     if count < len(runs):
-        runs[count, 0] = y
-        runs[count, 1] = x
-        runs[count, 2] = x
+        runs[count] = y, x, x
     return count + 1
 
 
@@ -331,14 +329,11 @@ def accumulate_blobs(
     sums[:, TOP] = -np.inf
     for n in range(len(runs)):
         y, x0, x1 = runs[n]
-        box = boxes[blob[n]]
         total = sums[blob[n]]
-        box[0], box[1] = min(box[0], x0), min(box[1], y)
-        box[2], box[3] = max(box[2], x1), max(box[3], y)
         for x in range(x0, x1 + 1):
             sky = interpolate(level, height, width, y, x)
             smooth = filtered(image, y, x)
-            _add(image, sky, y, x, total)
+            _add(image, sky, y, x, boxes[blob[n]], total)
             if smooth - sky > total[TOP]:
                 total[TOP] = smooth - sky
                 total[TOP_X] = x
@@ -386,8 +381,12 @@ def brightest_blobs(
 
 
 @jit
-def _add(image: NDArray, sky: float, y: int, x: int, total: Floats) -> None:
-    """Add a pixel to the sums of a blob."""
+def _add(
+    image: NDArray, sky: float, y: int, x: int, box: Ints | Ints32, total: Floats
+) -> None:
+    """Add a pixel to the box and to the sums of a blob."""
+    box[0], box[1] = min(box[0], x), min(box[1], y)
+    box[2], box[3] = max(box[2], x), max(box[3], y)
     light = image[y, x] - sky
     total[AREA] += 1
     total[FLUX] += light
@@ -425,24 +424,18 @@ def flood_fill(
         (M, 2) buffer: the object ends at M pixels
     """
     height, width = image.shape
-    box[0] = x
-    box[1] = y
-    box[2] = x
-    box[3] = y
+    box[:] = x, y, x, y
     total[:] = 0.0
     total[PEAK] = -np.inf
     # The stack holds the pixels of the object: those that are summed, then those that are not yet.
-    stack[0, 0] = y
-    stack[0, 1] = x
+    stack[0] = y, x
     assigned[y, x] = 1
     count = 1
     summed = 0
     while summed < count:
         v, u = stack[summed]
         summed += 1
-        _add(image, interpolate(level, height, width, v, u), v, u, total)
-        box[0], box[1] = min(box[0], u), min(box[1], v)
-        box[2], box[3] = max(box[2], u), max(box[3], v)
+        _add(image, interpolate(level, height, width, v, u), v, u, box, total)
         # Its eight neighbors, inside the image
         for b in range(max(v - 1, 0), min(v + 2, height)):
             for a in range(max(u - 1, 0), min(u + 2, width)):
@@ -451,6 +444,5 @@ def flood_fill(
                 value = filtered(image, b, a) if smooth else float(image[b, a])
                 if value > interpolate(threshold, height, width, b, a):
                     assigned[b, a] = 1
-                    stack[count, 0] = b
-                    stack[count, 1] = a
+                    stack[count] = b, a
                     count += 1

@@ -280,11 +280,7 @@ def prepare_image(
 
 def check_image(image: NDArray) -> None:
     """Raise ImageError unless the image is a finite, non-constant (H, W) array of real numbers."""
-    check_pixel_type(image)
-    if image.ndim != 2:
-        raise ImageError(
-            f"an image of shape {image.shape}; allowed: monochrome, (height, width)"
-        )
+    check_monochrome(image)
     check_size(image)
     # A sample of the pixels is quicker than all of them.
     some = image[::97, ::89]
@@ -307,6 +303,15 @@ def check_pixel_type(image: object) -> None:
     if image.dtype.kind not in "buif":
         raise ImageError(
             f"pixels of type {image.dtype} are not real numbers; allowed: integers and floats"
+        )
+
+
+def check_monochrome(image: NDArray) -> None:
+    """Raise ImageError unless the image is an (H, W) array of real numbers."""
+    check_pixel_type(image)
+    if image.ndim != 2:
+        raise ImageError(
+            f"an image of shape {image.shape}; allowed: monochrome, (height, width)"
         )
 
 

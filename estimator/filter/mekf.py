@@ -365,7 +365,10 @@ class AttitudeFilter:
                 return update
             # Solutions used later than t_s were judged by a lost filter: only their gyro samples are kept.
             later = [segment.samples for segment in self._segments[k + 1 :]]
-            self._adopt(prior, solution, update.agreeing, np.concatenate([after, *later]))
+            # The new history begins with the state that the solution gives.
+            variance = self._initial_bias_variance
+            state = adopt(prior, solution, self._layout, variance, update.agreeing)
+            self._segments = [_Segment(state, np.concatenate([after, *later]), None)]
         # 5. Propagate to the present.
         self._refused = []
         last = self._segments[-1]
@@ -416,13 +419,6 @@ class AttitudeFilter:
         if agreeing >= CONFIRMATIONS:
             status = RESET if odds >= ENOUGH else DISPUTED
         return Update(status, update.residual_rad, update.distance, agreeing, odds)
-
-    def _adopt(
-        self, prior: MekfState, solution: AttitudeFix, agreeing: int, samples: Floats
-    ) -> None:
-        """Begin a new history with the state that a solution gives, and the gyro samples after it."""
-        state = adopt(prior, solution, self._layout, self._initial_bias_variance, agreeing)
-        self._segments = [_Segment(state, samples, None)]
 
     def _agrees(self, prior: MekfState, solution: AttitudeFix) -> bool:
         """Return whether a refused solution agrees with the one before it, propagated by the gyro alone.

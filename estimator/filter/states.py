@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
+from estimator.core.vectors import dot, norm, rotate
 from estimator.filter.error_models import GyroModel, TrackerModel
 
 # Compiled propagation by gyro samples.
@@ -100,10 +101,7 @@ def remove_errors(
     angle: Floats, effective_s: float, values: Floats, inverse: Floats, out: Floats
 ) -> None:
     """Fill `out` (3,) with the rotation A (a - T b) of a measured angle a, with the effective time T and the bias b."""
-    for i in range(3):
-        out[i] = 0.0
-        for j in range(3):
-            out[i] += inverse[i, j] * (angle[j] - effective_s * values[3 + j])
+    out[:] = rotate(inverse, angle - effective_s * values[3:6])
 
 
 @jit
@@ -114,9 +112,7 @@ def unknown_rad(sample: Floats, outage_rad: float) -> float:
     """
     if sample[4] == MISSING:
         return outage_rad
-    return (
-        max(abs(sample[1]), abs(sample[2]), abs(sample[3])) if sample[4] == SATURATED else 0.0
-    )
+    return np.abs(sample[1:4]).max() if sample[4] == SATURATED else 0.0
 
 
 @jit
@@ -180,13 +176,11 @@ def fill_rows(
     columns
         (9,) state number of each element of M, row by row; -1 for no state
     """
+    rows[:, :3] = exponential[:, :3]
     for i in range(3):
         for j in range(3):
-            rows[i, j] = exponential[i, j]
             # -(J A)_ij
-            total = 0.0
-            for k in range(3):
-                total += exponential[i, 3 + k] * inverse[k, j]
+            total = dot(exponential[i, 3:], inverse[:, j])
             rows[i, 3 + j] = effective_s * total
             for k in range(3):
                 if columns[3 * j + k] >= 0:
@@ -228,7 +222,7 @@ def transition(p: Floats, effective_s: float, out: Floats) -> None:
     exp(-[p]) = I - (sin p / p) [p] + ((1 - cos p) / p^2) [p]^2 (Rodrigues), and
     J(p) = I - ((1 - cos p) / p^2) [p] + ((p - sin p) / p^3) [p]^2.
     """
-    square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    square = dot(p, p)
     # Below 1e-6 a series, whose error in `out` is below 1e-16: the quotients would lose digits.
     if square < 1e-6:
         sine = 1 - square / 6
@@ -256,21 +250,21 @@ def rotate_quaternion(ref_from_body_wxyz: Floats, rotation_rad: Floats) -> None:
     q = ref_from_body_wxyz
     # Quaternion (w, x, y, z) of the rotation vector: (cos(p / 2), sin(p / 2) p / |p|)
     x, y, z = rotation_rad
-    half = math.sqrt(x * x + y * y + z * z) / 2
+    half = norm(rotation_rad) / 2
     scale = math.sin(half) / (2 * half) if half > 1e-9 else 0.5
     w = math.cos(half)
     x = scale * x
     y = scale * y
     z = scale * z
     a, b, c, d = q
-    q[0] = a * w - b * x - c * y - d * z
-    q[1] = a * x + b * w + c * z - d * y
-    q[2] = a * y - b * z + c * w + d * x
-    q[3] = a * z + b * y - c * x + d * w
+    q[:] = (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
     # Rounding would otherwise accumulate in the norm.
-    norm = math.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    for i in range(4):
-        q[i] /= norm
+    q /= math.sqrt(np.sum(q**2))
 
 
 # CONSIDERED are the states whose uncertainty counts but whose value is not estimated (Schmidt's filter), unless

@@ -136,6 +136,30 @@ def angle(u: Floats, v: Floats) -> float:
 
 
 @jit
+def triangle_sides_rad(rays: Floats, corners: NDArray) -> tuple[float, float, float]:
+    """Sides of the triangle of three rows i, j, k: the angles ij, ik and jk."""
+    i, j, k = corners
+    return angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])
+
+
+@jit
+def smart_triangles(base: int) -> NDArray[np.int64]:
+    """(T, 3) triangles of the first `base` stars in the smart order of Mortari, Samaan & Junkins 2001.
+
+    They are (i, i + dj, i + dj + dk) with i running fastest: successive triangles share few stars, so that one false
+    star costs little.
+    """
+    out = np.empty((max(base * (base - 1) * (base - 2) // 6, 0), 3), np.int64)
+    count = 0
+    for dj in range(1, base - 1):
+        for dk in range(1, base - dj):
+            for i in range(base - dj - dk):
+                out[count] = i, i + dj, i + dj + dk
+                count += 1
+    return out
+
+
+@jit
 def triple(u: Floats, v: Floats, w: Floats) -> float:
     """Triple product u . (v x w); its sign is the handedness of a triangle of directions."""
     return vectors.dot(u, vectors.cross(v, w))
@@ -193,10 +217,7 @@ def match_nearest(
         side, cell_first, cell_row = index.cells
         best, _ = nearest(index.vectors, cell_first, cell_row, side, x, y, z, chord)
         # A catalog star that is used already cannot match again.
-        is_used = False
-        for m in range(count):
-            is_used = is_used or star[m] == best
-        if best >= 0 and not is_used:
+        if best >= 0 and not (star[:count] == best).any():
             observed[count] = n
             star[count] = best
             count += 1
@@ -225,9 +246,7 @@ def log10_chance(groups: NDArray, count: int, p: float) -> float:
     further = 0
     for n in range(len(groups)):
         # Number of earlier matches of the same group.
-        earlier = 0
-        for m in range(n):
-            earlier += groups[m] == groups[n]
+        earlier = np.sum(groups[:n] == groups[n])
         independent += earlier == 0
         second += earlier == 1
         further += earlier > 1

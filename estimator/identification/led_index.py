@@ -17,7 +17,7 @@ from estimator.catalog.sky_index import cell_of
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
-from estimator.core.vectors import Vector
+from estimator.core.vectors import Vector, row, squared_chord
 
 # Fraction of the field in which an unmatched LED counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.95
@@ -109,7 +109,7 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     ImageError
         If there are no pairs.
     """
-    radius = np.linalg.norm(leds.position_m, axis=1)
+    radius = leds.radius_m
     median_m = float(np.median(radius))
     lever_m = float(np.linalg.norm(lever.camera_body_m))
     # The greatest angle between two LEDs in one field.
@@ -132,7 +132,7 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
         np.ascontiguousarray(leds.position_m, dtype=float),
         radius,
         median_m,
-        lever.cam_from_body.apply(lever.camera_body_m),
+        lever.pupil_cam_m,
         float(scaling_error),
         inner,
         float(4 * half_size[0] * half_size[1]),
@@ -245,9 +245,6 @@ def has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
         if left > right:
             continue
         for place in range(grid.first[left], grid.first[right + 1]):
-            dx = grid.direction[place, 0] - direction[0]
-            dy = grid.direction[place, 1] - direction[1]
-            dz = grid.direction[place, 2] - direction[2]
-            if dx * dx + dy * dy + dz * dz < gate * gate:
+            if squared_chord(row(grid.direction, place), direction) < gate * gate:
                 return True
     return False

@@ -204,8 +204,7 @@ def _alike(
             # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
             if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
                 if found < len(pairs):
-                    pairs[found, 0] = a
-                    pairs[found, 1] = b
+                    pairs[found] = a, b
                 found += 1
     return found
 
@@ -234,9 +233,8 @@ def _attitudes(
 
 def _frames(u: Floats, v: Floats) -> Floats:
     """(M, 3, 3) axes of pairs of unit vectors, in rows: the bisector b, n x b, and the normal n to both vectors."""
-    middle = u + v
+    middle = normalized(u + v)
     normal = np.cross(u, v)
-    middle = normalized(middle)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     return np.stack([middle, np.cross(normal, middle), normal], axis=1)
 

@@ -56,6 +56,7 @@ from estimator.identification.led_evidence import (
 )
 from estimator.identification.led_index import DomeIndex, has_led_near
 from estimator.identification.refusals import AMBIGUOUS, NO_MATCH
+from estimator.identification.star_detections import ray
 
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
@@ -180,8 +181,7 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
                 continue
             begin, end, _ = _pair_range(detections, dome, a, b)
             # The cost: number of LED pairs, or one beyond all of these for a short pair.
-            pair[count, 0] = a
-            pair[count, 1] = b
+            pair[count] = a, b
             cost[count] = end - begin if length >= min_length else 1e9 - length
             count += 1
     return pair[:count][np.argsort(cost[:count])]
@@ -245,13 +245,9 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
         penalty = 0
         for end in range(2):
             # Each end costs 3 if it is not matched, and 1 if it is shared.
-            is_matched = False
-            for n in best.observed:
-                is_matched = is_matched or n == pairs[other, end]
-            penalty += 3 * (not is_matched)
-            penalty += (
-                pairs[other, end] == pairs[rank, 0] or pairs[other, end] == pairs[rank, 1]
-            )
+            light = pairs[other, end]
+            penalty += 3 * (not (best.observed == light).any())
+            penalty += light == pairs[rank, 0] or light == pairs[rank, 1]
         if penalty < cost:
             best_rank = other
             cost = penalty
@@ -392,10 +388,7 @@ def _ray(detections: LedDetections, n: int, focal_ratio: float) -> Vector:
     """Unit ray of detection n in camera axes, if the focal length is `focal_ratio` times the assumed one."""
     if focal_ratio == 1:
         return vectors.row(detections.ray, n)
-    x = detections.tangent[n, 0] / focal_ratio
-    y = detections.tangent[n, 1] / focal_ratio
-    inverse = 1 / sqrt(x * x + y * y + 1)
-    return x * inverse, y * inverse, inverse
+    return ray(detections.tangent, n, focal_ratio)
 
 
 @jit
@@ -560,17 +553,10 @@ def _quick_check(
                 _ray(detections, n, focal_ratio), dome, radius_m
             )
         else:
-            x = (
-                detections.direction[n, 0]
-                + radius_offset_m * detections.direction_per_m[n, 0]
-            )
-            y = (
-                detections.direction[n, 1]
-                + radius_offset_m * detections.direction_per_m[n, 1]
-            )
-            z = (
-                detections.direction[n, 2]
-                + radius_offset_m * detections.direction_per_m[n, 2]
-            )
+            u = vectors.row(detections.direction, n)
+            slope = vectors.row(detections.direction_per_m, n)
+            x = u[0] + radius_offset_m * slope[0]
+            y = u[1] + radius_offset_m * slope[1]
+            z = u[2] + radius_offset_m * slope[2]
         count += has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
     return count

@@ -223,9 +223,7 @@ def detections_of(
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
         # The inverse of [xx xy; xy yy] is [yy -xy; -xy xx] / (xx yy - xy^2).
         scale = focal_px**2 / (xx * yy - xy * xy)
-        weight[n, 0] = yy * scale
-        weight[n, 1] = xx * scale
-        weight[n, 2] = -xy * scale
+        weight[n] = yy * scale, xx * scale, -xy * scale
         mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
     tangent = undistorted(
         lights.xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
@@ -288,16 +286,7 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
         cell = row * CELLS + column
         rank[n] = used[cell]
         used[cell] += 1
-    keep = np.zeros(len(places), np.bool_)
-    taken = 0
-    level = 0
-    while taken < count:
-        for n in range(len(places)):
-            if rank[n] == level and taken < count:
-                keep[n] = True
-                taken += 1
-        level += 1
-    return np.flatnonzero(keep)
+    return np.sort(np.argsort(rank, kind="mergesort")[:count])
 
 
 @jit
@@ -318,10 +307,7 @@ def chosen(detections: Detections, rows: NDArray) -> Detections:
 @jit
 def gates_of(detections: Detections, factor: float) -> Floats:
     """(N,) matching radii in tangents: `factor` times GATE_SIGMA standard deviations."""
-    gates = np.empty(len(detections.sigma))
-    for n in range(len(gates)):
-        gates[n] = factor * GATE_SIGMA * detections.sigma[n]
-    return gates
+    return factor * GATE_SIGMA * detections.sigma
 
 
 @jit
@@ -370,6 +356,5 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
 @jit
 def field_area(detections: Detections) -> float:
     """Area of the sensor, tangents squared."""
-    return (detections.field[1] - detections.field[0]) * (
-        detections.field[3] - detections.field[2]
-    )
+    left, right, top, bottom = detections.field
+    return (right - left) * (bottom - top)

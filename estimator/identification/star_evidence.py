@@ -369,14 +369,8 @@ def slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
         d t_x = f (-x y,      1 + x^2,  -y,  x)
         d t_y = f (-1 - y^2,  x y,       x,  y)
     """
-    d_x[0] = -f * x * y
-    d_x[1] = f * (1 + x * x)
-    d_x[2] = -f * y
-    d_x[3] = f * x
-    d_y[0] = -f * (1 + y * y)
-    d_y[1] = f * x * y
-    d_y[2] = f * x
-    d_y[3] = f * y
+    d_x[:] = -f * x * y, f * (1 + x * x), -f * y, f * x
+    d_y[:] = -f * (1 + y * y), f * x * y, f * x, f * y
 
 
 @jit
@@ -534,9 +528,7 @@ def _ways_dex(lights: int, matched: int) -> float:
 @jit
 def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
     """Fraction of the stars that are at least as bright as the faintest detection; 1 if magnitudes are unknown."""
-    faintest = mag[0]
-    for value in mag:
-        faintest = max(faintest, value)
+    faintest = mag.max()
     if not np.isfinite(faintest):
         return 1.0
     return max(first_from(sky.mag, 0, len(sky.mag), faintest + MAG_SMOOTHING), 1) / len(
@@ -587,8 +579,7 @@ def build_solution(
         unit = np.zeros(count)
         unit[axis] = 1.0
         column = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)
-        for k in range(3):
-            covariance[axis, k] = column[k]
+        covariance[axis] = column[:3]
     # Residuals: weighted by the inverse covariances for chi-square, and plain for the rms.
     for k in range(len(hypothesis.star)):
         observed = hypothesis.observed[k]

@@ -83,10 +83,7 @@ def _search(
         for c in range(2, d):
             for b in range(1, c):
                 for a in range(b):
-                    quad[0] = a
-                    quad[1] = b
-                    quad[2] = c
-                    quad[3] = d
+                    quad[:] = a, b, c, d
                     candidate = _test_quad(detections, quads, sky, quad, checks)
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
@@ -116,20 +113,15 @@ def _test_quad(
     """
     # 2. The code: C and D in the axes of A and B.
     _longest_first(detections.tangent, quad)
-    a = quad[0]
-    b = quad[1]
+    a, b = quad[0], quad[1]
     ray_a = ray(detections.tangent, a, 1.0)
     ray_b = ray(detections.tangent, b, 1.0)
     length = vectors.chord(ray_a, ray_b)
     code = np.empty(4)
     frame = np.empty((3, 3))
     vectors.pair_frame(ray_a, ray_b, frame)
-    code[0], code[1] = quad_index.in_frame(
-        frame, ray(detections.tangent, quad[2], 1.0), length
-    )
-    code[2], code[3] = quad_index.in_frame(
-        frame, ray(detections.tangent, quad[3], 1.0), length
-    )
+    code[:2] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
+    code[2:] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
     quad_index.arrange(code, quad)
     a, b = quad[0], quad[1]
     # 3. All cells within the gate of the code.

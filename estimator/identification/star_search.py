@@ -178,12 +178,9 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
     The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
     """
-    trace = 0.0
     # trace(R1^T R2) = sum of the products of the elements.
-    for i in range(3):
-        for j in range(3):
-            trace += first.R_cam_from_ref[i, j] * second.R_cam_from_ref[i, j]
-    return second.dex > -np.inf and trace > 2.99
+    trace = np.sum(first.R_cam_from_ref * second.R_cam_from_ref)
+    return bool(second.dex > -np.inf and trace > 2.99)
 
 
 @jit
@@ -217,11 +214,8 @@ def _pair_costs(detections: Detections) -> tuple[Floats, NDArray]:
                 crowd[b] += 1
                 length = 1e3 * min_length * min_length / max(length, 1e-9)
             cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
-    for a in range(total):
-        for b in range(a + 1, total):
-            cost[a, b] *= crowd[a] * crowd[b]
             cost[b, a] = cost[a, b]
-    return cost, np.argsort((np.arange(total) + 1) * crowd)
+    return cost * np.outer(crowd, crowd), np.argsort((np.arange(total) + 1) * crowd)
 
 
 class Links(NamedTuple):
@@ -269,8 +263,7 @@ def _no_links(stars: int) -> Links:
 @jit
 def _clear(links: Links) -> None:
     """Remove all entries."""
-    for n in range(links.total[0]):
-        links.last[links.hub[n]] = 0
+    links.last[links.hub[: links.total[0]]] = 0
     links.total[0] = 0
 
 
@@ -396,8 +389,7 @@ def _close(
                 if wanted[q, 2] * vectors.dot(vectors.row(star, i), normal) < 0:
                     continue
                 if found < len(closed):
-                    closed[found, 0] = i
-                    closed[found, 1] = k
+                    closed[found] = i, k
                     found += 1
             if count < len(hub_star):
                 hub_star[count] = i

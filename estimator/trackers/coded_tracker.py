@@ -112,7 +112,7 @@ class CodedTracker(DomeTracker):
         self.code = code
         self.decoder = decoder or DecoderSettings()
         radius_m = leds.radius_m
-        pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
+        pupil_m = lever.pupil_cam_m
         position_m = np.asarray(leds.position_m, dtype=float)
         self.sphere = led_naming.Sphere(
             position_m, radius_m, position_m / radius_m[:, None], pupil_m

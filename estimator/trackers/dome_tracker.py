@@ -106,7 +106,7 @@ def star_identifier(
     """
     radius = leds.radius_m
     median_radius_m = float(np.median(radius))
-    pupil_m = lever.cam_from_body.apply(lever.camera_body_m)
+    pupil_m = lever.pupil_cam_m
     corners = camera.rays(camera.corners_px)
     points = on_sphere(corners, pupil_m, median_radius_m) / median_radius_m
     field_tan, _ = inner_field(points)
@@ -151,8 +151,7 @@ def assumed_directions(
     lab_from_cam = lab_from_body * lever.cam_from_body.inv()
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
-    points_m = normalized(points_m)
-    return lab_from_cam.inv().apply(points_m)
+    return lab_from_cam.inv().apply(normalized(points_m))
 
 
 # Each entry maps (camera, leds, lever, settings) to a function that identifies (N, 3) rays with (N,) errors and, if the
@@ -226,7 +225,7 @@ class DomeTracker(FrameTracker):
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
             body_from_lab = self.lever.cam_from_body.inv() * cam_from_lab
             xy_px = project(body_from_lab, position_m, self.lever, self.camera)
-            fields.append(xy_px[self.camera.contains(np.nan_to_num(xy_px, nan=-1e9), 2.0)])
+            fields.append(xy_px[self.camera.contains(xy_px, 2.0)])
         xy_px = max(fields, key=len)
         warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
         self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
@@ -250,7 +249,7 @@ class DomeTracker(FrameTracker):
         clock = clock or Clock()
         if len(centroids) < MIN_EVIDENCE_MATCHES:
             return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
-        lever_cam_m = self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        lever_cam_m = self.lever.pupil_cam_m
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
         return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
@@ -432,7 +431,7 @@ class DomeTracker(FrameTracker):
         own_rad2 = systematic.isotropic(led_rad)
         if self.leds.covariance_m2 is not None:
             by_place = view.gradient @ cam_from_lab.as_matrix()
-            own_rad2 = by_place @ self.leds.covariance_m2[star] @ np.moveaxis(by_place, 1, 2)
+            own_rad2 = by_place @ self.leds.covariance_m2[star] @ by_place.mT
         # The rest of each ray's variance is noise of the frame.
         variance_rad2 = np.maximum(sigma_rad**2 - led_rad**2 - focal_rad**2, 0)
         noise_rad2 = systematic.isotropic(np.sqrt(variance_rad2))
@@ -448,7 +447,7 @@ class DomeTracker(FrameTracker):
         common errors, of which those of a survey by the camera contain lever and lens.
         """
         place_cam = cam_from_lab.apply(self.leds.position_m[star])
-        ray_cam = place_cam - self.lever.cam_from_body.apply(self.lever.camera_body_m)
+        ray_cam = place_cam - self.lever.pupil_cam_m
         view = systematic.geometry(place_cam, ray_cam)
         common_rad = self.camera.focal_sigma * view.tangent[None][int(self.focal_fitted) :]
         if self.leds.common_m is not None:
@@ -562,5 +561,5 @@ class DomeTracker(FrameTracker):
         """Return mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
         xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
         # An LED whose center is just off the chip may still have light on it.
-        inside = np.flatnonzero(self.camera.contains(np.nan_to_num(xy, nan=-1e9), -30.0))
+        inside = np.flatnonzero(self.camera.contains(xy, -30.0))
         return mutual_nearest(centroids.xy_px, xy[inside], radius_px, inside)

@@ -181,9 +181,7 @@ def _measure(
         total += row
     overexposed = 0
     for n in range(len(box_px)):
-        saturated = 0
-        for y in range(box_px[n, 1], box_px[n, 3] + 1):
-            for x in range(box_px[n, 0], box_px[n, 2] + 1):
-                saturated += image[y, x] >= saturation_dn
-        overexposed += saturated > allowed
+        x0, y0, x1, y1 = box_px[n]
+        saturated = image[y0 : y1 + 1, x0 : x1 + 1] >= saturation_dn
+        overexposed += int(np.count_nonzero(saturated)) > allowed
     return total / image.size, overexposed

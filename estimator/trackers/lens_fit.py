@@ -243,7 +243,7 @@ class Sights:
         pairs = np.array(self.match(lens.camera, lens.cam_from_ref, reach_px))
         observed, star = pairs
         seen_px, slopes = lens.project(self.vectors_ref[star])
-        spread = slopes @ lens.covariance @ slopes.swapaxes(1, 2)
+        spread = slopes @ lens.covariance @ slopes.mT
         gate_px = GATE_SIGMA * np.sqrt(np.trace(spread, axis1=1, axis2=2))
         least = np.linalg.norm(self.whiten[observed], ord=-2, axis=(1, 2))
         own_px = np.maximum(GATE_SIGMA * np.sqrt(lens.variance) / least, LEAST_GATE_PX)

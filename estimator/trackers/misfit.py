@@ -114,8 +114,7 @@ def count_near(
     R_ref_from_cam = R_cam_from_ref.T.copy()
     count = 0
     matched = np.zeros(len(gates), np.bool_)
-    for n in observed:
-        matched[n] = True
+    matched[observed] = True
     for n in range(len(gates)):
         if matched[n]:
             continue
@@ -192,8 +191,7 @@ def identify(
     # A few stars may fit by luck within gates that are too narrow for the others.
     if len(solution.star) == len(detections.sigma) and solution.chi2 < DOUBTFUL:
         return solution, 1.0
-    x, y, z, w = solution.cam_from_ref_xyzw
-    return widened(solution, matrix_of((x, y, z, w)), detections, stars)
+    return widened(solution, matrix_of(solution.cam_from_ref_xyzw), detections, stars)
 
 
 @jit
@@ -260,8 +258,7 @@ def with_floor(
         Detections with the errors of the search, whose floor is searched_px
     """
     # 1. Rows
-    x, y, z, w = solution.cam_from_ref_xyzw
-    R = matrix_of((x, y, z, w))
+    R = matrix_of(solution.cam_from_ref_xyzw)
     size = 4 if detections.focal_uncertainty > 0 else 3
     count = 2 * len(solution.star)
     rows = np.empty((size + 1, count))
@@ -419,7 +416,7 @@ def prediction_by_others(
         (K, 2) residuals r, (K, 2, 3) Jacobians J and (K, 2, 2) inverse covariances W, for the
         attitude that fits all stars
     """
-    weighted = np.swapaxes(jacobian, 1, 2) @ information
+    weighted = jacobian.mT @ information
     each = weighted @ jacobian
     others = each.sum(axis=0) - each
     # N - J^T W J, inverted with a unit diagonal and a small term against singular matrices
@@ -428,7 +425,7 @@ def prediction_by_others(
     covariance = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
     moved = (covariance @ weighted @ residual[:, :, None])[:, :, 0]
     alone = residual + np.einsum("kij,kj->ki", jacobian, moved)
-    return alone, jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return alone, jacobian @ covariance @ jacobian.mT
 
 
 def mean_information(information: Floats, residual: Floats, spread: Floats) -> Floats:

@@ -47,9 +47,6 @@ SATURATED = "the frame is saturated"
 # Extra centroid error of a saturated blob, whose plateau has edges at whole pixels. Monte Carlo: 0.01 to 0.07 px, more
 # with deeper saturation.
 SATURATED_SIGMA_PX = 0.05
-LONG_STREAK_PX = (
-    3.0  # median length above which streaks are fitted with the rate of the frame
-)
 MAX_CENTROID_SIGMA_PX = 5.0  # less accurate centroids are dropped: they could match any star
 # Extra error of a centroid on an interpolated bad pixel, from Monte Carlo.
 BAD_PIXEL_SIGMA_PX = 0.06

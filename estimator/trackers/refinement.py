@@ -166,7 +166,7 @@ class FieldMatcher:
     ) -> tuple[lens_fit.Sights, lens_fit.FittedCamera, NDArray]:
         """Return centroids and a solution as input of the fit of the camera; parameters as of `with_lens`."""
         information = information_of(weight) / self.camera.focal_px**2
-        whiten = np.asarray(np.linalg.cholesky(information), dtype=float).swapaxes(1, 2)
+        whiten = np.asarray(np.linalg.cholesky(information), dtype=float).mT
         change = np.zeros(lens_fit.UNKNOWNS)
         change[lens_fit.FOCAL] = np.log(solution.focal_ratio)
         cam_from_ref = Rotation.from_quat(solution.cam_from_ref_xyzw)

@@ -30,6 +30,7 @@ from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of
@@ -439,9 +440,12 @@ class StarTracker(FrameTracker):
         """
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
-        observed, star = checks.row_pairs(
-            ("observed", observed, len(centroids)), ("star", star, len(self.stars))
-        )
+        observed = checks.row_numbers("observed", observed, len(centroids))
+        star = checks.row_numbers("star", star, len(self.stars))
+        if len(observed) != len(star):
+            raise ImageError(
+                f"{len(observed)} of observed, {len(star)} of star; allowed: equal numbers of both"
+            )
         xy_px = centroids.xy_px[observed]
         vectors = self.stars.vectors[star]
         sigma_px = self.sigma_px(centroids)
@@ -602,7 +606,7 @@ class StarTracker(FrameTracker):
                 return solution, variance
             # The larger errors have found the attitude; the residuals tell the errors.
             claimed = self.detections(centroids, self.sigma_px(centroids))
-            R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+            R_cam_from_ref = matrix_of(solution.cam_from_ref_xyzw)
             found = star_evidence.evaluate(
                 claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
             )
@@ -657,7 +661,7 @@ class StarTracker(FrameTracker):
             if whole and solution.chi2 < misfit.DOUBTFUL and known:
                 return Refit(solution, camera, 1.0, detections=detections)
             if known and not self.camera.row_time_s:
-                R_cam_from_ref = matrix_of(tuple(solution.cam_from_ref_xyzw.tolist()))
+                R_cam_from_ref = matrix_of(solution.cam_from_ref_xyzw)
                 solution, variance = misfit.widened(
                     solution, R_cam_from_ref, detections, self.sky
                 )

@@ -29,6 +29,7 @@ lattice of LEDs, use `saa`.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -40,13 +41,16 @@ from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
+from estimator.core.vectors import Vector, row, squared_chord
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
     DirectMatch,
     angle,
     match_field,
     no_match,
+    smart_triangles,
     to_star_match,
+    triangle_sides_rad,
     triple,
 )
 from estimator.identification.solver_options import Options
@@ -91,7 +95,7 @@ class FialhoOptions(NamedTuple):
         Fraction of the observed stars that must match
     optimized
         Whether the lists are assembled from neighbors
-    x, y, z, chord2
+    boresight, chord2
         Prior boresight, a unit vector in the catalog's frame, and the greatest squared chord of a candidate from it
     accept
         log10 of the chance at which a match is accepted; infinite for the paper's rule, the fraction alone
@@ -105,9 +109,7 @@ class FialhoOptions(NamedTuple):
     base: int
     min_fraction: float
     optimized: bool
-    x: float
-    y: float
-    z: float
+    boresight: Vector
     chord2: float
     accept: float = ACCEPT_LOG10_CHANCE
 
@@ -140,12 +142,11 @@ def search_options(
             f"fialho: tolerance {tolerance_rad} rad, magnitude error {settings.epsilon_mag}; allowed: more than 0"
         )
     # No chord on the unit sphere is longer than 2: without a prior boresight every star passes.
-    x = 0.0
-    y = 0.0
-    z = 1.0
+    boresight = (0.0, 0.0, 1.0)
     chord2 = 5.0
     if settings.boresight_ref is not None:
         x, y, z = settings.boresight_ref
+        boresight = float(x), float(y), float(z)
         chord2 = 4 * np.sin(min(settings.within_rad, np.pi) / 2) ** 2
     return FialhoOptions(
         tolerance_rad,
@@ -156,41 +157,43 @@ def search_options(
         settings.base_stars,
         min_fraction,
         optimized,
-        float(x),
-        float(y),
-        float(z),
+        boresight,
         float(chord2),
         np.inf if settings.by_paper else ACCEPT_LOG10_CHANCE,
     )
 
 
-def fialho_1(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
+def _identify(
+    min_fraction: float,
+    optimized: bool,
+    retries: bool,
+    vectors_cam: Floats,
+    index: PairIndex,
+    tolerance_rad: float,
+    **options: Any,
 ) -> StarMatch | None:
-    """The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
-    settings = replace(Options(**options), boresight_ref=None)
-    return _identify(
-        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_BASIC, False, False
-    )
-
-
-def fialho_2(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
-) -> StarMatch | None:
-    """One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
-    return _identify(
-        vectors_cam, index, tolerance_rad, Options(**options), MIN_FRACTION_BASIC, True, False
-    )
-
-
-def fialho_3(
-    vectors_cam: Floats, index: PairIndex, tolerance_rad: float, **options: Any
-) -> StarMatch | None:
-    """Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
+    """Identify stars with the parameters of one version; only an optimized one has a prior boresight."""
     settings = Options(**options)
-    return _identify(
-        vectors_cam, index, tolerance_rad, settings, MIN_FRACTION_FALSE_STARS, True, True
-    )
+    if not optimized:
+        settings = replace(settings, boresight_ref=None)
+    parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
+    settings.require_known_focal("fialho")
+    count = len(vectors_cam)
+    if count < MIN_MATCHES:
+        return None
+    rays = np.ascontiguousarray(vectors_cam)
+    match = search(rays, settings.magnitudes(count), index, parameters)
+    return to_star_match(match, settings.by_paper)
+
+
+fialho_1 = partial(_identify, MIN_FRACTION_BASIC, False, False)
+"""The basic algorithm: one triangle, each list from the whole catalog, no prior boresight. See `fialho_4`."""
+
+fialho_2 = partial(_identify, MIN_FRACTION_BASIC, True, False)
+"""One triangle with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
+
+fialho_3 = partial(_identify, MIN_FRACTION_FALSE_STARS, True, True)
+"""Several triangles with optimized lists, near the prior boresight if there is one. See `fialho_4`."""
 
 
 def fialho_4(
@@ -240,26 +243,6 @@ VERSIONS: dict[str, Callable[..., StarMatch | None]] = {
 }
 
 
-def _identify(
-    vectors_cam: Floats,
-    index: PairIndex,
-    tolerance_rad: float,
-    settings: Options,
-    min_fraction: float,
-    optimized: bool,
-    retries: bool,
-) -> StarMatch | None:
-    """Identify stars with the parameters of one version."""
-    parameters = search_options(tolerance_rad, settings, min_fraction, optimized, retries)
-    settings.require_known_focal("fialho")
-    count = len(vectors_cam)
-    if count < MIN_MATCHES:
-        return None
-    rays = np.ascontiguousarray(vectors_cam)
-    match = search(rays, settings.magnitudes(count), index, parameters)
-    return to_star_match(match, settings.by_paper)
-
-
 @jit
 def search(
     rays: Floats, magnitudes: Floats, index: PairIndex, options: FialhoOptions
@@ -287,31 +270,19 @@ def search(
     match = triplets(rays, magnitudes, index, corners, options, tried)
     if len(match.observed):
         return match
-    # 5. Other triangles: (i, i + dj, i + dj + dk), i running fastest, so that one false star costs little.
+    # 5. Other triangles, in an order in which one false star costs little.
     count = 1
-    for dj in range(1, base - 1):
-        for dk in range(1, base - dj):
-            for i in range(base - dj - dk):
-                if count >= options.triangles or tried[1] >= options.checks:
-                    return no_match()
-                next_corners = np.array([i, i + dj, i + dj + dk])
-                # Not the first triangle again, and none that is too small.
-                if (next_corners == corners).all() or _shortest_side(
-                    rays, next_corners
-                ) < min_side_rad:
-                    continue
-                match = triplets(rays, magnitudes, index, next_corners, options, tried)
-                if len(match.observed):
-                    return match
-                count += 1
+    for others in smart_triangles(base):
+        if count >= options.triangles or tried[1] >= options.checks:
+            return no_match()
+        # Not the first triangle again, and none that is too small.
+        if (others == corners).all() or min(*triangle_sides_rad(rays, others)) < min_side_rad:
+            continue
+        match = triplets(rays, magnitudes, index, others, options, tried)
+        if len(match.observed):
+            return match
+        count += 1
     return no_match()
-
-
-@jit
-def _shortest_side(rays: Floats, corners: NDArray) -> float:
-    """The least angle between any two of three stars."""
-    i, j, k = corners
-    return min(angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k]))
 
 
 @jit
@@ -324,7 +295,7 @@ def _brightest(rays: Floats, base: int, min_side_rad: float) -> NDArray:
             # The first triangle in the order of brightness whose sides are long enough.
             for k in range(j + 1, base):
                 corners = np.array([i, j, k])
-                if _shortest_side(rays, corners) >= min_side_rad:
+                if min(*triangle_sides_rad(rays, corners)) >= min_side_rad:
                     return corners
     return np.full(3, -1)
 
@@ -347,10 +318,7 @@ def triplets(
     tried
         (2,) triplets tested and angles compared so far, increased in place
     """
-    i, j, k = corners
-    sides = np.array(
-        [angle(rays[i], rays[j]), angle(rays[i], rays[k]), angle(rays[j], rays[k])]
-    )
+    sides = np.array(triangle_sides_rad(rays, corners))
     # The index holds no longer pairs.
     if sides.max() > index.max_angle_rad:
         return no_match()
@@ -390,10 +358,7 @@ def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOpt
     # The comparison is False for NaN: an unknown magnitude passes.
     if abs(index.magnitude[star] - magnitude) > options.gate_mag:
         return False
-    x, y, z = index.vectors[star]
-    return (x - options.x) ** 2 + (y - options.y) ** 2 + (
-        z - options.z
-    ) ** 2 <= options.chord2
+    return squared_chord(row(index.vectors, star), options.boresight) <= options.chord2
 
 
 @jit

@@ -127,7 +127,8 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
     a = vectors_cam[row_a]
     b = vectors_cam[row_b]
     count = len(vectors_cam) - 2
-    midpoint = (a + b) / np.sqrt(np.sum((a + b) ** 2))
+    axes = triad(a, b)
+    midpoint = axes[0]
     base_rad = angle(a, b)
     reach_rad = 0.0
     others = np.empty(count, np.int64)
@@ -155,12 +156,10 @@ def build_primary(stars: SearchInput, row_a: int, row_b: int) -> Primary:
         # The rings about A and B, of the gates' widths, cross at X in a rhombus; its angle is that of A and B seen
         # from X.
         sides = max(corner[0, k] * corner[1, k], 1e-20)
-        sine = np.sqrt(np.sum(np.cross(a - x, b - x) ** 2)) / sides
+        sine = vectors.norm(np.cross(a - x, b - x)) / sides
         rhombus = 4 * gate[0, k] * gate[1, k] / max(sine, 1e-9)
         area[k] = min(np.pi * radius[k] ** 2, rhombus)
         k += 1
     rows = np.array([row_a, row_b])
     reach_rad += gate_rad(gates, 0.0)
-    return Primary(
-        rows, triad(a, b), midpoint, others, corner, gate, sigma, radius, area, reach_rad
-    )
+    return Primary(rows, axes, midpoint, others, corner, gate, sigma, radius, area, reach_rad)

@@ -25,7 +25,9 @@ from estimator.identification.direct_match import (
     angle,
     match_field,
     no_match,
+    smart_triangles,
     to_star_match,
+    triangle_sides_rad,
     triple,
 )
 from estimator.identification.solver_options import Options
@@ -105,19 +107,16 @@ def pyramid(
 
 @jit
 def _search(rays: Floats, index: PairIndex, options: PyramidOptions) -> DirectMatch:
-    """Steps 1 to 6: try triangles (i, i + dj, i + dj + dk) in the smart order; return the first significant match."""
+    """Steps 1 to 6: try triangles in the smart order; return the first significant match."""
     tried = np.zeros(3, np.int64)  # observed triangles, hypotheses, checks
-    # 1. Close rows first: i runs fastest, so that successive triangles share few stars.
-    for dj in range(1, options.base - 1):
-        for dk in range(1, options.base - dj):
-            for i in range(options.base - dj - dk):
-                corners = np.array([i, i + dj, i + dj + dk])
-                match = _triangle(rays, index, corners, options, tried)
-                if match.log10_chance < ACCEPT_LOG10_CHANCE:
-                    return match
-                tried[0] += 1
-                if tried[0] >= options.triangles or tried[2] >= options.checks:
-                    return no_match()
+    # 1. Triangles that change all three stars soon.
+    for corners in smart_triangles(options.base):
+        match = _triangle(rays, index, corners, options, tried)
+        if match.log10_chance < ACCEPT_LOG10_CHANCE:
+            return match
+        tried[0] += 1
+        if tried[0] >= options.triangles or tried[2] >= options.checks:
+            return no_match()
     return no_match()
 
 
@@ -140,9 +139,7 @@ def _triangle(
         The first significant one, or else the empty one
     """
     i, j, k = corners
-    ij = angle(rays[i], rays[j])
-    ik = angle(rays[i], rays[k])
-    jk = angle(rays[j], rays[k])
+    ij, ik, jk = triangle_sides_rad(rays, corners)
     t_ij, t_ik, t_jk = sqrt(2.0) * options.tolerance + options.stretch * np.array(
         [ij, ik, jk]
     )
@@ -264,9 +261,7 @@ def _scale_tangents(rays: Floats, factor: float) -> Floats:
         x = rays[n, 0] / z * factor
         y = rays[n, 1] / z * factor
         length = sqrt(x * x + y * y + 1)
-        out[n, 0] = x / length
-        out[n, 1] = y / length
-        out[n, 2] = 1 / length
+        out[n] = x / length, y / length, 1 / length
     return out
 
 

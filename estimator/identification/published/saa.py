@@ -180,11 +180,9 @@ def _partners(
             if misfit_a > primary.gate_rad[0, k] or misfit_b > primary.gate_rad[1, k]:
                 continue
             cost += (misfit_a**2 + misfit_b**2) / stars.gates.separation_rad**2
-            dx = stars.vectors[s, 0] - x
-            dy = stars.vectors[s, 1] - y
-            dz = stars.vectors[s, 2] - z
+            distance2 = vectors.squared_chord(vectors.row(stars.vectors, s), (x, y, z))
             # The position decides between several partners, but is not part of the assumption's cost.
-            position_cost = (dx * dx + dy * dy + dz * dz) / primary.sigma_rad[k] ** 2
+            position_cost = distance2 / primary.sigma_rad[k] ** 2
             if cost + position_cost < least:
                 least = cost + position_cost
                 partner[k] = s

@@ -28,6 +28,7 @@ from estimator.identification.direct_match import (
     fit_rotation,
     no_match,
     to_star_match,
+    triangle_sides_rad,
     triple,
 )
 from estimator.identification.solver_options import Options
@@ -194,9 +195,7 @@ def _triangle(
         (3,) rows of the observed stars
     """
     i, j, k = corners
-    ij = angle(rays[i], rays[j])
-    ik = angle(rays[i], rays[k])
-    jk = angle(rays[j], rays[k])
+    ij, ik, jk = triangle_sides_rad(rays, corners)
     # Short sides carry little information, and the index holds no longer pairs.
     if (
         min(ij, ik, jk) < MIN_SIDE_TOLERANCES * options.tolerance_rad
@@ -380,14 +379,13 @@ def _same_side(
     best = 0.0
     product = 1.0
     for m in range(3):
-        a = m
         b = (m + 1) % 3
-        volume = triple(rays[corners[a]], rays[corners[b]], rays[n])
+        volume = triple(rays[corners[m]], rays[corners[b]], rays[n])
         # The line farthest from the star decides: noise cannot move the star across it.
         if abs(volume) > best:
             best = abs(volume)
             product = volume * triple(
-                index.vectors[stars[a]], index.vectors[stars[b]], index.vectors[d]
+                index.vectors[stars[m]], index.vectors[stars[b]], index.vectors[d]
             )
     return product > 0
 
@@ -411,10 +409,9 @@ def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floa
     """
     least = np.inf
     for m in range(3):
-        a = m
         b = (m + 1) % 3
-        volume = abs(triple(rays[corners[a]], rays[corners[b]], rays[n]))
+        volume = abs(triple(rays[corners[m]], rays[corners[b]], rays[n]))
         # Sine of the angle at which the rings cross.
-        sine = max(volume / (np.sin(side[a]) * np.sin(side[b])), 1e-9)
-        least = min(least, width[a] * width[b] / sine)
+        sine = max(volume / (np.sin(side[m]) * np.sin(side[b])), 1e-9)
+        least = min(least, width[m] * width[b] / sine)
     return least

@@ -36,12 +36,14 @@ from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
+from estimator.core.vectors import dot, norm
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
     DirectMatch,
     angle,
     match_field,
     no_match,
+    smart_triangles,
     to_star_match,
     triple,
 )
@@ -134,18 +136,13 @@ spherical_triangle = partial(triangle, True)
 def search(rays: Floats, index: PairIndex, options: TriangleOptions) -> DirectMatch:
     """The compiled search: steps 1 to 5; the empty match if none is accepted."""
     tried = np.zeros(2, np.int64)  # catalog triangles, angles compared
-    count = 0
-    # 1. Triangles (i, i + dj, i + dj + dk), i running fastest, so that one false star costs little.
-    for dj in range(1, options.base - 1):
-        for dk in range(1, options.base - dj):
-            for i in range(options.base - dj - dk):
-                if count >= options.triangles or tried[1] >= options.checks:
-                    return no_match()
-                count += 1
-                corners = np.array([i, i + dj, i + dj + dk])
-                match = _catalog_triangles(rays, index, corners, options, tried)
-                if match.log10_chance <= ACCEPT_LOG10_CHANCE:
-                    return match
+    # 1. Triangles in an order in which one false star costs little.
+    for corners in smart_triangles(options.base)[: options.triangles]:
+        if tried[1] >= options.checks:
+            break
+        match = _catalog_triangles(rays, index, corners, options, tried)
+        if match.log10_chance <= ACCEPT_LOG10_CHANCE:
+            return match
     return no_match()
 
 
@@ -283,23 +280,17 @@ def _agrees(
 @jit
 def planar_features(u: Floats, v: Floats, w: Floats) -> tuple[float, float]:
     """Area and polar moment of the planar triangle of three unit vectors, with Heron's area from squared sides."""
-    a2 = 2 - 2 * _dot(v, w)
-    b2 = 2 - 2 * _dot(u, w)
-    c2 = 2 - 2 * _dot(u, v)
+    a2 = 2 - 2 * dot(v, w)
+    b2 = 2 - 2 * dot(u, w)
+    c2 = 2 - 2 * dot(u, v)
     area = sqrt(max(4 * a2 * b2 - (a2 + b2 - c2) ** 2, 0.0)) / 4
     return area, area * (a2 + b2 + c2) / 36
 
 
 @jit
-def _dot(u: Floats, v: Floats) -> float:
-    """Scalar product of two vectors."""
-    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
-
-
-@jit
 def spherical_area(u: Floats, v: Floats, w: Floats) -> float:
     """Area (the excess) of a spherical triangle, sr."""
-    cosines = _dot(u, v) + _dot(u, w) + _dot(v, w)
+    cosines = dot(u, v) + dot(u, w) + dot(v, w)
     return 2 * atan2(abs(triple(u, v, w)), 1 + cosines)
 
 
@@ -309,7 +300,7 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
 
     The small triangles' own planar moments are added (Steiner), so that few of them are enough.
     """
-    center = (u + v + w) / sqrt(np.sum((u + v + w) ** 2))
+    center = _unit(u + v + w)
     total = 0.0
     for i in range(SPLIT):
         for j in range(SPLIT - i):
@@ -318,7 +309,7 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
                 x = _node(u, v, w, i + 1, j)
                 y = _node(u, v, w, i, j + 1)
                 z = _node(u, v, w, i + upper, j + upper)
-                middle = (x + y + z) / sqrt(np.sum((x + y + z) ** 2))
+                middle = _unit(x + y + z)
                 own = planar_features(x, y, z)[1]
                 total += angle(center, middle) ** 2 * spherical_area(x, y, z) + own
     return total
@@ -328,4 +319,10 @@ def spherical_moment(u: Floats, v: Floats, w: Floats) -> float:
 def _node(u: Floats, v: Floats, w: Floats, i: int, j: int) -> Floats:
     """The direction i steps of SPLIT from u to v and j steps to w."""
     node = u + (v - u) * (i / SPLIT) + (w - u) * (j / SPLIT)
-    return node / sqrt(np.sum(node**2))
+    return _unit(node)
+
+
+@jit
+def _unit(u: Floats) -> Floats:
+    """The unit vector along u."""
+    return u / norm(u)

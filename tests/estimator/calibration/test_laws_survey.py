@@ -191,7 +191,7 @@ def test_an_assumption_acts_as_a_measurement_of_its_weight(
     )
 
 
-@law(dome_survey.redundancy, dome_survey.check_redundancy)
+@law(dome_survey.redundancy, dome_survey.check_redundancy, Subset.terms)
 @given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), rows=some.integers(40, FRAMES * LIGHTS))
 def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     rng: np.random.Generator, list_m: float, rows: int
@@ -204,8 +204,8 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     known = replace(
         true, map_sigma_m=list_m, assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0)
     )
-    terms = ba.normal_equations(known, seen, every)
     part = Subset(known, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(rows))
+    terms = part.terms
     covariances = bundle_covariance.covariance(terms, known)
     spare = 2 * rows - np.trace(np.linalg.solve(whole_matrix(terms), pixels))
     assert dome_survey.redundancy(part, covariances) == pytest.approx(spare, abs=1e-3)

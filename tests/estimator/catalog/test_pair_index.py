@@ -70,9 +70,8 @@ def test_bisection_finds_the_first_neighbor_beyond_an_angle(
         rng.integers(0, 600, 300), rng.uniform(-0.01, 0.33, 300), strict=True
     ):
         mine = sky.separation_rad[sky.first[star] : sky.first[star + 1]]
-        assert pair_index.first_neighbor(sky, star, low) - sky.first[star] == np.searchsorted(
-            mine, low
-        )
+        begin, _ = pair_index.neighbor_range(sky, star, low, 1.0)
+        assert begin - sky.first[star] == np.searchsorted(mine, low)
 
 
 # Sixty-fourths are exact in binary, so that angles fall on one another, on the query's ends and on the line's nodes.

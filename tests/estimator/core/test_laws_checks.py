@@ -158,9 +158,7 @@ def test_a_rotation_is_valid_and_finite() -> None:
     checks.rows,
     checks.unit_rows,
     checks.row_numbers,
-    checks.row_pairs,
     checks.first_bad,
-    checks.angle_guess,
 )
 @given(rng=SEEDS, thing=THINGS)
 def test_rows_have_their_length_and_are_finite_and_present(
@@ -189,9 +187,6 @@ def test_rows_have_their_length_and_are_finite_and_present(
     for wrong in ([count], [-1], [0.0], [[0]], ["a"]):
         with pytest.raises(ImageError):
             checks.row_numbers("x", wrong, count)
-    with pytest.raises(ImageError, match="2 of a, 1 of b; allowed: equal numbers"):
-        checks.row_pairs(("a", [0, 1], 2), ("b", [0], 1))
-    assert checks.angle_guess("fov", 14.9) == "fov 14.9 rad is 854°; degrees?"
 
 
 def lights(rng: np.random.Generator, count: int) -> dict[str, NDArray]:

@@ -56,3 +56,6 @@ def test_products_match_numpy(vectors) -> None:
     assert vectors.chord(tuple(a[0]), tuple(b[2])) == pytest.approx(
         np.linalg.norm(a[0] - b[2]), rel=1e-14
     )
+    assert vectors.squared_chord(tuple(a[0]), tuple(b[2])) == pytest.approx(
+        np.sum((a[0] - b[2]) ** 2), rel=1e-14
+    )

@@ -91,7 +91,13 @@ def assert_inside(blobs: Blobs, most: int) -> None:
 # Detection
 
 
-@law(detect.prepare_image, detect.check_image, detect.check_size, detect.to_native)
+@law(
+    detect.prepare_image,
+    detect.check_image,
+    detect.check_monochrome,
+    detect.check_size,
+    detect.to_native,
+)
 @given(
     image=EVERY_KIND.flatmap(
         lambda kind: arrays(kind, array_shapes(max_dims=3, min_side=0, max_side=20))
