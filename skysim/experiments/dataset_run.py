@@ -344,19 +344,18 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         "format": FORMAT,
         "skysim": __version__,
         "code": code_version(),
+        "digest": plan.digest,
     }
     there = storage.names()
     if MANIFEST in there:
-        check_manifest(storage, described | {"digest": plan.digest})
+        check_manifest(storage, described)
     elif there:
         raise InputError(
             storage.url, f"contains {min(there)}", "an empty folder, or this dataset"
         )
     else:
         storage.prepare(())
-        text = json.dumps(
-            described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str
-        )
+        text = json.dumps(described | plan.manifest(), indent=1, default=str)
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
     # The description of the array is written last.

@@ -132,11 +132,14 @@ def cells(rows: PointRows) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not rows:
         return [], []
-    texts = []
-    for one in rows:
-        levels = [format_level(level) for level in one.levels.values()]
-        responses = [format_response(one, name) for name in one.responses]
-        texts.append([str(one.point), *levels, *responses])
+    texts = [
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
+        for one in rows
+    ]
     return ["point", *rows[0].levels, *rows[0].responses], texts
 
 
@@ -308,13 +311,10 @@ def to_indices(
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
-    if switches_causes(plan.study):
-        return [
-            index for response in AXES for index in switched_causes(plan, store, response)
-        ]
-    if kind != "saltelli" or plan.study.optimize:
+    found = switched_causes if switches_causes(plan.study) else response_indices
+    if found is response_indices and (kind != "saltelli" or plan.study.optimize):
         raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
-    return [index for response in AXES for index in response_indices(plan, store, response)]
+    return [index for response in AXES for index in found(plan, store, response)]
 
 
 def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:

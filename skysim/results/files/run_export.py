@@ -217,8 +217,9 @@ def truth_row(truth: FrameTruth) -> Record:
     row: Record = {
         "frame": truth.frame,
         "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
+        "t_mid_s": truth.t_mid_s,
+        "exposure_s": truth.exposure_s,
     }
-    row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
     for name in ATTITUDES:
         quaternion = getattr(truth, f"{name}_xyzw")
         row |= {
