@@ -389,9 +389,8 @@ class Search(ConfigModel):
     @property
     def responses(self) -> list[str]:
         """The responses of all objectives and constraints, each once."""
-        names = [one.response for one in self.objectives]
-        names += [one.response for one in self.constraints]
-        return list(dict.fromkeys(names))
+        both = (*self.objectives, *self.constraints)
+        return list(dict.fromkeys(one.response for one in both))
 
 
 class Study(ConfigModel):

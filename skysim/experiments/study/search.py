@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.types import Record
 from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
@@ -73,8 +73,7 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
     """The factor with a name. Raises InputError if there is none."""
-    if name not in factors:
-        raise InputError(where, *unknown_name("factor", name, factors))
+    check_name(where, "factor", name, factors)
     return factors[name]
 
 

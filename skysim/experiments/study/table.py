@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
@@ -551,8 +551,7 @@ def shown_points(lines: PointRows, shown: Shown, study: Study) -> list[PointRow]
 def check_levels(levels: Mapping[str, Value], study: Study, lines: PointRows) -> None:
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
-        if name not in study.factors:
-            raise InputError("where", *unknown_name("factor", name, study.factors))
+        check_name("where", "factor", name, study.factors)
         available = distinct(line.levels[name] for line in lines)
         if not any(same(level, one) for one in available):
             allowed = ", ".join(map(format_level, available[:20]))
