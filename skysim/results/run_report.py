@@ -214,8 +214,9 @@ def scatter_arcsec(solved: Rows) -> list[float]:
     if len(solved) < 3:
         return [math.nan] * 3
     t_s = [row.t_s for row in solved]
+    angles_deg = np.array([row.estimate_deg for row in solved])
     # 360 degrees are none.
-    angles_deg = np.unwrap([row.estimate_deg for row in solved], period=360, axis=0)
+    angles_deg = np.unwrap(angles_deg, period=360, axis=0)
     design = np.column_stack([np.ones(len(t_s)), t_s])
     fit = np.linalg.lstsq(design, angles_deg, rcond=None)[0]
     squares = np.sum((angles_deg - design @ fit) ** 2, axis=0)

@@ -389,8 +389,9 @@ class Search(ConfigModel):
     @property
     def responses(self) -> list[str]:
         """The responses of all objectives and constraints, each once."""
-        both = (*self.objectives, *self.constraints)
-        return list(dict.fromkeys(one.response for one in both))
+        names = [one.response for one in self.objectives]
+        names += [one.response for one in self.constraints]
+        return list(dict.fromkeys(names))
 
 
 class Study(ConfigModel):
