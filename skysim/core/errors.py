@@ -3,7 +3,7 @@
 import signal
 import sys
 import weakref
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple
@@ -124,6 +124,12 @@ class InputError(ValueError):
     def at(self, where: Where | None) -> "InputError":
         """The error with its place in a file."""
         return InputError(self.key, self.problem, self.allowed, where)
+
+
+def check_name(key: object, kind: str, name: object, allowed: Collection[object]) -> None:
+    """Raise InputError for a name that is not one of the allowed ones."""
+    if name not in allowed:
+        raise InputError(key, *unknown_name(kind, name, allowed))
 
 
 # Ctrl-C and SIGTERM as KeyboardInterrupt, raised only where every caller passes it on.

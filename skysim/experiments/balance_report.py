@@ -6,7 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from estimator.calibration.mass_dynamics import INERTIA, MOMENT, MassEstimate, inertia_six
+from estimator.calibration.mass_dynamics import (
+    INERTIA,
+    MOMENT,
+    BearingRecord,
+    MassEstimate,
+    inertia_six,
+)
 from estimator.calibration.mass_properties import filter_mass
 from estimator.core.errors import ImageError
 from skysim.core import files
@@ -102,18 +108,18 @@ def nees(flight: BalanceFlight, estimate: MassEstimate) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[nine, nine], error))
 
 
-def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float) -> None:
+def draw_flights(fig: Any, statistics: Record, record: BearingRecord) -> None:
     """Draw gravity torque and offset of the center of mass flight by flight, and the last flight's attitude."""
     torque, offset, motion = fig.subplots(1, 3)
-    numbers = np.arange(1, len(iterations) + 1)
-    rows = [flight_row(n, one) for n, one in enumerate(iterations, 1)]
+    rows = statistics["flights"]
+    numbers = np.arange(1, len(rows) + 1)
     for key, style, label in (
         ("torque_nm", "o-", "estimate"),
         ("torque_bound_nm", "v--", "bound"),
         ("true_torque_nm", "kx", "simulated vehicle"),
     ):
         torque.semilogy(numbers, [row[key] for row in rows], style, label=label)
-    torque.axhline(torque_bar_nm, color="0.5", linestyle=":")
+    torque.axhline(statistics["torque_bar_nm"], color="0.5", linestyle=":")
     torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
     for axis, name in enumerate(MOMENT_NAMES):
         values, sigma = (
@@ -126,11 +132,8 @@ def draw_flights(fig: Any, iterations: Sequence[Iteration], torque_bar_nm: float
         xticks=numbers,
         yscale="symlog",
     )
-    record = iterations[-1].flight.record
     motion.plot(record.t_s, euler_deg(record.lab_from_body), ".-", label=EULER)
-    motion.set(
-        xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(iterations)}"
-    )
+    motion.set(xlabel="t [s]", ylabel="measured attitude [deg]", title=f"flight {len(rows)}")
     for axes in (torque, offset, motion):
         axes.legend(fontsize="small")
 
@@ -207,9 +210,8 @@ def flight_table(flights: Sequence[Record]) -> Table:
         Column("gravity torque", "N m", ".2g"),
         Column("at most", "N m", ".2g"),
     ]
-    rows = []
-    for one in flights:
-        row = [
+    rows = [
+        [
             one["flight"],
             f"{one['solved']} / {one['frames']}",
             one["tilt_deg"],
@@ -219,7 +221,8 @@ def flight_table(flights: Sequence[Record]) -> Table:
             one["torque_nm"],
             one["torque_bound_nm"],
         ]
-        rows.append(row)
+        for one in flights
+    ]
     return Table(columns, rows)
 
 
@@ -248,8 +251,8 @@ def write_all(
 ) -> Report:
     """Write picture, JSON and report; their paths are added to the statistics. Returns the report."""
     picture = files.make_folder(folder) / "balance.png"
-    bar_nm = statistics["torque_bar_nm"]
-    image = png(lambda fig: draw_flights(fig, iterations, bar_nm), (15, 4.5))
+    last = iterations[-1].flight.record
+    image = png(lambda fig: draw_flights(fig, statistics, last), (15, 4.5))
     files.write_bytes(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
     files.write_text(folder / "balance.json", files.to_json(statistics))

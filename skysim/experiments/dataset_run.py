@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core import __version__
-from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, check_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Record
 from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
@@ -169,8 +169,7 @@ def load(
         if count < 1:
             raise InputError(f"dataset.{name}", count, "1 or more")
     for name in formats:
-        if name not in FORMATS:
-            raise InputError("dataset.formats", *unknown_name("format", name, FORMATS))
+        check_name("dataset.formats", "format", name, FORMATS)
     plan = study_plan(scene, vary, seed, overrides or {})
     keys = set().union(*map(keys_of, plan.study.factors.values()))
     if "tracked" in plan.spec.trial or TRACKED in keys:  # which only affects solving
@@ -193,8 +192,7 @@ def study_plan(
     if vary:
         check_version(tree, vary, text)
     for key in tree:
-        if key not in KEYS:
-            raise InputError(vary, *unknown_name("key", key, KEYS))
+        check_name(vary, "key", key, KEYS)
     trial = tree.get("trial") or {"kind": "frames"}
     if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
         raise InputError(vary, "trial.kind: a dataset has frames", "frames")
@@ -344,19 +342,18 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
         "format": FORMAT,
         "skysim": __version__,
         "code": code_version(),
+        "digest": plan.digest,
     }
     there = storage.names()
     if MANIFEST in there:
-        check_manifest(storage, described | {"digest": plan.digest})
+        check_manifest(storage, described)
     elif there:
         raise InputError(
             storage.url, f"contains {min(there)}", "an empty folder, or this dataset"
         )
     else:
         storage.prepare(())
-        text = json.dumps(
-            described | {"digest": plan.digest} | plan.manifest(), indent=1, default=str
-        )
+        text = json.dumps(described | plan.manifest(), indent=1, default=str)
         storage.write(MANIFEST, text.encode())
     storage.prepare(folders_of(plan))
     # The description of the array is written last.

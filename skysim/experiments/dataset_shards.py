@@ -10,7 +10,6 @@ from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from estimator.core.types import ra_dec_roll_rad
 from skysim.core.errors import InputError
@@ -173,13 +172,18 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
     """The scalar labels of a frame, by column of the index; `numbers` come first."""
     truth = one.truth
     frame = one.frame
-    labels = {**numbers, "height": frame.image_dn.shape[0], "width": frame.image_dn.shape[1]}
-    labels |= {"exposure_s": frame.exposure_s, "saturation_dn": frame.saturation_dn}
+    height, width = frame.image_dn.shape
+    labels = {
+        **numbers,
+        "height": height,
+        "width": width,
+        "exposure_s": frame.exposure_s,
+        "saturation_dn": frame.saturation_dn,
+    }
     for name in ATTITUDES:
-        rotation: Rotation = getattr(truth, name)
+        quaternion = getattr(truth, name).as_quat()
         labels |= {
-            f"{name}_q{end}": float(q)
-            for end, q in zip("xyzw", rotation.as_quat(), strict=True)
+            f"{name}_q{end}": float(q) for end, q in zip("xyzw", quaternion, strict=True)
         }
     labels |= {
         f"rate_cam_{end}_rad_s": float(rate)
@@ -236,19 +240,16 @@ def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
         if len(counts) > 1:
-            code = {"size": [height, width], "counts": counts}
             mask = {
-                "bbox": mask_box(counts, height),
-                "area": sum(counts[1::2]),
-                "segmentation": code,
-                "iscrowd": 1,
-            }
-            numbers = {
                 "id": first + len(found),
                 "image_id": number,
                 "category_id": 1 + CATEGORIES.index(name),
+                "bbox": mask_box(counts, height),
+                "area": sum(counts[1::2]),
+                "segmentation": {"size": [height, width], "counts": counts},
+                "iscrowd": 1,
             }
-            found.append(json.dumps(numbers | mask))
+            found.append(json.dumps(mask))
     return ", ".join(found).encode()
 
 

@@ -331,9 +331,9 @@ def tolerance_limit(values: Floats, probability: float) -> Summary:
     return Summary(limit, math.nan, math.nan, count, needs)
 
 
-def rms(values: Floats, axis: int = -1) -> Any:
+def rms(values: Floats) -> Any:
     """sqrt(mean(x^2)) along the last axis."""
-    return np.sqrt(np.mean(np.square(values), axis=axis))
+    return np.sqrt(np.mean(np.square(values), axis=-1))
 
 
 def sample_std(values: Floats, axis: int = -1) -> Any:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from skysim.core import __version__
-from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.errors import InputError, check_name, printable
 from skysim.results.report_blocks import (
     Block,
     Cell,
@@ -368,8 +368,7 @@ def page_path(path: str | Path) -> Path:
     from skysim.core.files import make_folder
 
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise InputError(path, *unknown_name("file format", path.suffix, SUFFIXES))
+    check_name(path, "file format", path.suffix, SUFFIXES)
     make_folder(path.parent)
     if path.is_dir():
         raise InputError(path, "is a folder", "a file")

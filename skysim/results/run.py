@@ -232,9 +232,8 @@ def run_of(flight: Flight, scores: Sequence[Sequence[Score]]) -> Run:
     """The result of a flight at its end, from the scores of each camera, the main one first."""
     telemetry = flight.telemetry()
     imu_samples = flight.imu_samples()
-    given = flight.parts.given
     main, *heads = (
-        Run(flight.lab, camera, tuple(own), telemetry, imu_samples, given=given)
+        Run(flight.lab, camera, tuple(own), telemetry, imu_samples, given=flight.parts.given)
         for camera, own in zip(flight.lab.cameras, scores, strict=True)
     )
     return replace(main, heads={head.camera.name: head for head in heads})
@@ -254,10 +253,9 @@ class FlightRecorder:
     def of(self, camera: StarCamera) -> Recorder:
         """The recorder of a camera."""
         if not self.recorders:
-            cameras = self.flight.lab.cameras
             self.recorders = {
                 one.name: Recorder(folder, one)
-                for one, folder in zip(cameras, self.folders, strict=True)
+                for one, folder in zip(self.flight.lab.cameras, self.folders, strict=True)
             }
         return self.recorders[camera.name]
 

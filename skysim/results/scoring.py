@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, FrameRow, Mount, Record, Truth
+from skysim.core.types import Frame, FrameRow, Record, Truth
 from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
@@ -28,14 +28,12 @@ def angle_names(scene: Scene) -> tuple[str, str, str]:
     return ("RA", "Dec", "roll") if scene.stars else ("roll", "pitch", "yaw")
 
 
-def angles_deg(
-    cam_from_lab: Rotation, scene: Scene, mount: Mount
-) -> tuple[float, float, float]:
+def angles_deg(cam_from_lab: Rotation, camera: StarCamera) -> tuple[float, float, float]:
     """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
-    if scene.stars:
+    if camera.scene.stars:
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
         return float(ra), float(dec), float(roll)
-    lab_from_body = cam_from_lab.inv() * mount.cam_from_body
+    lab_from_body = cam_from_lab.inv() * camera.mount.cam_from_body
     yaw, pitch, roll = lab_from_body.as_euler("ZYX", degrees=True)
     return float(roll), float(pitch), float(yaw)
 
@@ -50,7 +48,7 @@ def scored_attitude(camera: StarCamera, truth: Truth) -> Rotation:
 
 def true_angles_deg(camera: StarCamera, truth: Truth) -> tuple[float, float, float]:
     """`angles_deg` of the truth that solutions are compared with."""
-    return angles_deg(scored_attitude(camera, truth), camera.scene, camera.mount)
+    return angles_deg(scored_attitude(camera, truth), camera)
 
 
 def row(
@@ -60,8 +58,6 @@ def row(
 
     Errors and standard deviations are in arcseconds, NaN without a solution.
     """
-    scene = camera.scene
-    mount = camera.mount
     attitude = report.attitude
     cam_from_lab = scored_attitude(camera, truth)
     cross = roll = cross_sigma = roll_sigma = chance = nees = survey_share = math.nan
@@ -69,7 +65,7 @@ def row(
     wrong = False
     if attitude.cam_from_ref is not None:
         cross, roll = metrics.cross_and_roll_rad(attitude.cam_from_ref, cam_from_lab)
-        estimate = angles_deg(attitude.cam_from_ref, scene, mount)
+        estimate = angles_deg(attitude.cam_from_ref, camera)
         covariance = np.full((3, 3), np.nan)
         if attitude.covariance_rad2 is not None:
             covariance = attitude.covariance_rad2

@@ -99,9 +99,9 @@ def table(log: Telemetry) -> Any:
 
     columns: Record = {"t_s": log.t_s}
 
-    def add(name: str, values: Floats, components: Sequence[str], unit: str) -> None:
-        for component, column in zip(components, values.T, strict=True):
-            columns[f"{name}_{component}_{unit}"] = column
+    def add(name: str, values: Floats, unit: str, ends: Sequence[str] = AXES) -> None:
+        for end, column in zip(ends, values.T, strict=True):
+            columns[f"{name}_{end}_{unit}"] = column
 
     attitudes = {
         "true": log.lab_from_body,
@@ -111,14 +111,14 @@ def table(log: Telemetry) -> Any:
     }
     for name, attitude in attitudes.items():
         if attitude is not None:
-            add(name, euler_deg(attitude), EULER, "deg")
+            add(name, euler_deg(attitude), "deg", EULER)
     pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
     if pointing is not None:
         columns["pointing_error_deg"] = pointing
-    add("rate", np.degrees(log.rate_body_rad_s), AXES, "deg_s")
-    add("torque", log.torque_nm, AXES, "nm")
-    add("disturbance", log.disturbance_nm, AXES, "nm")
-    add("momentum", log.momentum_nms, AXES, "nms")
+    add("rate", np.degrees(log.rate_body_rad_s), "deg_s")
+    add("torque", log.torque_nm, "nm")
+    add("disturbance", log.disturbance_nm, "nm")
+    add("momentum", log.momentum_nms, "nms")
     for names, joints, unit in (
         (log.wheel_names, log.wheel_rad_s / RPM_RAD_S, "rpm"),
         (log.gimbal_names, np.degrees(log.gimbal_rad), "deg"),
@@ -138,13 +138,12 @@ def table(log: Telemetry) -> Any:
     }
     for name, rates in biases.items():
         if rates is not None:
-            add(name, per_hour(rates), AXES, "deg_h")
+            add(name, per_hour(rates), "deg_h")
     if log.sigma_attitude_rad is not None:
-        add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, AXES, "arcsec")
+        add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, "arcsec")
     for name, mounting in log.mountings.items():
-        add(f"mounting_{name}", mounting.estimate_rad / ARCSEC_RAD, AXES, "arcsec")
-        add(f"sigma_mounting_{name}", mounting.sigma_rad / ARCSEC_RAD, AXES, "arcsec")
-        add(f"true_mounting_{name}", mounting.true_rad / ARCSEC_RAD, AXES, "arcsec")
+        for kind, values_rad in zip(("", "sigma_", "true_"), mounting, strict=True):
+            add(f"{kind}mounting_{name}", values_rad / ARCSEC_RAD, "arcsec")
     return Table(columns)
 
 

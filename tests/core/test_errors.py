@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from estimator.core.errors import ImageError
-from skysim.core.errors import OVERRIDES, InputError, Where, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, Where, check_name, unknown_name
 
 ROOT = Path(__file__).parents[2]
 COUNT = InputError(
@@ -91,6 +91,13 @@ def test_the_error_line_has_place_problem_and_allowed_values(
 def test_an_unknown_name_has_a_problem_and_the_allowed_names() -> None:
     error = InputError("tracker.solver", *unknown_name("solver", "magic", ["quest", "svd"]))
     assert (error.problem, error.allowed) == ("unknown solver 'magic'", "quest, svd")
+
+
+def test_only_a_name_that_is_not_allowed_is_refused() -> None:
+    check_name("tracker.solver", "solver", "svd", ["quest", "svd"])
+    with pytest.raises(InputError) as refused:
+        check_name("tracker.solver", "solver", "magic", ["quest", "svd"])
+    assert str(refused.value) == "tracker.solver: unknown solver 'magic'; allowed: quest, svd"
 
 
 def parts(error: InputError) -> tuple[str, str, str, Where | None]:

@@ -107,8 +107,13 @@ def facts(statistics: Record) -> Facts:
 
 def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
-    columns = [text_column("what"), Column("measured"), Column("95 %")]
-    columns += [Column("file", format=".5g"), text_column("unit")]
+    columns = [
+        text_column("what"),
+        Column("measured"),
+        Column("95 %"),
+        Column("file", format=".5g"),
+        text_column("unit"),
+    ]
     night = statistics["night"]
     rows = []
     for row in statistics["values"] + (night["values"] if night else []):

@@ -113,8 +113,14 @@ def model(p: Floats) -> tuple[Floats, Floats]:
 
     flux = p[:, FLUX, None]
     image = plane(gy, gx)
-    slopes = [flux * plane(gy, dx), flux * plane(dy, gx), image, np.ones_like(image)]
-    slopes += [flux * plane(gy, wx), flux * plane(wy, gx)]
+    slopes = [
+        flux * plane(gy, dx),
+        flux * plane(dy, gx),
+        image,
+        np.ones_like(image),
+        flux * plane(gy, wx),
+        flux * plane(wy, gx),
+    ]
     return p[:, SKY, None] + flux * image, np.stack(slopes, axis=2)
 
 

@@ -60,14 +60,6 @@ class MeasuredSensor(NamedTuple):
     saturation_dn: float
 
 
-class Findings(NamedTuple):
-    """The photon transfer, and the results so far: estimates by key, and remarks on what is unknown."""
-
-    transfer: Transfer
-    estimates: dict[str, Estimate]
-    remarks: list[str]
-
-
 def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
     """Every parameter from levels of darks and flats that have passed the checks of `frame_files`.
 
@@ -84,8 +76,17 @@ def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
     ]
     transfer, fitted = fitted_transfer(darks, flats, temperatures, flat_points, usable)
     estimates = {"gain_e_dn": transfer.gain_e_dn, "read_noise_e": transfer.read_noise_e}
-    found = Findings(transfer, estimates, [])
-    full_well(found, flat_points)
+    found = MeasuredSensor(
+        estimates,
+        [],
+        transfer,
+        None,
+        temperatures[own],
+        flat_points,
+        linearity_error(flat_points, transfer),
+        float(by_level(flat_points, "mean_dn").max()),
+    )
+    full_well(found)
     chosen = best_temperature(temperatures, darks, transfer, own)
     at_it = [one for one in darks if one.temperature_c == temperatures[chosen]]
     planes = fixed_pattern.dark_planes(at_it, transfer)
@@ -106,16 +107,7 @@ def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
             f"lamp: the flats scatter by {100 * transfer.drift:.2g} % about the law, more than the frames of a pair"
             " differ; drift and a nonlinearity of another law look alike; allowed: a steadier lamp, or more flats"
         )
-    return MeasuredSensor(
-        estimates,
-        found.remarks,
-        transfer,
-        dark,
-        temperatures[own],
-        flat_points,
-        linearity_error(flat_points, transfer),
-        float(by_level(flat_points, "mean_dn").max()),
-    )
+    return found._replace(dark=dark)
 
 
 def fitted_transfer(
@@ -195,15 +187,15 @@ def best_temperature(
     return max(range(len(temperatures)), key=signal)
 
 
-def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
+def full_well(found: MeasuredSensor) -> None:
     """Add full well and nonlinearity to the findings.
 
     Full well is the charge at which the signal no longer grows with the exposure. Nonlinearity is the relative loss of
     signal there, c x of the fit.
     """
     transfer = found.transfer
-    full = list(compress(flats, photon_transfer.saturated(flats)))
-    brightest = max(flats, key=lambda one: one.moments.mean_dn)
+    full = list(compress(found.flats, photon_transfer.saturated(found.flats)))
+    brightest = max(found.flats, key=lambda one: one.moments.mean_dn)
     if full:
         level_dn = float(by_level(full, "mean_dn").mean())
         sigma_dn = math.sqrt(np.mean([one.moments.mean_sigma_dn**2 for one in full]))
@@ -228,7 +220,7 @@ def full_well(found: Findings, flats: Sequence[TransferPoint]) -> None:
 
 
 def dark_parameters(
-    found: Findings,
+    found: MeasuredSensor,
     darks: Levels,
     planes: fixed_pattern.Planes,
     own: int,
@@ -288,7 +280,7 @@ def dark_parameters(
 
 
 def unresolved(
-    found: Findings,
+    found: MeasuredSensor,
     own: int,
     rates: Floats,
     noise: fixed_pattern.RateNoise,
@@ -315,7 +307,7 @@ def unresolved(
     )
 
 
-def doubling(found: Findings, temperatures: Temperatures) -> None:
+def doubling(found: MeasuredSensor, temperatures: Temperatures) -> None:
     """Add the temperature step that doubles the dark current: ln 2 over the slope of ln D, by a weighted line.
 
     The same pixels are compared at all temperatures, so their scatter does not matter.
@@ -347,8 +339,7 @@ def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float
 
     The line is fitted with relative weights (EMVA 1288, release 4.0 Linear: the linearity error LE).
     """
-    black = transfer.values[BLACK]
-    signal = by_level(flats, "mean_dn") - black
+    signal = by_level(flats, "mean_dn") - transfer.values[BLACK]
     time_s = exposures_s(flats)
     inside = (signal > 0.05 * signal.max()) & (signal < 0.95 * signal.max())
     if inside.sum() < 3:

@@ -153,11 +153,9 @@ def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
     row = rate_rows(sheet, rate_deg_s)[0]
     setup = setups.prepared_setup(sheet.spec, sheet.cells[row].settings)
-    axes = []
-    for seed in sheet.column("seed", [row])[0].tolist():
-        rng = trials.streams(setup, seed)[0]
-        axes.append(trials.attitude_and_axis(setup, rng)[1])
-    x, y, _ = np.transpose(axes)
+    seeds = sheet.column("seed", [row])[0].tolist()
+    rngs = (trials.streams(setup, seed)[0] for seed in seeds)
+    x, y, _ = np.transpose([trials.attitude_and_axis(setup, rng)[1] for rng in rngs])
     return np.arctan2(y, x)
 
 

@@ -125,8 +125,12 @@ def noise_equivalent_angle(apart: Floats) -> float:
 def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
-    found: Record = {"counts": counts_of_fields(sheet, rows), **rms_by_group(sheet, rows)}
-    found |= {"nees": mean_nees(sheet, rows), "intervals": {}}
+    found: Record = {
+        "counts": counts_of_fields(sheet, rows),
+        **rms_by_group(sheet, rows),
+        "nees": mean_nees(sheet, rows),
+        "intervals": {},
+    }
     for name, axes in GROUPS.items():
         apart = first[axes] - second[axes]
         squares = mean_known(apart**2, (0, 1)) / 2

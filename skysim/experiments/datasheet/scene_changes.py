@@ -70,9 +70,7 @@ def causes(scene: Scene) -> Changes:
 
 def disturbances(scene: Scene) -> Changes:
     """Disturbances that the scene supports, beyond its own."""
-    chip = scene.camera.detector
-    exposure_s = scene.exposure.time_s
-    hot = {"camera.detector.hot_e_s": max(chip.hot_e_s, 1000.0)}
+    hot = {"camera.detector.hot_e_s": max(scene.camera.detector.hot_e_s, 1000.0)}
     own = scene.model_dump(mode="json", by_alias=True)["background"]
     found: Changes = {
         "protons, 1e3 /cm²/s": {"camera.detector.particles": [{"per_cm2_s": 1e3}]},
@@ -81,7 +79,7 @@ def disturbances(scene: Scene) -> Changes:
         "hot pixels, 1 %": {"camera.detector.hot_pixels": 1e-2} | hot,
     }
     for electrons in (100, 1000):
-        glow = {"kind": "uniform", "e_s": electrons / exposure_s}
+        glow = {"kind": "uniform", "e_s": electrons / scene.exposure.time_s}
         found[f"stray light, {electrons} e- a pixel"] = {"background": [*own, glow]}
     if scene.stars is None:
         return found

@@ -115,10 +115,9 @@ class SurveyRun:
     def uncertainty_after(self) -> SurveyUncertainty:
         """The uncertainty of the IMU and of unmeasured LEDs as before, and of lever and lens as found."""
         accuracy = self.accuracy
-        before = self.uncertainty
         lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
         focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
-        return before._replace(lever_sigma_m=lever_m, focal_error=focal)
+        return self.uncertainty._replace(lever_sigma_m=lever_m, focal_error=focal)
 
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
@@ -141,8 +140,7 @@ def stray_lights(run: SurveyRun) -> list[StrayLight]:
     xy_px = [np.zeros((0, 2))]
     for k, match in enumerate(run.inliers):
         if run.survey.tied[k]:
-            lights = run.frames[k].lights.xy_px
-            xy_px.append(np.delete(lights, match.light, axis=0))
+            xy_px.append(np.delete(run.frames[k].lights.xy_px, match.light, axis=0))
             frame.append(np.full(len(xy_px[-1]), k))
     return survey_faults.stray_lights(
         run.held, np.concatenate(frame), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
@@ -434,14 +432,16 @@ def coverage_statistics(so_far: Coverage) -> Record:
         if so_far.accuracy
         else np.full(len(measured), so_far.model.leds_sigma_m)
     )
-    led = so_far.model.leds.id
     return {
         "leds": len(frames),
         "measured": int(measured.sum()),
         "seen_once": int(np.sum(frames == 1)),
         "unseen": int(np.sum(frames == 0)),
         "by_led": rows_of_columns(
-            led=led, frames=frames, measured=measured, sigma_mm=1e3 * sigma_m
+            led=so_far.model.leds.id,
+            frames=frames,
+            measured=measured,
+            sigma_mm=1e3 * sigma_m,
         ),
     }
 

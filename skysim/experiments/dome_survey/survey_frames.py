@@ -261,7 +261,7 @@ def match_by_imu(
     visible = np.flatnonzero(prior.camera.contains(predicted, -margin_px))
     detected = frame.lights.xy_px
     if not len(visible) or not len(detected):
-        return Correspondences(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return Correspondences(*np.zeros((2, 0), np.int64))
     predicted = predicted[visible]
     individual_px = individual_px[visible]
     shift = common_shift_px(

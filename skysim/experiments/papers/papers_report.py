@@ -82,9 +82,13 @@ def verdict(reproductions: Sequence[Reproduction]) -> Verdict:
 
 def contents(reproductions: Sequence[Reproduction]) -> Table:
     """Verdicts and seconds of each experiment, with links."""
-    columns = [text_column("experiment"), text_column("")]
-    columns += [Column(f"predictions: {kind}") for kind in VERDICTS]
-    columns += [Column("rows"), Column("time", "s", ".0f")]
+    columns = [
+        text_column("experiment"),
+        text_column(""),
+        *(Column(f"predictions: {kind}") for kind in VERDICTS),
+        Column("rows"),
+        Column("time", "s", ".0f"),
+    ]
     rows = []
     for one in reproductions:
         counts = [one.count(kind, predictions=True) for kind in VERDICTS]
@@ -116,8 +120,14 @@ def section(reproduction: Reproduction) -> Section:
 
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """The published numbers beside ours."""
-    columns = [text_column("what"), text_column("class"), Column("published"), Column("ours")]
-    columns += [text_column("verdict"), Column("note", kind="aside")]
+    columns = [
+        text_column("what"),
+        text_column("class"),
+        Column("published"),
+        Column("ours"),
+        text_column("verdict"),
+        Column("note", kind="aside"),
+    ]
     rows = []
     for one in comparisons:
         row = one.row

@@ -25,7 +25,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from skysim.scene import loader
 from skysim.simulation.flight import Progress, open_flight
 
 Verdict = Literal["agrees", "undecided", "disagrees"]
-VERDICTS: tuple[Verdict, ...] = ("agrees", "undecided", "disagrees")
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 TERM = re.compile(r"\s*([\w.-]+?)\s*(?:\[(.*?)\])?\s*")
 BOTH = re.compile(r"^(.*?\S)\s+([-/])\s+(\S.*)$")
 

@@ -55,8 +55,8 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sente
     Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES
     is beyond what one draw of three angles can have (probability OVERCONFIDENCE_PROBABILITY).
     """
-    known = [(line.responses.get("nees", NO_VALUE), line) for line in lines]
-    known = [(one, line) for one, line in known if one.trials]
+    every = ((line.responses.get("nees", NO_VALUE), line) for line in lines)
+    known = [(one, line) for one, line in every if one.trials]
     if not known:
         return []
     found = [(jointly(one, len(known)), line) for one, line in known]
@@ -333,13 +333,14 @@ def valued(name: str, lines: PointRows) -> list[PointRow]:
     return [line for line in found if not has_few_values(line, name)] or found
 
 
-def extremes(name: str, lines: PointRows) -> tuple[PointRow, PointRow]:
-    """The points with the least and the largest value of a response."""
+def extremes(name: str, lines: PointRows) -> list[tuple[PointRow, str]]:
+    """The points with the least and the largest value of a response, with the text of the value."""
 
     def value(line: PointRow) -> float:
         return line.responses[name].value
 
-    return min(lines, key=value), max(lines, key=value)
+    ends = (min(lines, key=value), max(lines, key=value))
+    return [(line, format_summary(line.responses[name])) for line in ends]
 
 
 def response_range(name: str, lines: PointRows, place: Place) -> str:
@@ -347,8 +348,7 @@ def response_range(name: str, lines: PointRows, place: Place) -> str:
     points = valued(name, lines)
     if not points:
         return f"{name}: no trial has a value."
-    least, most = extremes(name, points)
-    low, high = (format_summary(line.responses[name]) for line in (least, most))
+    (least, low), (most, high) = extremes(name, points)
     if least.responses[name].value == most.responses[name].value:
         return f"{name}: {low}" + (
             f" at all {len(points)} points." if len(points) > 1 else "."
@@ -363,8 +363,7 @@ def range_rows(study: Study, lines: PointRows) -> list[list[str]]:
     rows = []
     for name in study.responses:
         if points := valued(name, done):
-            least, most = extremes(name, points)
-            low, high = (format_summary(line.responses[name]) for line in (least, most))
+            (least, low), (most, high) = extremes(name, points)
             rows.append([name, low, place(least), high, place(most)])
     return rows
 
@@ -393,8 +392,7 @@ def ambiguity(study: Study, lines: PointRows, place: Place) -> str:
     shares = []
     for line in lines:
         refused = line.responses["ambiguous"]
-        wrong = line.responses["misled"]
-        either = refused.value + np.nan_to_num(wrong.value)
+        either = refused.value + np.nan_to_num(line.responses["misled"].value)
         share = proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
     unit = ", each with hardware of its own" if study.hardware else ""

@@ -37,7 +37,7 @@ from skysim.core.yaml_reader import (
 from skysim.dynamics import profile_table
 from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
-from skysim.experiments.study.execution.engines import Engine
+from skysim.experiments.study.execution.engines import Engine, Pool, Serial
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import Plan, scene_texts
 from skysim.experiments.study.report.study_report import study_report
@@ -271,7 +271,7 @@ def table_file(given: Any, folder: Path) -> Path:
 def engine_for(programs: Programs, workers: int | None) -> Engine:
     """The engine of a study with these trackers and controllers, see `run_study`. Raises InputError."""
     if workers == 1:
-        return runner.ENGINES["serial"](None, "")
+        return Serial()
     reason = own_code.unsendable(programs)
     if reason and workers:
         raise InputError(
@@ -279,4 +279,4 @@ def engine_for(programs: Programs, workers: int | None) -> Engine:
             f"{workers} processes cannot take {reason}",
             "1, or functions of a module or a script",
         )
-    return runner.ENGINES["serial" if reason else "pool"](workers, "")
+    return Serial() if reason else Pool(workers)

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.types import Record
 from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
-from skysim.experiments.study.execution.runner import Progress, Watch, run_points
+from skysim.experiments.study.execution.runner import Progress, Watch, run
 from skysim.experiments.study.execution.store import TIMES, Store
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import (
@@ -73,8 +73,7 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
 
 def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
     """The factor with a name. Raises InputError if there is none."""
-    if name not in factors:
-        raise InputError(where, *unknown_name("factor", name, factors))
+    check_name(where, "factor", name, factors)
     return factors[name]
 
 
@@ -86,8 +85,7 @@ def si(value: Value) -> float:
 
 def cost(plan: Plan, point: Point) -> tuple[float, str]:
     """Cost of a point: base, `per` and `levels` of the factors, and the parts' total; if it is NaN, also the reason."""
-    config = plan.study.search.cost
-    total = factors_cost(config, point.levels)
+    total = factors_cost(plan.study.search.cost, point.levels)
     if plan.prices is None:
         return total, ""
     try:
@@ -232,12 +230,12 @@ def violation(limit: Constraint, value: float) -> float:
     """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
     if math.isnan(value):
         return MISSING_VIOLATION
-    excess = []
-    if limit.at_most is not None:
-        excess.append((value - limit.at_most) / max(abs(limit.at_most), MIN_SCALE))
-    if limit.at_least is not None:
-        excess.append((limit.at_least - value) / max(abs(limit.at_least), MIN_SCALE))
-    return max(excess)
+    bounds = ((limit.at_most, 1), (limit.at_least, -1))
+    return max(
+        sign * (value - bound) / max(abs(bound), MIN_SCALE)
+        for bound, sign in bounds
+        if bound is not None
+    )
 
 
 def scene_error(columns: metrics.Columns) -> str:
@@ -254,10 +252,11 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
-    best = []
-    for one, own in zip(feasible, values, strict=True):
-        if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1)):
-            best.append((tuple(own), one))
+    best = [
+        (tuple(own), one)
+        for one, own in zip(feasible, values, strict=True)
+        if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
+    ]
     return [one for _, one in sorted(best, key=lambda pair: pair[0])]
 
 
@@ -439,7 +438,7 @@ def run_candidate(
             raise InvalidScene
 
     try:
-        progress = run_points(limited, store, engine, [point], number, watch_candidate)
+        progress = run(limited, store, engine, watch_candidate, [point], number)
     except InvalidScene:
         rows = failed_rows(plan, store, number)
         store.add(rows)

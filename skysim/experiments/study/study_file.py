@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import OVERRIDES, InputError, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, check_name
 from skysim.core.paths import STUDIES
 from skysim.core.plugins import Programs
 from skysim.core.yaml_reader import (
@@ -218,10 +218,8 @@ def check_figures(plan: Plan) -> None:
     rows = [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
     for where, one in named_sections(study):
         for key, factor in one.axes.items():
-            if factor is not None and factor not in study.factors:
-                raise InputError(
-                    f"{where}.{key}", *unknown_name("factor", factor, study.factors)
-                )
+            if factor is not None:
+                check_name(f"{where}.{key}", "factor", factor, study.factors)
         metrics.response(one.response, where)
         if isinstance(one, Map) and study.trial.kind == "flight":
             raise InputError(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
@@ -132,11 +132,14 @@ def cells(rows: PointRows) -> tuple[list[str], list[list[str]]]:
     """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
     if not rows:
         return [], []
-    texts = []
-    for one in rows:
-        levels = [format_level(level) for level in one.levels.values()]
-        responses = [format_response(one, name) for name in one.responses]
-        texts.append([str(one.point), *levels, *responses])
+    texts = [
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
+        for one in rows
+    ]
     return ["point", *rows[0].levels, *rows[0].responses], texts
 
 
@@ -308,13 +311,10 @@ def to_indices(
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
-    if switches_causes(plan.study):
-        return [
-            index for response in AXES for index in switched_causes(plan, store, response)
-        ]
-    if kind != "saltelli" or plan.study.optimize:
+    found = switched_causes if switches_causes(plan.study) else response_indices
+    if found is response_indices and (kind != "saltelli" or plan.study.optimize):
         raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
-    return [index for response in AXES for index in response_indices(plan, store, response)]
+    return [index for response in AXES for index in found(plan, store, response)]
 
 
 def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
@@ -551,8 +551,7 @@ def shown_points(lines: PointRows, shown: Shown, study: Study) -> list[PointRow]
 def check_levels(levels: Mapping[str, Value], study: Study, lines: PointRows) -> None:
     """Raise InputError for an unknown factor, or a level at which there is no point."""
     for name, level in levels.items():
-        if name not in study.factors:
-            raise InputError("where", *unknown_name("factor", name, study.factors))
+        check_name("where", "factor", name, study.factors)
         available = distinct(line.levels[name] for line in lines)
         if not any(same(level, one) for one in available):
             allowed = ", ".join(map(format_level, available[:20]))

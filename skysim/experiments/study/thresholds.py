@@ -80,10 +80,9 @@ def crossing(
     if deviance > scipy.stats.chi2.isf(MISFIT_PROBABILITY, max(len(x) - 1, 1)):
         return Crossing(math.nan, -math.inf, math.inf, rising)
     # In the order in which the proportion falls, `above` and `below` are certain levels.
-    order = slice(None, None, -1) if rising else slice(None)
+    x, hits, trials, fit = (one[::-1] if rising else one for one in (x, hits, trials, best))
     sign = -1.0 if rising else 1.0
-    places = (np.log(x) if log else x)[order]
-    fit = best[order]
+    places = np.log(x) if log else x
     value = sign * math.inf
     between = None
     below = np.flatnonzero(fit < limit)
@@ -95,20 +94,19 @@ def crossing(
         value = float(places[n - 1] + share * (places[n] - places[n - 1]))
         value = math.exp(value) if log else value
         if too_few(trials, limit):
-            first, second = sorted(x[order][n - 1 : n + 1].tolist())
+            first, second = sorted(x[n - 1 : n + 1].tolist())
             between = first, second
-    above, beneath = certain_levels(x[order], hits[order], trials[order], limit)
+    above, beneath = certain_levels(x, hits, trials, limit)
     ends = (
         -sign * math.inf if above is None else above,
         sign * math.inf if beneath is None else beneath,
     )
-    open_ends = [end for end, level in ((0, above), (-1, beneath)) if level is None]
     needs = []
-    for end in open_ends:
+    for end in [end for end, level in ((0, above), (-1, beneath)) if level is None]:
         share = float(fit[end])
         certain = (1 - limit, 0, 1 - share) if end == 0 else (limit, 0, share)
         if 0 < (count := metrics.trials_needed(*certain)) <= MOST_TRIALS:
-            needs.append((float(x[order][end]), count))
+            needs.append((float(x[end]), count))
     return Crossing(value, min(ends), max(ends), rising, between, tuple(needs))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.constants import INCH_M
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import check_name
 from skysim.results.files.templates import (
     CAPTION_MM,
     GAP_MM,
@@ -54,8 +54,7 @@ class Page(NamedTuple):
 
 def pages(dome: Dome, paper: str) -> Iterator[Page]:
     """The pages of a dome's gores. Raises InputError for an unknown paper."""
-    if paper not in PAPERS:
-        raise InputError("paper", *unknown_name("paper", paper, PAPERS))
+    check_name("paper", "paper", paper, PAPERS)
     width_mm, height_mm = SHEETS_MM.get(paper, (math.inf, math.inf))
     count = gore_count(dome, 1e-3 * (width_mm - 2 * MARGIN_MM))
     gores = [gore(dome, number, count) for number in range(count)]

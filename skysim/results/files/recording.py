@@ -175,8 +175,8 @@ def read_truth(path: Path) -> FrameTruth:
         (one line) for a file that is not a truth file or that an older skysim wrote.
     """
     sources = read_table(path)
-    counts = {"frame": 1, "t_mid_s": 1, "exposure_s": 1}
     quaternions = [f"{name}_xyzw" for name in ATTITUDES]
+    counts = dict.fromkeys(("frame", "t_mid_s", "exposure_s"), 1)
     counts |= {**dict.fromkeys(quaternions, 4), "rate_cam_rad_s": 3}
     numbers = {
         key: np.array(header_numbers(path, sources.meta, key, count))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
 from skysim.core.types import ATTITUDES, Floats, Record
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
@@ -217,8 +217,9 @@ def truth_row(truth: FrameTruth) -> Record:
     row: Record = {
         "frame": truth.frame,
         "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
+        "t_mid_s": truth.t_mid_s,
+        "exposure_s": truth.exposure_s,
     }
-    row |= {"t_mid_s": truth.t_mid_s, "exposure_s": truth.exposure_s}
     for name in ATTITUDES:
         quaternion = getattr(truth, f"{name}_xyzw")
         row |= {
@@ -481,7 +482,6 @@ def export(run: Recording, formats: Iterable[str], out: Path, bar: Bar) -> Paths
     """
     names = list(dict.fromkeys(formats))
     for name in names:
-        if name not in EXPORTS:
-            raise InputError("export.formats", *unknown_name("format", name, EXPORTS))
+        check_name("export.formats", "format", name, EXPORTS)
     files.make_folder(out)
     return [path for name in names for path in EXPORTS[name](run, out, bar)]

@@ -63,10 +63,12 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         np.array([R_cam_from_body @ each.T for each in R_lab_from_body]),
         np.array([each @ camera.mount.camera_body_m for each in R_lab_from_body]),
     )
-    rows = []
-    for n in range(len(R_lab_from_body)):
-        pose = Poses(*(part[n : n + 1] for part in poses))
-        rows.append(in_view(camera.sources, optics, pose, reach=0.0))
+    rows = [
+        in_view(
+            camera.sources, optics, Poses(*(part[n : n + 1] for part in poses)), reach=0.0
+        )
+        for n in range(len(R_lab_from_body))
+    ]
     ends = np.cumsum([0, *map(len, rows)])
     near = camera.sources.take(np.concatenate(rows))
     atmosphere = find_light(camera.lights, AirEffects)
@@ -128,8 +130,6 @@ def simulate_detections(
     false = trial.false_lights + round(
         len(detected) * trial.false_share / (1 - trial.false_share)
     )
-    if not false:
-        return Centroids(xy_px[detected], np.full(len(detected), sigma_px), flux[detected])
     false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
     if len(flux):
         false_flux = flux[rng.integers(len(flux), size=false)]

@@ -282,23 +282,19 @@ def check_scene(plan: Plan, store: Store) -> None:
             )
 
 
-def run(plan: Plan, store: Store, engine: Engine, watch: Watch | None = None) -> Progress:
-    """Run all missing trials of a plan, or as many as its budget allows."""
-    return run_points(plan, store, engine, plan.points, 0, watch)
-
-
-def run_points(
+def run(
     plan: Plan,
     store: Store,
     engine: Engine,
-    points: Sequence[Point],
-    first: int,
-    watch: Watch | None,
+    watch: Watch | None = None,
+    points: Sequence[Point] = (),
+    first: int = 0,
 ) -> Progress:
-    """Run the missing trials of `points`, numbered from `first`, within the budget of time and failures.
+    """Run all missing trials of a plan, or of these `points` numbered from `first`, within its time and failures.
 
     Rows are stored before they are counted, so a killed run loses at most the chunks in flight.
     """
+    points = points or plan.points
     replicates = plan.study.replicates
     numbers = np.arange(first * replicates, (first + len(points)) * replicates)
     missing = numbers[~store.done(int(numbers[-1]) + 1)[numbers]]

@@ -201,8 +201,8 @@ class Store:
         able = row_parts.can_write_parts() and bool(self.meta("replicates"))
         while able and in_parts + count > MOST_ROWS and count >= PART_ROWS == moved:
             moved = self._move_part()
-            count = count - moved
-            in_parts = in_parts + moved
+            count -= moved
+            in_parts += moved
         self._room = MOST_ROWS - in_parts - count
         if self._room < 0:
             self._room = PART_ROWS - count if count < PART_ROWS else PART_ROWS
@@ -303,9 +303,11 @@ class Store:
                 self.db.execute(query).fetchone(), int, int, int
             )
             parts = self.parts()
-        done = done + sum(part.rows for part in parts)
-        wrong = wrong + sum(part.wrong for part in parts)
-        return {"done": done, "failed": failed, "wrong": wrong}
+        return {
+            "done": done + sum(part.rows for part in parts),
+            "failed": failed,
+            "wrong": wrong + sum(part.wrong for part in parts),
+        }
 
     def failures(self) -> list[tuple[int, str]]:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""

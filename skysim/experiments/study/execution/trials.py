@@ -225,9 +225,8 @@ def solved_centroids(
     trial = setup.trial
     estimator = setup.estimator
     assert isinstance(trial, CentroidTrial)
-    drawn = [streams(setup, seed) for seed in seeds]
-    lab_from_body = random_attitudes(setup, [attitude_rng for attitude_rng, _ in drawn])
-    noise = [noise_rng for _, noise_rng in drawn]
+    attitude_rngs, noise = zip(*(streams(setup, seed) for seed in seeds), strict=True)
+    lab_from_body = random_attitudes(setup, attitude_rngs)
     if isinstance(estimator, CodedTracker):
         coded = [
             solve_coded(lab, estimator, trial, *each)
@@ -243,9 +242,8 @@ def solved_centroids(
             simulate_detections(trial, view.xy_px, view.electrons, scene, rng)
             for view, rng in zip(views, noise, strict=True)
         ]
-        exposure_s = scene.exposure.time_s
         reports = [
-            Report(factory.solve_centroids(estimator, each, exposure_s), each)
+            Report(factory.solve_centroids(estimator, each, scene.exposure.time_s), each)
             for each in detections
         ]
     lights = [
@@ -266,8 +264,8 @@ def streams(setup: TrialSetup, seed: int) -> tuple[Generator, Generator]:
 def run_frame_trial(setup: TrialSetup, seed: int) -> Outcome:
     """Frame trial: random attitude, one rendered frame, solved lost in space or in tracking mode."""
     moving = moving_camera(setup, seed)
-    frame, truth = moving.render(tracked_frames(setup))
-    if tracked_frames(setup):
+    frame, truth = moving.render(moving.tracked)
+    if moving.tracked:
         report = tracked_report(setup, moving, frame)
     else:
         report = factory.solve_frame(
@@ -401,7 +399,7 @@ def render_trial_frame(
         Receives the masks of smear and particles
     """
     moving = moving_camera(setup, seed)
-    return *moving.render(tracked_frames(setup), added), moving.streak_px
+    return *moving.render(moving.tracked, added), moving.streak_px
 
 
 class MovingCamera(NamedTuple):
@@ -411,27 +409,24 @@ class MovingCamera(NamedTuple):
     ----------
     streak_px
         (dx, dy) streak vector of the frame as a gyro measures it; None without a gyro
+    tracked
+        Number of frames that are followed before the frame of the trial; also the index of that frame
     """
 
     camera: StarCamera
     trajectory: Trajectory
     streak_px: tuple[float, float] | None
+    tracked: int
 
     def render(self, index: int, added: AddedCharge | None = None) -> tuple[Frame, Truth]:
         """A frame and its truth."""
         return render_frame(self.camera, self.trajectory, index, added=added)
 
 
-def tracked_frames(setup: TrialSetup) -> int:
-    """Number of frames that are followed before the frame of a frame trial; also the index of that frame."""
-    assert isinstance(setup.trial, FrameTrial)
-    return setup.trial.tracked
-
-
 def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     """The camera in the motion of a frame trial and, with a gyro, the streak vector of its frame."""
     trial = setup.trial
-    (attitude_rng, noise) = streams(setup, seed)
+    attitude_rng, noise = streams(setup, seed)
     assert isinstance(trial, FrameTrial)
     camera = setup.lab.in_run(int(noise.integers(2**62))).camera
     middle, axis_cam = attitude_and_axis(setup, attitude_rng)
@@ -448,7 +443,7 @@ def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     streak_px = exposure_window(camera.scene, 0).exposure_s * camera.scene.camera.focal_px
     # For a star on the boresight: d(x / z)/dt = -w_y, d(y / z)/dt = w_x.
     streak = (-rate_cam[1] * streak_px, rate_cam[0] * streak_px) if trial.gyro else None
-    return MovingCamera(camera, trajectory, streak)
+    return MovingCamera(camera, trajectory, streak, trial.tracked)
 
 
 def attitude_and_axis(setup: TrialSetup, rng: Generator) -> tuple[Rotation, Floats]:
@@ -507,13 +502,10 @@ def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:
     """(3,) unit axis of rotation in camera axes; azimuth_rad is used if it is perpendicular to the boresight."""
-    if not isinstance(axis, AxisConfig):
-        boresight = np.array([0.0, 0.0, 1.0])
-        return (
-            boresight
-            if axis == "boresight"
-            else np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
-        )
+    if axis == "boresight":
+        return np.array([0.0, 0.0, 1.0])
+    if isinstance(axis, str):
+        return np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
     vector = (
         mount.cam_from_body.apply(axis.body)
         if axis.body is not None

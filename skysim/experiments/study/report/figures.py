@@ -235,8 +235,14 @@ def draw_line(
 def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
     """Draw points that have few values as hollow marks, each with its number of values."""
     axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
-    text = {"fontsize": 6.5, "color": style["color"], "path_effects": [halo()]}
-    text |= {"xytext": (4, 4), "textcoords": "offset points", "xycoords": style["transform"]}
+    text = {
+        "fontsize": 6.5,
+        "color": style["color"],
+        "path_effects": [halo()],
+        "xytext": (4, 4),
+        "textcoords": "offset points",
+        "xycoords": style["transform"],
+    }
     for n in np.flatnonzero(one.few & np.isfinite(one.value)):
         axes.annotate(f"n={one.values[n]}", (one.x[n], one.value[n]), **text)
 
@@ -499,8 +505,13 @@ def pareto_png(
         axes.set_ylim(*limits([other.value], [low, high], False, False))
         axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(x, y, "D--", color=ORANGE, label="front")
-        style: Any = {"fontsize": 8, "color": ORANGE, "path_effects": [halo()]}
-        style |= {"xytext": (5, 5), "textcoords": "offset points"}
+        style: Any = {
+            "fontsize": 8,
+            "color": ORANGE,
+            "path_effects": [halo()],
+            "xytext": (5, 5),
+            "textcoords": "offset points",
+        }
         if len(x) <= MAX_LABELED_POINTS:
             for n, *at in zip(marked.tolist(), x, y, strict=True):
                 axes.annotate(str(points[n]), at, **style)

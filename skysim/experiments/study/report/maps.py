@@ -78,11 +78,10 @@ def direction_maps(
     lines: PointRows, figure: Map, study: Study, columns_of: ColumnsOf
 ) -> list[DirectionMap]:
     """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
-    panels = []
-    for label, group in group_points(lines, figure, study).items():
-        columns = columns_of(*(line.point for line in group))
-        panels.append(direction_map(label, columns, figure.value))
-    return panels
+    return [
+        direction_map(label, columns_of(*(line.point for line in group)), figure.value)
+        for label, group in group_points(lines, figure, study).items()
+    ]
 
 
 def direction_map(label: str, columns: metrics.Columns, response: str) -> DirectionMap:

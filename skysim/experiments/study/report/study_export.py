@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core import files
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
 from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
@@ -130,7 +130,6 @@ EXPORTS: dict[str, Callable[[Store, Names, Path], None]] = {
 
 def export(store: Store, responses: Names, path: Path) -> None:
     """Write a study's results in the format given by the path's suffix. Raises InputError for an unknown suffix."""
-    if path.suffix not in EXPORTS:
-        raise InputError(path, *unknown_name("file format", path.suffix, EXPORTS))
+    check_name(path, "file format", path.suffix, EXPORTS)
     files.make_folder(path.parent)
     EXPORTS[path.suffix](store, responses, path)

@@ -387,8 +387,9 @@ def index_table(indices: Sequence[Index]) -> Table:
         text_column("error"),
         text_column("factor"),
         Column("alone, rms", "″", ".3g"),
+        Column("first order"),
+        Column("total"),
     ]
-    columns += [Column("first order"), Column("total")]
     rows = [
         [one.response, one.factor, one.rms_arcsec, with_key(one.first), with_key(one.total)]
         for one in sorted(indices, key=lambda one: (one.response, -one.total.value))
@@ -420,8 +421,13 @@ def from_the_last(kept: int, count: int) -> list[tuple[int]]:
 
 def runs_section(store: Store) -> Section:
     """The runs that have filled the store."""
-    columns = [text_column("engine"), Column("workers"), Column("trials")]
-    columns += [Column("time", "s", ".1f"), Column("trials/s", format=".2g")]
+    columns = [
+        text_column("engine"),
+        Column("workers"),
+        Column("trials"),
+        Column("time", "s", ".1f"),
+        Column("trials/s", format=".2g"),
+    ]
     runs = store.runs()
     rows = []
     for run in runs:
