@@ -30,6 +30,9 @@ from skysim.simulation.timing import longest_live_s
 
 MOST_WAITING = 1000  # commands that wait for the next control period
 MOST_TRIGGERS = 100  # triggered exposures that wait
+LEAST_VARIANCE_RAD2 = 1e-18  # about each axis: the filter loses less than 0.0002" in rounding
+MOST_VARIANCE_RAD2 = 1.0
+ROUNDING = 1e-9  # relative difference of what is symmetric
 QUATERNION_TOLERANCE = 1e-3  # of the length of a quaternion
 SOLUTION_KEYS = ("t_s", "cam_from_ref_xyzw", "covariance_rad2")
 
@@ -176,11 +179,14 @@ class CommandState:
             raise InputError("attitude", error) from None
         if abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
             raise InputError("attitude", "cam_from_ref_xyzw is not a unit quaternion")
-        if (
-            not np.allclose(covariance, covariance.T)
-            or np.linalg.eigvalsh(covariance)[0] <= 0
-        ):
-            raise InputError("attitude", "covariance_rad2 is not positive and symmetric")
+        least, _, most = np.linalg.eigvalsh(covariance)
+        is_symmetric = np.abs(covariance - covariance.T).max() <= ROUNDING * most
+        if not is_symmetric or not LEAST_VARIANCE_RAD2 <= least <= most <= MOST_VARIANCE_RAD2:
+            raise InputError(
+                "attitude",
+                "covariance_rad2 is no covariance of an attitude",
+                "symmetric, with standard deviations from 1e-9 to 1 rad",
+            )
         if not 0 <= t_s <= self.flight.now_s:
             raise InputError(
                 "attitude", f"t_s {t_s:g}", f"0 to {self.flight.now_s:g}, the present"

@@ -106,7 +106,12 @@ def attitude(**changes: Any) -> dict[str, Any]:
     [
         ({"t_s": 5.0}, "t_s 5; allowed: 0 to 0"),
         ({"cam_from_ref_xyzw": [1, 1, 0, 0]}, "not a unit quaternion"),
-        ({"covariance_rad2": np.diag([1e-9, 1e-9, -1e-9]).tolist()}, "not positive"),
+        (
+            {"covariance_rad2": np.diag([1e-9, 1e-9, -1e-9]).tolist()},
+            "no covariance of an attitude",
+        ),
+        ({"covariance_rad2": np.diag([1e-300, 1e-9, 1e-9]).tolist()}, "from 1e-9 to 1 rad"),
+        ({"covariance_rad2": np.diag([1e30, 1e-9, 1e-9]).tolist()}, "from 1e-9 to 1 rad"),
         ({"covariance_rad2": [1, 2, 3]}, "has shape"),
     ],
 )
