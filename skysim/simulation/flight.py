@@ -34,7 +34,7 @@ from skysim.simulation.lab import (
     build_tracker,
     with_parts,
 )
-from skysim.simulation.motion import Motion, history_s
+from skysim.simulation.motion import Motion, history_s, readings_of
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
@@ -90,6 +90,9 @@ class State:
         (n,) speeds of the reaction wheels
     gimbal_rad
         (n,) angles of the CMGs' gimbals
+    readings
+        Of thrusters thruster_duty (n,), the open fraction of the last control period, and propellant_kg; of trim
+        masses that move trim_m (n,), their positions
     """
 
     t_s: float
@@ -97,6 +100,7 @@ class State:
     rate_body_rad_s: Floats
     wheel_rad_s: Floats
     gimbal_rad: Floats
+    readings: dict[str, Floats]
 
 
 class Schedule:
@@ -236,6 +240,7 @@ class Flight:
             simulation.rate_body_rad_s.copy(),
             simulation.speeds_rad_s[vehicle.wheels.dof],
             simulation.angles_rad[vehicle.gimbals.qpos],
+            readings_of(self.motion.drives),
         )
 
     def step(self, torque_nm: Floats | None = None) -> list[Shot]:

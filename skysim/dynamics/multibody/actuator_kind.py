@@ -39,7 +39,15 @@ class ControlInput(NamedTuple):
 
 
 class Actuators(Protocol):
-    """A set of actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,)."""
+    """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
+
+    Attributes
+    ----------
+    motor
+        (n,) numbers of the commanded motors
+    """
+
+    motor: Ints
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Write the commands into control; return the torque (3,) that they will give."""
@@ -51,6 +59,25 @@ class Actuators(Protocol):
 
     def command_map(self) -> tuple[Floats, float]:
         """(n, 3) commands per unit of torque on the body, with every gimbal at zero, and the limit of a command."""
+        ...
+
+
+class ActuatorDrive(Protocol):
+    """Hardware between the commands of a set and MuJoCo's motors, such as valves. Stateful: one object per motion.
+
+    Attributes
+    ----------
+    readings
+        Present values by name, such as the propellant
+    """
+
+    readings: dict[str, Floats]
+
+    def apply(self, control: Floats, angles_rad: Floats) -> None:
+        """Replace the commands in the controls (K, nu) of the next K steps by those of the motors at each step.
+
+        The full qpos is that of the first step.
+        """
         ...
 
 
@@ -76,6 +103,8 @@ class ActuatorKind:
         (model, data, config): sets the initial angles and speeds of its joints in the data
     check
         (spec, path of the file): raises InputError for joints that do not fit together
+    drive
+        (compiled model, config): returns the hardware between commands and motors; None without any
     """
 
     key: str
@@ -85,6 +114,7 @@ class ActuatorKind:
     sites: tuple[str, ...] = ()
     start: Callable[[Any, Any, Any], None] = nothing
     check: Callable[[Any, Path], None] = nothing
+    drive: Callable[[Any, Any], ActuatorDrive] | None = None
 
 
 @jit

@@ -14,6 +14,7 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
+    ActuatorDrive,
     ActuatorKind,
     Actuators,
     ControlInput,
@@ -23,13 +24,14 @@ from skysim.dynamics.multibody.actuator_kind import (
 )
 from skysim.dynamics.multibody.cmgs import CMGS
 from skysim.dynamics.multibody.fans import FANS
+from skysim.dynamics.multibody.thrusters import THRUSTERS
+from skysim.dynamics.multibody.trims import TRIM, TRIMS
 from skysim.dynamics.multibody.wheels import WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
 
-KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS)
+KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS, THRUSTERS, TRIMS)
 
 TORQUES = ("torque_x", "torque_y", "torque_z")
-TRIM = "trim_"  # slide joints of trim masses, see mass.py
 PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
 
 
@@ -45,6 +47,15 @@ def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     for kind in kinds_on(vehicle):
         found[kind.key] = kind.control(model, getattr(vehicle, kind.key))
     return found
+
+
+def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
+    """The hardware between commands and motors of all actuators that are switched on."""
+    return [
+        kind.drive(model, getattr(vehicle, kind.key))
+        for kind in kinds_on(vehicle)
+        if kind.drive
+    ]
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
@@ -93,7 +104,8 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
             found = joints(spec, prefix)
-            if getattr(vehicle, key) is None:
+            is_on = vehicle.trim or vehicle.trims if key == "trim" else getattr(vehicle, key)
+            if is_on is None:
                 locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
                 for joint in found:
                     spec.delete(joint)

@@ -279,6 +279,7 @@ class CmgActuator:
 
     def __init__(self, model: Any, config: CmgsConfig) -> None:
         self.gimbals = Hinges.from_model(model, GIMBAL)
+        self.motor = self.gimbals.motor
         self.rotors = Hinges.from_model(model, ROTOR)
         self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
         self.model = CmgSet(

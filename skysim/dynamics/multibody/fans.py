@@ -28,7 +28,7 @@ FAN = "fan_"
 
 @dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans of a compiled model, in the order of their names.
+    """Fans, or thrusters, of a compiled model, in the order of their names.
 
     Attributes
     ----------
@@ -48,12 +48,12 @@ class Fans:
     motor: Ints
 
     @classmethod
-    def from_model(cls, model: Any) -> Fans:
-        """The fans that have an actuator."""
+    def from_model(cls, model: Any, prefix: str = FAN) -> Fans:
+        """The sites whose name begins with prefix and that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         names = sorted(
-            name for name in all_names(model.actuator, model.nu) if name.startswith(FAN)
+            name for name in all_names(model.actuator, model.nu) if name.startswith(prefix)
         )
         sites = [model.site(name).id for name in names]
         # z axes of the sites; at zero joint angles lab and body axes coincide.
