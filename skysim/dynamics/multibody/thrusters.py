@@ -37,7 +37,7 @@ THRUSTER = "thruster_"
 
 # Weight of the thrusts beside the torque, relative to the lever arms: the torque is smaller by its square, 1e-8.
 SHARING = 1e-4
-SHORTEST_LAG_S = 1e-12  # stands for no lag
+SHORTEST_LAG_S = 1e-15  # stands for no lag
 
 
 class ThrusterActuator:
