@@ -100,12 +100,12 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     locked: dict[str, str] = {}
     check_names(spec, path)
     # 1. Joints: delete or check.
-    prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {"trim": (TRIM,)}
+    trim = "trims" if vehicle.trims else "trim"
+    prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {trim: (TRIM,)}
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
             found = joints(spec, prefix)
-            is_on = vehicle.trim or vehicle.trims if key == "trim" else getattr(vehicle, key)
-            if is_on is None:
+            if getattr(vehicle, key) is None:
                 locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
                 for joint in found:
                     spec.delete(joint)

@@ -153,6 +153,8 @@ def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:
     """Set the set-points of the servos to the positions at the start, less what gravity makes them yield."""
     slides = Hinges.from_model(model, TRIM)
+    if (slides.motor < 0).any():
+        return  # a model without motors, of the shapes alone
     sag_m = SERVO_S**2 * (gravity_body_m_s2(model, data.qpos) @ slides.axes)
     data.act[model.actuator_actadr[slides.motor]] = model.qpos0[slides.qpos] - sag_m
 

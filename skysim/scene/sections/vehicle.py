@@ -26,6 +26,7 @@ from skysim.core.units import (
     PositiveLength,
     QuadraticDrag,
     Seed,
+    Speed,
     Spin,
     Spins,
     Stiffness,
@@ -134,11 +135,11 @@ class TrimsConfig(ConfigModel):
     travel
         Largest position in both directions
     speed_limit
-        Speed of the masses, in m/s
+        Greatest speed of the masses
     """
 
     travel_m: PositiveLength = 0.02
-    speed_limit_m_s: Positive = 0.01
+    speed_limit_m_s: Annotated[Speed, Field(gt=0)] = 0.01
 
 
 class CmgsConfig(ConfigModel):
