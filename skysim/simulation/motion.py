@@ -217,8 +217,8 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
         controls = computer.compute_controls(inputs, attitude, momentum, owed)
         given[k] = computer.achieved_nm
         if scene.vehicle.thrusters:
-            impulse_ns = controls[vehicle.thrusters.motor].sum() * period_s
-            used_kg += propellant_kg(impulse_ns, scene.vehicle.thrusters)
+            impulses_ns = controls[vehicle.thrusters.motor] * period_s
+            used_kg += float(propellant_kg(impulses_ns, scene.vehicle.thrusters).sum())
         angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
         for spun in (vehicle.wheels, vehicle.rotors):
             torque = np.where(spun.motor < 0, 0.0, controls[spun.motor])

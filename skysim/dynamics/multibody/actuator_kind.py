@@ -62,6 +62,13 @@ class Actuators(Protocol):
         ...
 
 
+class MomentumFree:
+    """Actuators that store no momentum."""
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
 class ActuatorDrive(Protocol):
     """Hardware between the commands of a set and MuJoCo's motors, such as valves. Stateful: one object per motion.
 
@@ -71,7 +78,8 @@ class ActuatorDrive(Protocol):
         Present values by name, such as the propellant
     """
 
-    readings: dict[str, Floats]
+    @property
+    def readings(self) -> dict[str, Floats]: ...
 
     def apply(self, control: Floats, angles_rad: Floats) -> None:
         """Replace the commands in the controls (K, nu) of the next K steps by those of the motors at each step.
@@ -219,6 +227,19 @@ def add_motor(
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
         motor.ctrlrange = [-limit, limit]
     return motor
+
+
+def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
+    """Add a servo of a joint, whose set-point is the integral of the commanded rate.
+
+    A critically damped spring pulls the joint to it with the time constant tau,
+
+        torque = kp (set-point - angle) - kv d(angle)/dt,    kp = inertia / tau^2,    kv = 2 inertia / tau
+
+    The inertia of a slide is its mass, and its angle a position.
+    """
+    servo = spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
+    servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
 
 
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:

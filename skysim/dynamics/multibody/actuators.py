@@ -18,6 +18,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
     ControlInput,
+    MomentumFree,
     add_motor,
     joints,
     sites,
@@ -73,7 +74,7 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
         kind.add(spec, model, getattr(vehicle, kind.key))
 
 
-class IdealTorque:
+class IdealTorque(MomentumFree):
     """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
 
     def __init__(self, motor: Ints, limit_nm: float) -> None:
@@ -86,9 +87,6 @@ class IdealTorque:
 
     def command_map(self) -> tuple[Floats, float]:
         return np.eye(3), self.limit_nm
-
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:

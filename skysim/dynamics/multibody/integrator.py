@@ -146,8 +146,8 @@ class Simulation:
         """
         # 1. Room.
         self.discard_old(len(control))
-        # 2. Integration; step by step while the friction of a wheel may change.
-        if self.stiction is None or self.stiction.is_far(self.speeds_rad_s, len(control)):
+        # 2. Integration; step by step if the friction of a wheel may change.
+        if self.stiction is None:
             self.integrate(control)
         else:
             for row in control:

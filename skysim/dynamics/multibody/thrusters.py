@@ -15,9 +15,9 @@ give pulses of the full thrust F (`ValveDrive`):
 Every step of the integration gets the mean of f over it, so impulse and propellant are exact.
 """
 
+import itertools
 from typing import Any
 
-import mujoco
 import numpy as np
 from scipy.optimize import nnls
 
@@ -26,11 +26,11 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     ControlInput,
-    add_motor,
+    MomentumFree,
     scale_to_limit,
     sites,
 )
-from skysim.dynamics.multibody.fans import Fans, FanSet
+from skysim.dynamics.multibody.fans import Fans, FanSet, add_force
 from skysim.scene.sections.vehicle import ThrustersConfig
 
 THRUSTER = "thruster_"
@@ -40,7 +40,7 @@ SHARING = 1e-4
 SHORTEST_LAG_S = 1e-15  # stands for no lag
 
 
-class ThrusterActuator:
+class ThrusterActuator(MomentumFree):
     """Actuators of the flight computer: one-sided thrusters, commanded as if their thrust were continuous.
 
     Parameters
@@ -79,16 +79,12 @@ class ThrusterActuator:
         The scale is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
         """
         both_ways = self.model.thrust_from_torque
-        lattice = np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3)
         scales = [
             self.thrusts(torque).max() / np.abs(both_ways @ torque).max()
-            for torque in lattice
+            for torque in map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=3))
             if (both_ways @ torque).any()
         ]
         return both_ways * max(scales, default=1.0), self.model.thrust_limit_n
-
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
 
 
 def propellant_kg(impulse_ns: Floats, config: ThrustersConfig) -> Floats:
@@ -119,13 +115,12 @@ class ValveDrive:
     def __init__(self, model: Any, config: ThrustersConfig) -> None:
         self.config = config
         self.motor = Fans.from_model(model, THRUSTER).motor
-        self.step_s = float(model.opt.timestep)
+        self.step_s = np.float64(model.opt.timestep)
         self.lag_s = max(config.time_constant_s, SHORTEST_LAG_S)
-        self.thrust_n = np.zeros(len(self.motor))
-        self.saved_ns = np.zeros(len(self.motor))
-        self.begun_ns = np.zeros(len(self.motor))
+        zeros = np.zeros(len(self.motor))
+        self.thrust_n = self.saved_ns = self.begun_ns = zeros
         self.readings = {
-            "thruster_duty": np.zeros(len(self.motor)),
+            "thruster_duty": zeros,
             "propellant_kg": np.array(config.propellant_kg),
         }
 
@@ -142,8 +137,7 @@ class ValveDrive:
         share = np.clip(before_kg / np.maximum(flow_kg, np.finfo(float).tiny), 0.0, 1.0)
         control[:, self.motor] = impulse_ns * (share / self.step_s)[:, None]
         left_kg = np.maximum(left_kg - (flow_kg * share).sum(), 0.0)
-        if not left_kg:
-            self.thrust_n[:] = 0.0
+        self.thrust_n = self.thrust_n * (left_kg > 0)
         self.readings = {
             "thruster_duty": open_s / times_s[-1],
             "propellant_kg": np.asarray(left_kg),
@@ -175,9 +169,10 @@ class ValveDrive:
 
         and so on from the time when F becomes 0. Afterwards `thrust_n` is f at the last time.
         """
-        full_n = self.config.thrust_n if self.readings["propellant_kg"] else 0.0
-        if self.config.supply == "blowdown":
-            full_n *= self.readings["propellant_kg"] / self.config.propellant_kg
+        left = self.readings["propellant_kg"] / self.config.propellant_kg
+        full_n = self.config.thrust_n * (
+            left if self.config.supply == "blowdown" else left > 0
+        )
         opened_s = np.minimum(times_s, open_s)
         closed_s = times_s - opened_s
         excess_n = self.thrust_n - full_n
@@ -193,15 +188,7 @@ class ValveDrive:
 def add_thrusters(spec: Any, _: Any, config: ThrustersConfig) -> None:
     """Add a one-sided force at each thruster along z of its site; `ValveDrive` has its lag."""
     for site in sites(spec, THRUSTER):
-        motor = add_motor(
-            spec,
-            site.name,
-            mujoco.mjtTrn.mjTRN_SITE,
-            site.name,
-            config.thrust_n,
-            [0, 0, 1, 0, 0, 0],
-        )
-        motor.ctrlrange = [0.0, config.thrust_n]
+        add_force(spec, site.name, config.thrust_n).ctrlrange = [0.0, config.thrust_n]
 
 
 THRUSTERS = ActuatorKind(

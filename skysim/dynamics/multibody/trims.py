@@ -10,7 +10,6 @@ moving masses. A lead screw is stiff, so its servo is fast, and its set-point le
 
 from typing import Any
 
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     ControlInput,
     Hinges,
+    MomentumFree,
+    add_servo,
     joints,
 )
 from skysim.scene.sections.vehicle import TrimsConfig
@@ -35,11 +36,8 @@ def gravity_body_m_s2(model: Any, angles_rad: Floats) -> Floats:
     return lab_from_body.inv().apply(model.opt.gravity)
 
 
-class TrimActuator:
-    """Actuators of the flight computer: trim masses. A command is a displacement from the position at the start.
-
-    It measures the vertical as an inclinometer without errors would, and counts the steps of its motors. Stateful: one
-    object per motion.
+class TrimMotors:
+    """Motors of the trim masses that count their steps. Stateful: one object per motion.
 
     Parameters
     ----------
@@ -47,6 +45,11 @@ class TrimActuator:
         Compiled model
     config
         The scene's `vehicle.trims`
+
+    Attributes
+    ----------
+    start_m, position_m
+        (n,) positions along the slides at the start and now
     """
 
     def __init__(self, model: Any, config: TrimsConfig) -> None:
@@ -54,8 +57,23 @@ class TrimActuator:
         self.config = config
         self.slides = Hinges.from_model(model, TRIM)
         self.motor = self.slides.motor
-        self.start_m = model.qpos0[self.slides.qpos]
-        self.counted_m = np.zeros(len(self.slides))
+        self.start_m = model.qpos0[self.slides.qpos].copy()
+        self.position_m = self.start_m
+
+    def moved(self, displacement_m: Floats, times_s: Floats) -> Floats:
+        """Positions (K, n) at times (K, 1) after the start of a move to displacements (n,), within the travel."""
+        wanted_m = np.clip(
+            self.start_m + displacement_m, -self.config.travel_m, self.config.travel_m
+        )
+        reach_m = self.config.speed_limit_m_s * times_s
+        return self.position_m + np.clip(wanted_m - self.position_m, -reach_m, reach_m)
+
+
+class TrimActuator(TrimMotors, MomentumFree):
+    """Actuators of the flight computer: trim masses. A command is a displacement from the position at the start.
+
+    The computer measures the vertical as an inclinometer without errors would.
+    """
 
     def torque_per_displacement_n(self, angles_rad: Floats) -> Floats:
         """(3, n) torque on the body for each displacement, m a x g, at a full qpos."""
@@ -68,86 +86,58 @@ class TrimActuator:
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Command the smallest displacements that give the torque, or the nearest to it in least squares.
 
-        Each is clipped to its travel, and the torque returned is that of the displacements in reach of a period.
+        The torque returned is that of the displacements in reach of a period.
         """
-        travel_m = self.config.travel_m
         lever_n = self.torque_per_displacement_n(inputs.angles_rad)
         wanted_m = np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE) @ torque_nm
-        wanted_m = np.clip(wanted_m, -travel_m - self.start_m, travel_m - self.start_m)
         control[self.motor] = wanted_m
-        reach_m = self.config.speed_limit_m_s * inputs.period_s
-        self.counted_m = moved(self.counted_m, wanted_m, reach_m)
-        return lever_n @ self.counted_m
+        self.position_m = self.moved(wanted_m, np.array(inputs.period_s))
+        return np.asarray(lever_n @ (self.position_m - self.start_m))
 
     def command_map(self) -> tuple[Floats, float]:
         lever_n = self.torque_per_displacement_n(self.model.qpos0)
         displacements = np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE)
         return np.asarray(displacements, np.float64), self.config.travel_m
 
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
 
-
-def moved(present_m: Floats, wanted_m: Floats, reach_m: Floats | float) -> Floats:
-    """Positions after moving from present_m towards wanted_m, by no more than reach_m."""
-    return present_m + np.clip(wanted_m - present_m, -reach_m, reach_m)
-
-
-class TrimDrive:
-    """Motors of the trim masses: they move at a limited speed to the commanded displacements.
-
-    Parameters
-    ----------
-    model
-        Compiled model
-    config
-        The scene's `vehicle.trims`
+class TrimDrive(TrimMotors):
+    """The motors themselves: they move at a limited speed to the commanded displacements.
 
     Attributes
     ----------
     readings
         trim_m (n,): positions of the masses along their slides
-    position_m, set_point_m
-        (n,) positions of the motors, and set-points of their servos; None before the first period
+    set_point_m
+        (n,) set-points of the servos; None before the first period
     """
 
-    def __init__(self, model: Any, config: TrimsConfig) -> None:
-        self.model = model
-        self.config = config
-        self.step_s = float(model.opt.timestep)
-        self.slides = Hinges.from_model(model, TRIM)
-        self.start_m = model.qpos0[self.slides.qpos].copy()
-        self.position_m = self.start_m
-        self.set_point_m: Floats | None = None
-        self.readings = {"trim_m": self.start_m}
+    set_point_m: Floats | None = None
+
+    @property
+    def readings(self) -> dict[str, Floats]:
+        return {"trim_m": self.position_m}
 
     def apply(self, control: Floats, angles_rad: Floats) -> None:
         """Replace the displacements by the rates of the servos' set-points."""
-        travel_m = self.config.travel_m
-        motor = self.slides.motor
+        step_s = np.float64(self.model.opt.timestep)
         # 1. Positions after each step.
-        wanted_m = np.clip(self.start_m + control[0, motor], -travel_m, travel_m)
-        times_s = self.step_s * np.arange(1, len(control) + 1)[:, None]
-        path_m = moved(self.position_m, wanted_m, self.config.speed_limit_m_s * times_s)
+        times_s = step_s * np.arange(1, len(control) + 1)[:, None]
+        path_m = self.moved(control[0, self.motor], times_s)
         # 2. A servo yields by the acceleration of gravity over its frequency squared.
         sag_m = SERVO_S**2 * (gravity_body_m_s2(self.model, angles_rad) @ self.slides.axes)
         if self.set_point_m is None:
             self.set_point_m = self.start_m - sag_m
         set_points_m = np.vstack((self.set_point_m, path_m - sag_m))
-        control[:, motor] = np.diff(set_points_m, axis=0) / self.step_s
+        control[:, self.motor] = np.diff(set_points_m, axis=0) / step_s
         self.position_m = path_m[-1]
         self.set_point_m = set_points_m[-1]
-        self.readings = {"trim_m": self.position_m}
 
 
 def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
-    """Add a servo at each slide, critically damped, whose set-point is the integral of its control; see `add_cmgs`."""
+    """Add a servo at each slide, critically damped, whose set-point is the integral of its control."""
     masses_kg = Hinges.from_model(model, TRIM).inertia_kg_m2
     for joint, mass_kg in zip(joints(spec, TRIM), masses_kg, strict=True):
-        servo = spec.add_actuator(
-            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
-        )
-        servo.set_to_intvelocity(kp=mass_kg / SERVO_S**2, kv=2 * mass_kg / SERVO_S)
+        add_servo(spec, joint.name, mass_kg, SERVO_S)
 
 
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:

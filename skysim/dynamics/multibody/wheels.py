@@ -34,11 +34,9 @@ from skysim.scene.sections.vehicle import WheelsConfig
 
 WHEEL = "wheel_"
 
-# Stiction: the speed below which a wheel comes to rest, that above which one at rest was torn loose by a knock, and the
-# most by which a knock changes a speed within a control period.
+# Stiction: the speed below which a wheel comes to rest, and that above which one at rest was torn loose by a knock.
 REST_RAD_S = 1e-6
 TORN_RAD_S = 1e-2
-JOLT_RAD_S = 1.0
 # MuJoCo's parameters of a friction that lets no wheel creep: the shortest time constant, and the greatest impedance.
 HARD_FRICTION = ([2e-3, 1.0], [0.9999, 0.9999, 1e-3, 0.5, 2.0])
 
@@ -147,14 +145,6 @@ class Stiction:
         self.joints = Hinges.from_model(model, WHEEL)
         self.sticks = np.zeros(len(self.joints), dtype=bool)
         self.before_rad_s = np.zeros(len(self.joints))
-
-    def is_far(self, speeds_rad_s: Floats, steps: int) -> bool:
-        """Whether no wheel can come to rest within some steps; the arguments are the full qvel and their number."""
-        wheels = np.abs(speeds_rad_s[self.joints.dof])
-        most_nm = self.config.torque_limit_nm + self.config.stiction_nm
-        most_nm += self.config.viscous_nms * wheels
-        lost = most_nm / self.joints.inertia_kg_m2 * steps * self.model.opt.timestep
-        return bool((wheels > 2 * lost + JOLT_RAD_S).all()) and not self.sticks.any()
 
     def set_friction(
         self, control: Floats, speeds_rad_s: Floats, body_rad_s2: Floats

@@ -100,9 +100,8 @@ def actuators(plan: Plan) -> Fact | None:
 
 def propellant(plan: Plan, forecast: TorqueForecast | None) -> tuple[Fact | None, str]:
     """The propellant that the thrusters need for the maneuver, and a warning if the tank has less."""
-    control = plan.scene.motion.control
     config = plan.lab.vehicle.config.thrusters
-    if not (config and control and forecast and control.actuators == "thrusters"):
+    if not (config and forecast and forecast.propellant_kg):
         return None, ""
     needed = f"{short(1e3 * forecast.propellant_kg)} g"
     held = f"{short(1e3 * config.propellant_kg)} g"
