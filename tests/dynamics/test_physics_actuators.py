@@ -382,7 +382,7 @@ def test_a_jolt_of_the_body_tears_a_sticking_wheel_loose() -> None:
 
 
 def test_a_stiction_below_the_coulomb_friction_is_refused() -> None:
-    with pytest.raises(ValidationError, match=r"stiction: 0.001 N m; allowed: 0, or coulomb"):
+    with pytest.raises(ValidationError, match=r"stiction: below coulomb 0.002 N m"):
         vehicle_config(wheels={"coulomb": "2 mN m", "stiction": "1 mN m"})
 
 

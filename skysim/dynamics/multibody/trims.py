@@ -75,29 +75,25 @@ class TrimActuator(TrimMotors, MomentumFree):
     The computer measures the vertical as an inclinometer without errors would.
     """
 
-    def torque_per_displacement_n(self, angles_rad: Floats) -> Floats:
-        """(3, n) torque on the body for each displacement, m a x g, at a full qpos."""
+    def levers_n(self, angles_rad: Floats) -> tuple[Floats, Floats]:
+        """(3, n) torque on the body for each displacement, m a x g, at a full qpos, and its pseudo-inverse (n, 3)."""
         gravity = gravity_body_m_s2(self.model, angles_rad)
         # The inertia of a slide is its mass.
-        return (
-            np.cross(self.slides.axes, gravity[:, None], axis=0) * self.slides.inertia_kg_m2
-        )
+        lever_n = np.cross(self.slides.axes.T, gravity).T * self.slides.inertia_kg_m2
+        return lever_n, np.asarray(np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE), np.float64)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Command the smallest displacements that give the torque, or the nearest to it in least squares.
 
         The torque returned is that of the displacements in reach of a period.
         """
-        lever_n = self.torque_per_displacement_n(inputs.angles_rad)
-        wanted_m = np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE) @ torque_nm
-        control[self.motor] = wanted_m
+        lever_n, displacement_from_torque = self.levers_n(inputs.angles_rad)
+        control[self.motor] = wanted_m = displacement_from_torque @ torque_nm
         self.position_m = self.moved(wanted_m, np.array(inputs.period_s))
         return np.asarray(lever_n @ (self.position_m - self.start_m))
 
     def command_map(self) -> tuple[Floats, float]:
-        lever_n = self.torque_per_displacement_n(self.model.qpos0)
-        displacements = np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE)
-        return np.asarray(displacements, np.float64), self.config.travel_m
+        return self.levers_n(self.model.qpos0)[1], self.config.travel_m
 
 
 class TrimDrive(TrimMotors):

@@ -34,9 +34,7 @@ from skysim.scene.sections.vehicle import WheelsConfig
 
 WHEEL = "wheel_"
 
-# Stiction: the speed below which a wheel comes to rest, and that above which one at rest was torn loose by a knock.
-REST_RAD_S = 1e-6
-TORN_RAD_S = 1e-2
+REST_RAD_S = 1e-6  # speed below which a wheel is at rest
 # MuJoCo's parameters of a friction that lets no wheel creep: the shortest time constant, and the greatest impedance.
 HARD_FRICTION = ([2e-3, 1.0], [0.9999, 0.9999, 1e-3, 0.5, 2.0])
 
@@ -154,11 +152,10 @@ class Stiction:
         The acceleration of the body (3,) is that of the step before.
         """
         speed = speeds_rad_s[self.joints.dof]
-        load_nm = control[self.joints.motor]
-        load_nm = load_nm - self.joints.inertia_kg_m2 * (body_rad_s2 @ self.joints.axes)
+        inertial_nm = self.joints.inertia_kg_m2 * (body_rad_s2 @ self.joints.axes)
+        load_nm = control[self.joints.motor] - inertial_nm
         # A wheel comes to rest where its speed changes sign, or by friction alone, which lets it creep to zero.
-        limit_rad_s = np.where(self.sticks, TORN_RAD_S, REST_RAD_S)
-        rests = (np.abs(speed) < limit_rad_s) | (speed * self.before_rad_s < 0)
+        rests = self.sticks | (np.abs(speed) < REST_RAD_S) | (speed * self.before_rad_s < 0)
         self.sticks = rests & (np.abs(load_nm) <= self.config.stiction_nm)
         self.before_rad_s = speed.copy()
         self.model.dof_frictionloss[self.joints.dof] = np.where(

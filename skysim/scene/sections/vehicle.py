@@ -73,11 +73,7 @@ class WheelsConfig(ConfigModel):
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         if 0 < self.stiction_nm < self.coulomb_nm:
-            raise InputError(
-                "stiction",
-                f"{self.stiction_nm:g} N m",
-                f"0, or coulomb {self.coulomb_nm:g} N m and more",
-            )
+            raise InputError("stiction", f"below coulomb {self.coulomb_nm:g} N m")
         return self
 
 

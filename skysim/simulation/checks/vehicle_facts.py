@@ -75,8 +75,7 @@ def actuators(plan: Plan) -> Fact | None:
         limit = f"{short(thrusters.thrust_n)} N"
         rows.append(("thrusters", limit, vehicle.thrusters, None))
     if trim := config.trims or config.trim:
-        key = "trims" if config.trims else "trim"
-        rows.append((key, f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
+        rows.append(("trim", f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
     lines = []
     values: dict[str, Any] = {}
     for key, limit, members, spun_rpm in rows:
@@ -103,15 +102,12 @@ def propellant(plan: Plan, forecast: TorqueForecast | None) -> tuple[Fact | None
     config = plan.lab.vehicle.config.thrusters
     if not (config and forecast and forecast.propellant_kg):
         return None, ""
-    needed = f"{short(1e3 * forecast.propellant_kg)} g"
-    held = f"{short(1e3 * config.propellant_kg)} g"
+    grams = [short(1e3 * one) for one in (forecast.propellant_kg, config.propellant_kg)]
+    text = f"the maneuver needs {' of '.join(grams)} g"
     values = {"needed_kg": forecast.propellant_kg, "propellant_kg": config.propellant_kg}
-    warning = (
-        f"vehicle.thrusters.propellant: the maneuver needs {needed} of {held}; change it to a slower or smaller one, or"
-        " take more"
-    )
-    fact = Fact("propellant", [f"the maneuver needs {needed} of {held}"], values)
-    return fact, warning if forecast.propellant_kg > config.propellant_kg else ""
+    warning = f"vehicle.thrusters.propellant: {text}; change it to a slower or smaller one, or take more"
+    is_short = forecast.propellant_kg > config.propellant_kg
+    return Fact("propellant", [text], values), warning if is_short else ""
 
 
 def maneuver(plan: Plan) -> Fact | None:
