@@ -79,6 +79,7 @@ def test_scenes_are_shipped() -> None:
         "simsat_slew",
         "simsat_cmg",
         "simsat_bump",
+        "simsat_thrusters",
         "tas2_vscmg",
     }
     lit = {
@@ -394,6 +395,7 @@ def test_a_second_of_random_control_of_every_actuator_gives_no_mujoco_warning(
         },
         "gimbal_": {"cmgs": {"rotor_torque_limit": "0.1 N m"}},
         "fan_": {"fans": {}},
+        "thruster_": {"thrusters": {}},
     }
     balanced = {"center_of_mass": ["0 m", "0 m", "0 m"]}
     given = {"model": f"vehicles/{model}", "mount": mount} | balanced
@@ -405,7 +407,8 @@ def test_a_second_of_random_control_of_every_actuator_gives_no_mujoco_warning(
     assert flight.steps_left == 0
     assert np.isfinite(flight.states).all()
     assert flight.model.nu == 3 + sum(
-        name.startswith(("wheel_", "gimbal_", "rotor_", "fan_")) for name in named
+        name.startswith(("wheel_", "gimbal_", "rotor_", "fan_", "thruster_"))
+        for name in named
     )
     up = Rotation.from_quat(flight.states[:, 1:5], scalar_first=True).as_matrix()[:, 2, 2]
     tilt_deg = np.degrees(np.arccos(np.clip(up, -1, 1))).max()

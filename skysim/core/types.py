@@ -211,6 +211,8 @@ class Telemetry:
         (K,) command, or speed, of each actuator of the controller relative to its limit, by name
     wheel_names, gimbal_names
         Names of the joints of wheels and gimbals
+    readings
+        Readings of further actuators by name, such as the propellant in kg: (K,) or (K, n)
     """
 
     t_s: Floats
@@ -236,6 +238,7 @@ class Telemetry:
     loads: dict[str, Floats] = field(default_factory=dict)
     wheel_names: tuple[str, ...] = ()
     gimbal_names: tuple[str, ...] = ()
+    readings: dict[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,12 +33,13 @@ QUANTITY_PATTERN = (
 # Suffixes of fields that `quantity` parses, which the YAML keys do not have. `dark_e_s` and `rate_deg_s` are bare
 # numbers and keep their suffixes.
 SI_SUFFIX = re.compile(
-    r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|nm_rad|nms|nms2)$"
+    r"(?<!_deg)(?<!_rad)(?<!_e)(?<!^e)(?<!_cm2)(?<!_um)_(m_s|m|s|n|kg|kg_m|kg_m2|cd|w_sr|nm|ns|nm_rad|nms|nms2)$"
 )
 
 # The SI unit of each suffix, in the form that the loader accepts.
 SI_UNITS = {
     "m": "m",
+    "m_s": "m/s",
     "s": "s",
     "n": "N",
     "kg": "kg",
@@ -47,6 +48,7 @@ SI_UNITS = {
     "cd": "cd",
     "w_sr": "W/sr",
     "nm": "N m",
+    "ns": "N s",
     "nm_rad": "N m/rad",
     "nms": "N m s",
     "nms2": "N m s2",
@@ -145,6 +147,8 @@ Intensity = Annotated[Number, with_unit("cd", "luminous intensity", '"7.7 mcd"')
 RadiantIntensity = Annotated[Number, with_unit("W sr-1", "radiant intensity", '"3 mW/sr"')]
 Torque = Annotated[Number, with_unit("N m", "torque", '"0.5 N m"')]
 Force = Annotated[Number, with_unit("N", "force", '"0.5 N"')]
+Speed = Annotated[Number, with_unit("m s-1", "speed", '"10 mm/s"')]
+LinearImpulse = Annotated[Number, with_unit("N s", "impulse", '"5 mN s"')]
 Momentum = Annotated[Number, with_unit("N m s", "angular momentum", '"2 N m s"')]
 Damping = Annotated[Number, with_unit("N m s", "torque per rate", '"1e-4 N m s"')]
 QuadraticDrag = Annotated[

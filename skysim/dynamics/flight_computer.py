@@ -118,12 +118,7 @@ class FlightComputer:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = self.actuator_sets[self.config.actuators]
-        motors = {
-            "wheels": vehicle.wheels.motor,
-            "cmgs": vehicle.gimbals.motor,
-            "fans": vehicle.fans.motor,
-        }
-        self.motors = motors.get(self.config.actuators, vehicle.torques)
+        self.motors = self.actuator.motor
         self.names = [vehicle.model.actuator(number).name for number in self.motors]
         self.limit = self.actuator.command_map()[1]
         self.law = self.build_law(scene, vehicle, reference, programs)

@@ -54,6 +54,7 @@ MOTION = {  # sentences of the motion's statistics, by the statistic that a scen
     "momentum_nms_worst": "maximum stored momentum {momentum_nms_worst:.3g} N m s",
     "wheel_rpm_worst": "maximum wheel speed {wheel_rpm_worst:.0f} rpm",
     "manipulability_least": "minimum CMG manipulability {manipulability_least:.2g}",
+    "propellant_g_used": "propellant used {propellant_g_used:.3g} g",
     "imu_deg_worst": "IMU alone: error {imu_deg_end:.3g}° at the end; gyros saturated for {gyro_saturated_s:.2g} s",
     "filter_deg_worst": "filter: worst {filter_deg_worst:.3g}°, at the end {filter_arcsec_end:.3g}″, "
     "bias error {filter_bias_deg_h_end:.2g}°/h",

@@ -57,6 +57,8 @@ def summary(log: Telemetry) -> dict[str, float]:
             statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
         if log.manipulability is not None:
             statistics["manipulability_least"] = log.manipulability.min()
+        if "propellant_kg" in log.readings:
+            statistics["propellant_g_used"] = 1e3 * np.ptp(log.readings["propellant_kg"])
     if imu is not None and log.saturated is not None:
         statistics |= {"imu_deg_worst": imu.max(), "imu_deg_end": imu[-1]}
         statistics["gyro_saturated_s"] = log.saturated.sum() * log.period_s
@@ -127,6 +129,9 @@ def table(log: Telemetry) -> Any:
             f"{name}_{unit}": column for name, column in zip(names, joints.T, strict=True)
         }
     columns |= {f"load_{name}": load for name, load in log.loads.items()}
+    for name, values in log.readings.items():
+        for n, column in enumerate(values.reshape(len(values), -1).T):
+            columns[f"{name}_{n + 1}" if values.ndim > 1 else name] = column
     if log.manipulability is not None:
         columns["manipulability"] = log.manipulability
     if log.saturated is not None:

@@ -211,8 +211,10 @@ BODY_KEYS = (
     "torque_limit",
     "wheels",
     "fans",
+    "thrusters",
     "cmgs",
     "trim",
+    "trims",
     "drag",
 )
 

@@ -35,7 +35,7 @@ from skysim.simulation.lab import (
     build_tracker,
     with_parts,
 )
-from skysim.simulation.motion import Motion, history_s
+from skysim.simulation.motion import Motion, history_s, readings_of
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
@@ -92,6 +92,9 @@ class State:
         (n,) speeds of the reaction wheels
     gimbal_rad
         (n,) angles of the CMGs' gimbals
+    readings
+        Of thrusters thruster_duty (n,), the open fraction of the last control period, and propellant_kg; of trim
+        masses that move trim_m (n,), their positions
     """
 
     t_s: float
@@ -99,6 +102,7 @@ class State:
     rate_body_rad_s: Floats
     wheel_rad_s: Floats
     gimbal_rad: Floats
+    readings: dict[str, Floats]
 
 
 class Schedule:
@@ -258,6 +262,7 @@ class Flight:
             simulation.rate_body_rad_s.copy(),
             simulation.speeds_rad_s[vehicle.wheels.dof],
             simulation.angles_rad[vehicle.gimbals.qpos],
+            readings_of(self.motion.drives),
         )
 
     def step(
@@ -297,7 +302,8 @@ class Flight:
             (3,) torque in body axes; None without
         motors
             Commands (n,) of single motors by the key of their actuators: torques of `wheels` in N m, gimbal rates of
-            `cmgs` in rad/s, thrusts of `fans` in N. Those beyond a limit are clipped to it
+            `cmgs` in rad/s, thrusts of `fans` and `thrusters` in N, displacements of `trims` in m. Those beyond a limit
+            are clipped to it
 
         Raises
         ------

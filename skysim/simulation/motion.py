@@ -1,20 +1,21 @@
 """The vehicle in motion: flight computer, dynamics, disturbances, vibration and IMU, one control period at a time.
 
-`check_reference` refuses a maneuver that exceeds the vehicle's limits, `shortfall` forecasts what the actuators cannot
-give. `Motion.advance` simulates a control period:
+`check_reference` refuses a maneuver that exceeds the vehicle's limits, `forecast_torque` forecasts what the actuators
+give, and `shortfall` tells what they cannot. `Motion.advance` simulates a control period:
 
 1. The controller reads the attitude and the rate, true or estimated.
 2. The flight computer sets the actuators.
 3. Disturbance torques are added.
 4. `TelemetryRecorder` records the state, before it changes.
-5. MuJoCo integrates the equations of motion; the controls are held.
+5. Valves and the like turn the controls into those of every step, else the controls are held; MuJoCo integrates the
+   equations of motion.
 6. The IMU samples the motion with its vibration, and the navigation takes the samples.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,9 +32,10 @@ from skysim.dynamics.flight_computer import NO_COMMANDS, Commands, FlightCompute
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
-from skysim.dynamics.multibody.actuator_kind import ControlInput
-from skysim.dynamics.multibody.actuators import build_actuators
+from skysim.dynamics.multibody.actuator_kind import ActuatorDrive, ControlInput
+from skysim.dynamics.multibody.actuators import build_actuators, build_drives
 from skysim.dynamics.multibody.cmgs import CmgActuator
+from skysim.dynamics.multibody.thrusters import propellant_kg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -147,8 +149,28 @@ FLOWN_S = 300.0  # longest flight that shows how long actuators are saturated
 AT_LIMIT = 0.999  # load from which an actuator is saturated: friction keeps a wheel just below its limit
 
 
-def shortfall(lab: Lab) -> str:
-    """A warning if the actuators cannot give the torque that the maneuver needs; empty if they can.
+class TorqueForecast(NamedTuple):
+    """The torque that a maneuver needs, and what the actuators give.
+
+    Attributes
+    ----------
+    period_s, t_s
+        Forecast period, and (K,) starts of the periods
+    needed_nm, given_nm
+        (K, 3) torques in body axes
+    propellant_kg
+        Propellant that the thrusters use for it; 0 without thrusters
+    """
+
+    period_s: float
+    t_s: Floats
+    needed_nm: Floats
+    given_nm: Floats
+    propellant_kg: float
+
+
+def forecast_torque(lab: Lab) -> TorqueForecast | None:
+    """The forecast of the torques of a maneuver; None without a controller.
 
     The vehicle is put on the reference in each period. Then
 
@@ -161,7 +183,7 @@ def shortfall(lab: Lab) -> str:
     scene = lab.scene
     control = scene.motion.control
     if control is None or scene.motion.is_prescribed:
-        return ""
+        return None
     # The torque is given, so the control law does not matter.
     pid = control.model_copy(update={"law": "pid"})
     motion = scene.motion.model_copy(update={"control": pid})
@@ -176,6 +198,7 @@ def shortfall(lab: Lab) -> str:
     disturbances = build_disturbances(lab, (), period_s)
     needed = np.zeros((len(t_s), 3))
     given = np.zeros((len(t_s), 3))
+    used_kg = 0.0
     following = reference.state_at(0.0)
     for k, t in enumerate(t_s.tolist()):
         # 1. Torque.
@@ -193,10 +216,22 @@ def shortfall(lab: Lab) -> str:
         owed = (needed - given).sum(axis=0)
         controls = computer.compute_controls(inputs, attitude, momentum, Commands(owed))
         given[k] = computer.achieved_nm
+        if scene.vehicle.thrusters:
+            impulses_ns = controls[vehicle.thrusters.motor] * period_s
+            used_kg += float(propellant_kg(impulses_ns, scene.vehicle.thrusters).sum())
         angles[vehicle.gimbals.qpos] += period_s * controls[vehicle.gimbals.motor]
         for spun in (vehicle.wheels, vehicle.rotors):
             torque = np.where(spun.motor < 0, 0.0, controls[spun.motor])
             speeds[spun.dof] += period_s * torque / spun.inertia_kg_m2
+    return TorqueForecast(period_s, t_s, needed, given, used_kg)
+
+
+def shortfall(lab: Lab, forecast: TorqueForecast | None) -> str:
+    """A warning if the actuators cannot give the torque that the maneuver needs; empty if they can."""
+    control = lab.scene.motion.control
+    if control is None or forecast is None:
+        return ""
+    period_s, t_s, needed, given, _ = forecast
     missing = np.linalg.norm(needed - given, axis=1)
     if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
@@ -263,10 +298,12 @@ class TelemetryRecorder:
         simulation: Simulation,
         flight_computer: FlightComputer,
         navigation: Navigation | None,
+        drives: Sequence[ActuatorDrive],
     ) -> None:
         self.simulation = simulation
         self.flight_computer = flight_computer
         self.navigation = navigation
+        self.drives = drives
         steps = round(flight_computer.period_s / simulation.step_s)
         self.at_step = np.arange(0, simulation.last_step, steps)
         self.steps_per_tick = steps
@@ -286,6 +323,7 @@ class TelemetryRecorder:
             ("filter_wxyz", float, 4),
             ("filter", float, (3, 3)),
             ("mountings", float, (len(self.mounted), 2, 3)),
+            *((name, float, one.shape) for name, one in readings_of(drives).items()),
         ]
         self.rows = np.zeros(len(self.at_step), columns)
 
@@ -297,6 +335,8 @@ class TelemetryRecorder:
         row["disturbance_nm"] = disturbance_nm
         row["momentum_nms"] = momentum_nms
         row["loads"] = self.flight_computer.loads
+        for name, values in readings_of(self.drives).items():
+            row[name] = values
         navigation = self.navigation
         if navigation is None:
             return
@@ -322,11 +362,15 @@ class TelemetryRecorder:
         states = simulation.states[steps]
         rows = self.rows[: len(steps)]
         nq = simulation.model.nq
+        readings = readings_of(self.drives)
         # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
         for k in np.flatnonzero(~rows["recorded"]):
             rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
                 states[k, 1 : 1 + nq], states[k, 1 + nq :]
             )
+            # Actuators without commands keep their readings.
+            for name in readings:
+                rows[name][k] = rows[name][k - 1]
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
@@ -362,6 +406,7 @@ class TelemetryRecorder:
             loads=dict(zip(self.flight_computer.names, rows["loads"].T, strict=True)),
             wheel_names=vehicle.wheels.names,
             gimbal_names=vehicle.gimbals.names,
+            readings={name: rows[name] for name in readings},
             **estimates,
         )
 
@@ -380,6 +425,11 @@ class TelemetryRecorder:
             camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], relative_rad[n])
             for n, camera in enumerate(cameras)
         }
+
+
+def readings_of(drives: Sequence[ActuatorDrive]) -> dict[str, Floats]:
+    """The present readings of the actuators' hardware, by name."""
+    return {name: values for drive in drives for name, values in drive.readings.items()}
 
 
 def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
@@ -450,6 +500,7 @@ class Motion:
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
+        self.drives = build_drives(scene.vehicle, vehicle.model)
         self.navigation = None
         if scene.vehicle.imu is not None:
             self.navigation = Navigation(
@@ -466,7 +517,7 @@ class Motion:
         self.recorder = None
         if kept_s is None:
             self.recorder = TelemetryRecorder(
-                self.simulation, self.flight_computer, self.navigation
+                self.simulation, self.flight_computer, self.navigation, self.drives
             )
 
     def close(self) -> None:
@@ -528,6 +579,8 @@ class Motion:
         if self.recorder:
             self.recorder.record(momentum, mean_nm)
         # 5. Integration.
+        for drive in self.drives:
+            drive.apply(control, angles)
         simulation.advance(control)
         # 6. IMU.
         if navigation:

@@ -35,12 +35,19 @@ VARIABLE = {
     "vehicle.cmgs": '{rotor_torque_limit: "0.4 N m", rotor_rpm: 1200}',
 }
 FANS = {"vehicle.fans": '{thrust_limit: "0.8 N", time_constant: "20 ms"}'}
+THRUSTERS = {
+    "vehicle.model": "vehicles/simsat_thrusters.xml",
+    "vehicle.mass": "80 kg",
+    "vehicle.inertia": '["6 kg m2", "6.5 kg m2", "9 kg m2"]',
+    "vehicle.thrusters": '{thrust: "0.8 N"}',
+}
 SETS = {
     "ideal": ("ideal", {}),
     "wheels": ("wheels", WHEELS),
     "cmgs": ("cmgs", CMGS),
     "cmgs of variable speed": ("cmgs", VARIABLE),
     "fans": ("fans", FANS),
+    "thrusters": ("thrusters", THRUSTERS),
 }
 
 
@@ -97,6 +104,7 @@ def bodys_inertia(vehicle: multibody.VehicleModel) -> Floats:
         ("ideal", 1e-9),
         ("wheels", 1e-4),
         ("fans", 1e-3),
+        ("thrusters", 1e-6),
         ("cmgs", 1e-2),
         ("cmgs of variable speed", 1e-2),
     ],
@@ -151,9 +159,10 @@ def test_the_anti_windup_uses_the_actuator_limits(name: str) -> None:
         "cmgs": vehicle.gimbals.motor,
         "cmgs of variable speed": vehicle.gimbals.motor,
         "fans": vehicle.fans.motor,
+        "thrusters": vehicle.thrusters.motor,
     }[name]
     largest = {"ideal": 0.6, "wheels": 0.6, "cmgs": math.radians(60), "fans": 0.8}
-    largest["cmgs of variable speed"] = math.radians(60)
+    largest |= {"cmgs of variable speed": math.radians(60), "thrusters": 0.8}
     assert np.abs(control[motors]).max() == pytest.approx(largest[name], rel=1e-9)
     about_y = {"ideal": 1e-4 * 0.01}.get(name, 0.0)
     np.testing.assert_allclose(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 import pytest
+from pydantic import ValidationError
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -295,6 +298,92 @@ def test_gimbals_start_where_the_scene_has_them() -> None:
         np.tile([10, -20, 30, 90], (1001, 1)),
         atol=1e-6,
     )
+
+
+# --- stiction -----------------------------------------------------------------------------------------------
+
+STICKY = {
+    "torque_limit": "0.2 N m",
+    "coulomb": "2 mN m",
+    "viscous": "1e-4 N m s",
+    "stiction": "3 mN m",
+}
+
+
+def one_axis_speed(
+    motor_nm: Callable[[float], float], start_rad_s: float, t_s: Floats
+) -> Floats:
+    """Speeds of wheel x relative to the body, integrated by hand from rest or motion until it would stick."""
+    reduced = WHEEL_KG_M2 * (INERTIA[0] - WHEEL_KG_M2) / INERTIA[0]
+
+    def rate(t: float, speed: Floats) -> list[float]:
+        friction = 2e-3 * np.sign(speed[0] or motor_nm(t)) + 1e-4 * speed[0]
+        return [(motor_nm(t) - friction) / reduced]
+
+    solved = solve_ivp(
+        rate, t_s[[0, -1]], [start_rad_s], t_eval=t_s, rtol=1e-9, atol=1e-12, max_step=0.01
+    )
+    return solved.y[0]
+
+
+def test_a_wheel_at_rest_breaks_away_at_its_stiction() -> None:
+    """The motor's torque grows as 2 mN m/s t: 3 mN m at 1.5 s, from where Coulomb's 2 mN m and viscous friction act.
+
+    The first step with a torque above the stiction is that of 1.5 s, or the one after.
+    """
+    vehicle = multibody.build(vehicle_config(mount="free", wheels=STICKY))
+    control = still(vehicle, 3.0)
+    t_s = np.arange(3001) * 1e-3
+    control[:, vehicle.wheels.motor[0]] = 2e-3 * t_s[:-1]
+    flight = flown(vehicle, STILL, control)
+    wheel = speeds(flight)[:, vehicle.wheels.dof[0]]
+    assert np.abs(wheel[:1500]).max() < 1e-5
+    assert wheel[1503] > 1e-4
+    expected = one_axis_speed(lambda t: 2e-3 * t, 0.0, t_s[1500:])
+    np.testing.assert_allclose(wheel[1500:], expected, rtol=0, atol=3e-3 * expected[-1])
+    # Nothing from outside: the total angular momentum stays zero.
+    body = speeds(flight)[:, 0]
+    np.testing.assert_allclose(INERTIA[0] * body + WHEEL_KG_M2 * wheel, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("torque_mnm", "sticks"), [(-2.8, True), (-3.2, False)])
+def test_a_wheel_sticks_at_zero_speed_unless_the_torque_exceeds_its_stiction(
+    torque_mnm: float, sticks: bool
+) -> None:
+    """From 20 rpm: a torque between Coulomb's friction and the stiction stops the wheel, a greater one reverses it."""
+    start = 20 * RPM
+    vehicle = multibody.build(
+        vehicle_config(mount="free", wheels=STICKY | {"start_rpm": [20, 0, 0]})
+    )
+    flight = flown(
+        vehicle, STILL, held(vehicle, vehicle.wheels.motor[0], torque_mnm * 1e-3, 8.0)
+    )
+    wheel = speeds(flight)[:, vehicle.wheels.dof[0]]
+    t_s = np.arange(8001) * 1e-3
+    expected = one_axis_speed(lambda _: torque_mnm * 1e-3, start, t_s)
+    stops = int(np.flatnonzero(expected < 0)[0])
+    if sticks:
+        expected[stops:] = 0
+    assert 3000 < stops < 6000
+    np.testing.assert_allclose(wheel, expected, rtol=0, atol=2e-3 * start)
+    assert sticks == (np.abs(wheel[stops + 10 :]).max() < 1e-5)
+
+
+def test_a_jolt_of_the_body_tears_a_sticking_wheel_loose() -> None:
+    """A torque of 5 N m on the body asks 5 mN m and more of the bearing at first: J_w T / J = 8.4 mN m > 3 mN m."""
+    vehicle = multibody.build(vehicle_config(mount="free", wheels=STICKY))
+    control = still(vehicle, 0.5)
+    control[:100, vehicle.torques[0]] = 5.0
+    flight = flown(vehicle, STILL, control)
+    wheel = speeds(flight)[:, vehicle.wheels.dof[0]]
+    # On a wheel that the body leaves behind, only friction acts: J_w (dw/dt + a) = 2 mN m.
+    relative = (2e-3 / WHEEL_KG_M2 - 5.0 / (INERTIA[0] - WHEEL_KG_M2)) * 0.1
+    assert wheel[100] == pytest.approx(relative, rel=0.03)
+
+
+def test_a_stiction_below_the_coulomb_friction_is_refused() -> None:
+    with pytest.raises(ValidationError, match=r"stiction: below coulomb 0.002 N m"):
+        vehicle_config(wheels={"coulomb": "2 mN m", "stiction": "1 mN m"})
 
 
 # --- fans ---------------------------------------------------------------------------------------------------

@@ -90,6 +90,8 @@ def complaint_and_place(
         ("vehicle.wheels.dynamic_imbalance", "10 g cm2", 1e-6),
         ("vehicle.fans.thrust_limit", "0.1 lbf", 0.444822),
         ("vehicle.fans.time_constant", "200 ms", 0.2),
+        ("vehicle.thrusters.minimum_impulse", "5 mN s", 5e-3),
+        ("vehicle.trims.speed_limit", "10 mm/s", 0.01),
         ("vehicle.cmgs.gimbal_time_constant", "20 ms", 0.02),
         ("vehicle.cmgs.rotor_torque_limit", "0.1 N m", 0.1),
         ("vehicle.drag.viscous", "2 mN m s", 2e-3),
@@ -200,6 +202,8 @@ SUFFIXES = (
     "_kg",
     "_cd",
     "_n",
+    "_ns",
+    "_m_s",
     "_m",
     "_s",
 )
@@ -664,7 +668,7 @@ UNLOAD = "{start: 2 N m s, stop: 1 N m s}"
                 {"motion.control": f"{{actuators: {kind}}}"},
                 f"motion.control.actuators: requires the section vehicle.{kind}",
             )
-            for kind in ("wheels", "cmgs", "fans")
+            for kind in ("wheels", "cmgs", "fans", "thrusters", "trims")
         ),
         *(
             (

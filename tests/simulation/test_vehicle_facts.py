@@ -176,7 +176,7 @@ def test_the_forecast_of_saturation_is_that_of_the_flight() -> None:
         exposure__frames="4",
         exposure__rate_hz="1",
     )
-    forecast = motion.shortfall(lab)
+    forecast = motion.shortfall(lab, motion.forecast_torque(lab))
     flown = motion.Motion(lab, {}, lab.duration_s)
     while flown.simulation.steps_left:
         flown.advance(flown.period_steps)

@@ -3,7 +3,7 @@
 | key | value |
 |---|---|
 | `torque_nm` | (3,) torque in body axes, which the actuators of the scene's control law give |
-| `wheels`, `cmgs`, `fans`, `ideal`, ... | (n,) commands of the single motors, see `Flight.commands` |
+| `wheels`, `cmgs`, `fans`, `thrusters`, `trims`, `ideal` | (n,) commands of the single motors, see `Flight.commands` |
 | `attitude` | a solution of the client's tracker: t_s (of the frame), cam_from_ref_xyzw, covariance_rad2 (3, 3) |
 | `exposure_s` | exposure time of the next frames |
 | `trigger` | true: expose a frame from now on, where frames are triggered |

@@ -176,6 +176,7 @@ def period_values(flight: Flight, channel: str) -> dict[str, Any]:
         return {
             "wheel_rad_s": state.wheel_rad_s.tolist(),
             "gimbal_rad": state.gimbal_rad.tolist(),
+            **{name: values.tolist() for name, values in state.readings.items()},
         }
     if channel == "truth":
         return {

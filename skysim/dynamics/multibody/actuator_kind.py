@@ -39,7 +39,15 @@ class ControlInput(NamedTuple):
 
 
 class Actuators(Protocol):
-    """A set of actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,)."""
+    """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
+
+    Attributes
+    ----------
+    motor
+        (n,) numbers of the commanded motors
+    """
+
+    motor: Ints
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Write the commands into control; return the torque (3,) that they will give."""
@@ -55,6 +63,33 @@ class Actuators(Protocol):
 
     def command_map(self) -> tuple[Floats, float]:
         """(n, 3) commands per unit of torque on the body, with every gimbal at zero, and the limit of a command."""
+        ...
+
+
+class MomentumFree:
+    """Actuators that store no momentum."""
+
+    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
+        return np.zeros(3)
+
+
+class ActuatorDrive(Protocol):
+    """Hardware between the commands of a set and MuJoCo's motors, such as valves. Stateful: one object per motion.
+
+    Attributes
+    ----------
+    readings
+        Present values by name, such as the propellant
+    """
+
+    @property
+    def readings(self) -> dict[str, Floats]: ...
+
+    def apply(self, control: Floats, angles_rad: Floats) -> None:
+        """Replace the commands in the controls (K, nu) of the next K steps by those of the motors at each step.
+
+        The full qpos is that of the first step.
+        """
         ...
 
 
@@ -80,6 +115,8 @@ class ActuatorKind:
         (model, data, config): sets the initial angles and speeds of its joints in the data
     check
         (spec, path of the file): raises InputError for joints that do not fit together
+    drive
+        (compiled model, config): returns the hardware between commands and motors; None without any
     """
 
     key: str
@@ -89,6 +126,7 @@ class ActuatorKind:
     sites: tuple[str, ...] = ()
     start: Callable[[Any, Any, Any], None] = nothing
     check: Callable[[Any, Path], None] = nothing
+    drive: Callable[[Any, Any], ActuatorDrive] | None = None
 
 
 @jit
@@ -193,6 +231,19 @@ def add_motor(
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
         motor.ctrlrange = [-limit, limit]
     return motor
+
+
+def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
+    """Add a servo of a joint, whose set-point is the integral of the commanded rate.
+
+    A critically damped spring pulls the joint to it with the time constant tau,
+
+        torque = kp (set-point - angle) - kv d(angle)/dt,    kp = inertia / tau^2,    kv = 2 inertia / tau
+
+    The inertia of a slide is its mass, and its angle a position.
+    """
+    servo = spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
+    servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
 
 
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:

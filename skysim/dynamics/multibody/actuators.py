@@ -14,22 +14,25 @@ import numpy as np
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
+    ActuatorDrive,
     ActuatorKind,
     Actuators,
     ControlInput,
+    MomentumFree,
     add_motor,
     joints,
     sites,
 )
 from skysim.dynamics.multibody.cmgs import CMGS
 from skysim.dynamics.multibody.fans import FANS
+from skysim.dynamics.multibody.thrusters import THRUSTERS
+from skysim.dynamics.multibody.trims import TRIM, TRIMS
 from skysim.dynamics.multibody.wheels import WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
 
-KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS)
+KINDS: tuple[ActuatorKind, ...] = (WHEELS, CMGS, FANS, THRUSTERS, TRIMS)
 
 TORQUES = ("torque_x", "torque_y", "torque_z")
-TRIM = "trim_"  # slide joints of trim masses, see mass.py
 PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
 
 
@@ -47,6 +50,15 @@ def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     return found
 
 
+def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
+    """The hardware between commands and motors of all actuators that are switched on."""
+    return [
+        kind.drive(model, getattr(vehicle, kind.key))
+        for kind in kinds_on(vehicle)
+        if kind.drive
+    ]
+
+
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
     """Set the angles and speeds of the actuators' joints in the data of a model to those at the scene's start."""
     for kind in kinds_on(vehicle):
@@ -62,7 +74,7 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
         kind.add(spec, model, getattr(vehicle, kind.key))
 
 
-class IdealTorque:
+class IdealTorque(MomentumFree):
     """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
 
     def __init__(self, motor: Ints, limit_nm: float) -> None:
@@ -79,9 +91,6 @@ class IdealTorque:
     def command_map(self) -> tuple[Floats, float]:
         return np.eye(3), self.limit_nm
 
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
-
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
     """Delete the joints of actuators that are off, which locks them; check those of actuators that are on.
@@ -92,7 +101,8 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     locked: dict[str, str] = {}
     check_names(spec, path)
     # 1. Joints: delete or check.
-    prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {"trim": (TRIM,)}
+    trim = "trims" if vehicle.trims else "trim"
+    prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {trim: (TRIM,)}
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
             found = joints(spec, prefix)

@@ -30,6 +30,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     ControlInput,
     Hinges,
     add_motor,
+    add_servo,
     joints,
     member_values,
     scale_to_limit,
@@ -279,6 +280,7 @@ class CmgActuator:
 
     def __init__(self, model: Any, config: CmgsConfig) -> None:
         self.gimbals = Hinges.from_model(model, GIMBAL)
+        self.motor = self.gimbals.motor
         self.rotors = Hinges.from_model(model, ROTOR)
         self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
         self.model = CmgSet(
@@ -340,21 +342,13 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
 def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     """Add a rate servo at each gimbal, and a motor at each variable-speed rotor; other rotors keep their momentum.
 
-    The set-point of a servo is the integral of the commanded rate. A critically damped spring pulls the gimbal to it
-    with the scene's time constant tau,
-
-        torque = kp (set-point - angle) - kv d(angle)/dt,    kp = inertia / tau^2,    kv = 2 inertia / tau,
-
-    which holds the rate against gyroscopic torque from the vehicle's rotation. A damper alone would not hold it.
+    The spring of the servo holds the rate against gyroscopic torque from the vehicle's rotation. A damper alone would
+    not hold it.
     """
-    tau_s = cmgs.gimbal_time_constant_s
     for joint, inertia in zip(
         joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True
     ):
-        servo = spec.add_actuator(
-            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
-        )
-        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+        add_servo(spec, joint.name, inertia, cmgs.gimbal_time_constant_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
             add_motor(

@@ -15,6 +15,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
     ControlInput,
+    MomentumFree,
     add_motor,
     all_names,
     scale_to_limit,
@@ -28,7 +29,7 @@ FAN = "fan_"
 
 @dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans of a compiled model, in the order of their names.
+    """Fans, or thrusters, of a compiled model, in the order of their names.
 
     Attributes
     ----------
@@ -48,12 +49,12 @@ class Fans:
     motor: Ints
 
     @classmethod
-    def from_model(cls, model: Any) -> Fans:
-        """The fans that have an actuator."""
+    def from_model(cls, model: Any, prefix: str = FAN) -> Fans:
+        """The sites whose name begins with prefix and that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         names = sorted(
-            name for name in all_names(model.actuator, model.nu) if name.startswith(FAN)
+            name for name in all_names(model.actuator, model.nu) if name.startswith(prefix)
         )
         sites = [model.site(name).id for name in names]
         # z axes of the sites; at zero joint angles lab and body axes coincide.
@@ -106,7 +107,7 @@ class FanSet:
         return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
-class FanActuator:
+class FanActuator(MomentumFree):
     """Actuators of the flight computer: fans, commanded as if they had no lag; see `FanSet`."""
 
     def __init__(self, model: Any, config: FansConfig) -> None:
@@ -125,9 +126,6 @@ class FanActuator:
 
     def command_map(self) -> tuple[Floats, float]:
         return self.model.thrust_from_torque, self.model.thrust_limit_n
-
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
 
 
 @dataclass(slots=True)
@@ -176,13 +174,16 @@ class MomentumDump:
         return present_nm
 
 
+def add_force(spec: Any, site: str, limit_n: float) -> Any:
+    """Add a force along z of a site."""
+    site_type = mujoco.mjtTrn.mjTRN_SITE
+    return add_motor(spec, site, site_type, site, limit_n, [0, 0, 1, 0, 0, 0])
+
+
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
     """Add a force at each fan along z of its site, which follows the command with a first-order lag."""
     for site in sites(spec, FAN):
-        limit = config.thrust_limit_n
-        fan = add_motor(
-            spec, site.name, mujoco.mjtTrn.mjTRN_SITE, site.name, limit, [0, 0, 1, 0, 0, 0]
-        )
+        fan = add_force(spec, site.name, config.thrust_limit_n)
         # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
         fan.dynprm[0] = config.time_constant_s

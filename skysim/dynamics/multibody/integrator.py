@@ -8,6 +8,7 @@ MuJoCo computes the multibody dynamics and integrates them by the fourth-order R
 3. Raise an error if MuJoCo warned.
 """
 
+import copy
 from collections.abc import Callable
 
 import mujoco
@@ -20,6 +21,7 @@ from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.multibody.actuators import set_start
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel
+from skysim.dynamics.multibody.wheels import Stiction
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CONTROL = mujoco.mjtState.mjSTATE_CTRL
@@ -66,6 +68,12 @@ class Simulation:
         check_tilt(vehicle, lab_from_body)
         self.vehicle = vehicle
         self.model = vehicle.model
+        self.stiction = None
+        wheels = vehicle.config.wheels
+        if wheels and wheels.stiction_nm:
+            # The friction of a wheel at rest is a parameter of the model.
+            self.model = copy.copy(vehicle.model)
+            self.stiction = Stiction(self.model, wheels)
         self.step_s = float(self.model.opt.timestep)
         self.last_step = max(1, int(np.ceil(min(duration_s / self.step_s, MAX_STEPS) - 1e-6)))
         self.history_steps = (
@@ -138,9 +146,21 @@ class Simulation:
         """
         # 1. Room.
         self.discard_old(len(control))
+        # 2. Integration; step by step if the friction of a wheel may change.
+        if self.stiction is None:
+            self.integrate(control)
+        else:
+            for row in control:
+                self.stiction.set_friction(row, self.speeds_rad_s, self.data.qacc[:3])
+                self.integrate(row[None])
+        # 3. Stability.
+        self.check_warnings()
+
+    def integrate(self, control: Floats) -> None:
+        """Integrate one step for each row of control (K, nu) with MuJoCo's rollout."""
         row = self.row
         end = self.row + len(control)
-        # 2. Integration. The warm start carries the solver's state over to this call.
+        # The warm start carries the solver's state over to this call.
         with mujoco_warnings():
             self.rollout.rollout(
                 [self.model],
@@ -154,8 +174,6 @@ class Simulation:
                 state=self.states[None, row + 1 : end + 1],
             )
         self.step += len(control)
-        # 3. Stability.
-        self.check_warnings()
 
     def required_torque_nm(
         self, angles_rad: Floats, speeds_rad_s: Floats, acceleration_rad_s2: Floats

@@ -5,7 +5,7 @@
 3. `unbalance` offsets and tilts the wheels' mass.
 4. `hold_trims` moves the trim masses: motorized masses on slides that bring the center of mass to the bearing's
    center. A motor with a lead screw holds its mass in place during a run, so the body is moved along the axis of the
-   joint, and the joint is removed.
+   joint, and the joint is removed unless `vehicle.trims` moves it in flight.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import joints
-from skysim.dynamics.multibody.actuators import TRIM
+from skysim.dynamics.multibody.trims import TRIM
 from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
 CAMERA = "star_camera"
@@ -224,7 +224,7 @@ class Trims:
     mass_kg
         (n,) masses
     position_m
-        (n,) positions along the slides at which they are held
+        (n,) positions along the slides at which they are held, or from which they start
     """
 
     names: tuple[str, ...]
@@ -257,9 +257,12 @@ class Trims:
 
 
 def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Trims:
-    """Move the trim masses of a spec to their positions and remove their joints; model is the compiled spec before."""
+    """Move the trim masses of a spec to their positions; model is the compiled spec before.
+
+    Their joints are removed unless motors move them in flight.
+    """
     # 1. Axes and centers at position zero, from the compiled model.
-    slides = joints(spec, TRIM) if vehicle.trim else []
+    slides = joints(spec, TRIM) if vehicle.trim or vehicle.trims else []
     names = tuple(joint.name for joint in slides)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -268,7 +271,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     axes = data.xaxis[ids].T.copy()
     centers_m = data.subtree_com[bodies].T.copy()
     # 2. Move the bodies.
-    position_m = np.zeros(0)
+    position_m = np.zeros(len(names))
     if config := vehicle.trim:
         if config.position_m and len(config.position_m) != len(names):
             raise InputError(
@@ -279,6 +282,11 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
         # Whole steps of the motors.
         wanted_m = np.array(config.position_m or (0.0,) * len(names))
         position_m = config.step_m * np.round(wanted_m / config.step_m)
+    if vehicle.trims and np.abs(position_m).max() > vehicle.trims.travel_m:
+        raise InputError(
+            "vehicle.trim.position",
+            f"beyond vehicle.trims.travel {vehicle.trims.travel_m:g} m",
+        )
     for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:
@@ -287,5 +295,8 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
                 f"joint {joint.name} must be on a body directly in body bus, not in another body",
             )
         body.pos = body.pos + at_m * axis  # in the model the axes of bus are those of the lab
-        spec.delete(joint)
+        # In flight the position of the joint is that of the mass.
+        joint.ref = at_m
+        if vehicle.trims is None:
+            spec.delete(joint)
     return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)

@@ -48,6 +48,7 @@ from skysim.dynamics.multibody.mass import (
     unbalance,
 )
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.thrusters import THRUSTER
 from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
 
@@ -82,7 +83,7 @@ class VehicleModel:
         Mass properties of the whole vehicle, with balanced wheels and the trim masses at their positions
     torques
         (3,) numbers of the actuators for ideal torques about body x, y, z
-    wheels, gimbals, rotors, fans, trims
+    wheels, gimbals, rotors, fans, trims, thrusters
         Actuators; empty if they are not switched on
     """
 
@@ -96,6 +97,7 @@ class VehicleModel:
     rotors: Hinges
     fans: Fans
     trims: Trims
+    thrusters: Fans
 
     @property
     def inertia_kg_m2(self) -> Floats:
@@ -144,6 +146,7 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
         Hinges.from_model(model, ROTOR),
         Fans.from_model(model),
         trims,
+        Fans.from_model(model, THRUSTER),
     )
 
 

@@ -7,6 +7,9 @@ command.
 
 Rotors do not follow the body's rotation about their axles, so the inertia that responds to a torque is
 J - sum inertia axle axle^T.
+
+A wheel at rest, or whose speed crosses zero, sticks while the torque on its bearing is below the stiction
+(`Stiction`); from there on the friction is that of a moving wheel.
 """
 
 from dataclasses import dataclass, field
@@ -30,6 +33,10 @@ from skysim.dynamics.multibody.actuator_kind import (
 from skysim.scene.sections.vehicle import WheelsConfig
 
 WHEEL = "wheel_"
+
+REST_RAD_S = 1e-6  # speed below which a wheel is at rest
+# MuJoCo's parameters of a friction that lets no wheel creep: the shortest time constant, and the greatest impedance.
+HARD_FRICTION = ([2e-3, 1.0], [0.9999, 0.9999, 1e-3, 0.5, 2.0])
 
 
 @dataclass(slots=True)
@@ -94,6 +101,7 @@ class WheelActuator:
 
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.joints = hinges = Hinges.from_model(model, WHEEL)
+        self.motor = hinges.motor
         limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
         self.model = WheelSet(
             hinges.axes, hinges.inertia_kg_m2, config.torque_limit_nm, limit_rad_s
@@ -120,12 +128,61 @@ class WheelActuator:
         return self.model.momentum(speeds_rad_s[self.joints.dof])
 
 
+class Stiction:
+    """Static friction of the wheels: MuJoCo's friction loss of a wheel that sticks is raised to the stiction.
+
+    MuJoCo itself holds a wheel with the Coulomb friction. The torque on the bearing of a wheel at rest is that of its
+    motor less what the body's acceleration a demands, u - inertia axis . a. Stateful: one object per motion.
+
+    Parameters
+    ----------
+    model
+        Compiled model of this motion alone; its friction losses change
+    config
+        The scene's `vehicle.wheels`
+
+    Attributes
+    ----------
+    sticks
+        (n,) whether each wheel sticks
+    before_rad_s
+        (n,) speeds at the step before
+    """
+
+    def __init__(self, model: Any, config: WheelsConfig) -> None:
+        self.model = model
+        self.config = config
+        self.joints = Hinges.from_model(model, WHEEL)
+        self.sticks = np.zeros(len(self.joints), dtype=bool)
+        self.before_rad_s = np.zeros(len(self.joints))
+
+    def set_friction(
+        self, control: Floats, speeds_rad_s: Floats, body_rad_s2: Floats
+    ) -> None:
+        """Set the friction losses of the next step, from its controls (nu,) and the full qvel; see the class.
+
+        The acceleration of the body (3,) is that of the step before.
+        """
+        speed = speeds_rad_s[self.joints.dof]
+        inertial_nm = self.joints.inertia_kg_m2 * (body_rad_s2 @ self.joints.axes)
+        load_nm = control[self.joints.motor] - inertial_nm
+        # A wheel comes to rest where its speed changes sign, or by friction alone, which lets it creep to zero.
+        rests = self.sticks | (np.abs(speed) < REST_RAD_S) | (speed * self.before_rad_s < 0)
+        self.sticks = rests & (np.abs(load_nm) <= self.config.stiction_nm)
+        self.before_rad_s = speed.copy()
+        self.model.dof_frictionloss[self.joints.dof] = np.where(
+            self.sticks, self.config.stiction_nm, self.config.coulomb_nm
+        )
+
+
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
     """Add a motor at each wheel, and the friction of its axle; MuJoCo's Coulomb friction also holds a wheel at rest."""
     # T = coulomb sign(speed) + viscous speed.
     for joint in joints(spec, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
+        if wheels.stiction_nm:
+            joint.solref_friction, joint.solimp_friction = HARD_FRICTION
         add_motor(
             spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, wheels.torque_limit_nm
         )

@@ -36,6 +36,8 @@ DYNAMICS = (
     "vehicle.imu",
     "vehicle.wheels",
     "vehicle.fans",
+    "vehicle.thrusters",
+    "vehicle.trims",
     "vehicle.drag",
     "vehicle.disturbances",
     "vehicle.mass",

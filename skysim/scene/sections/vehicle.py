@@ -15,6 +15,7 @@ from skysim.core.units import (
     Imbalance,
     Inertia,
     Length,
+    LinearImpulse,
     Mass,
     NotNegative,
     Number,
@@ -23,6 +24,7 @@ from skysim.core.units import (
     PositiveLength,
     QuadraticDrag,
     Seed,
+    Speed,
     Spin,
     Spins,
     Stiffness,
@@ -31,7 +33,7 @@ from skysim.core.units import (
 )
 
 # Keys of `vehicle`, and the ideal torques.
-ActuatorsName = Literal["ideal", "wheels", "fans", "cmgs"]
+ActuatorsName = Literal["ideal", "wheels", "fans", "thrusters", "trims", "cmgs"]
 TorqueLimit = Annotated[Torque, Field(gt=0)]
 TorqueLevel = Annotated[Torque, Field(ge=0)]
 Friction = Annotated[Damping, Field(ge=0)]
@@ -47,6 +49,8 @@ class WheelsConfig(ConfigModel):
         Greatest motor torque and speed
     coulomb, viscous
         Bearing friction, T = coulomb sign(speed) + viscous speed
+    stiction
+        Torque from which a wheel at rest breaks away; the Coulomb friction if it is zero
     static_imbalance
         Mass times offset of the rotor's center of mass from its axle; its disturbance grows with the speed squared
     dynamic_imbalance
@@ -59,6 +63,7 @@ class WheelsConfig(ConfigModel):
     speed_limit_rpm: Positive = 3000.0
     coulomb_nm: TorqueLevel = 0.0
     viscous_nms: Friction = 0.0
+    stiction_nm: TorqueLevel = 0.0
     static_imbalance_kg_m: Annotated[Imbalance, Field(ge=0)] = 0.0
     dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
     start_rpm: tuple[Number, ...] = ()
@@ -67,6 +72,8 @@ class WheelsConfig(ConfigModel):
     def check_speeds(self) -> "WheelsConfig":
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
+        if 0 < self.stiction_nm < self.coulomb_nm:
+            raise InputError("stiction", f"below coulomb {self.coulomb_nm:g} N m")
         return self
 
 
@@ -83,6 +90,52 @@ class FansConfig(ConfigModel):
 
     thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
     time_constant_s: LagTime = 0.2
+
+
+class ThrustersConfig(ConfigModel):
+    """Cold-gas thrusters: every site `thruster_*` of the model pushes along its own z, with its valve open or closed.
+
+    The defaults are `assumed` of a small nitrogen thruster with a solenoid valve, and a tank of 1.3 l at 200 bar.
+
+    Attributes
+    ----------
+    thrust
+        Thrust of an open valve
+    minimum_impulse
+        Impulse of the shortest pulse; shorter ones are saved up for a later period
+    time_constant
+        Time constant of the first-order lag between valve and thrust; 0 for none
+    specific_impulse
+        Thrust over weight flow of propellant; nitrogen of 293 K gives 80 s in vacuum, sqrt(2 c_p T) / g0, less in air
+    propellant
+        Propellant at the start
+    supply
+        `regulated`: the thrust is constant until the tank is empty; `blowdown`: proportional to the propellant left
+    """
+
+    thrust_n: Annotated[Force, Field(gt=0)] = 0.5
+    minimum_impulse_ns: Annotated[LinearImpulse, Field(ge=0)] = 2.5e-3
+    time_constant_s: Annotated[Time, Field(ge=0)] = 3e-3
+    specific_impulse_s: Duration = 60.0
+    propellant_kg: Annotated[Mass, Field(gt=0)] = 0.3
+    supply: Literal["regulated", "blowdown"] = "regulated"
+
+
+class TrimsConfig(ConfigModel):
+    """Motors that move the trim masses in flight: every slide joint `trim_*` of the model, from its place in `trim`.
+
+    The defaults are `assumed` of a stepper motor with a lead screw of 2 mm at 5 turns a second.
+
+    Attributes
+    ----------
+    travel
+        Largest position in both directions
+    speed_limit
+        Greatest speed of the masses
+    """
+
+    travel_m: PositiveLength = 0.02
+    speed_limit_m_s: Annotated[Speed, Field(gt=0)] = 0.01
 
 
 class CmgsConfig(ConfigModel):
@@ -280,10 +333,10 @@ class VehicleConfig(ConfigModel):
         (+x right, +y down, +z boresight): [0, 0, 55] rolls it about its boresight
     torque_limit
         Limit of each ideal torque about body x, y, z
-    wheels, fans, cmgs
+    wheels, fans, thrusters, cmgs
         Actuators that are switched on; joints of the others are locked
-    trim
-        Trim masses
+    trim, trims
+        Trim masses at their places, and the motors that move them in flight
     gimbals
         Axes of mount two_axis
     """
@@ -299,8 +352,10 @@ class VehicleConfig(ConfigModel):
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None
     fans: FansConfig | None = None
+    thrusters: ThrustersConfig | None = None
     cmgs: CmgsConfig | None = None
     trim: TrimConfig | None = None
+    trims: TrimsConfig | None = None
     drag: DragConfig = DragConfig()
     disturbances: DisturbancesConfig = DisturbancesConfig()
     imu: ImuConfig | None = None
@@ -319,9 +374,9 @@ class VehicleConfig(ConfigModel):
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
         if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
             raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
-        if self.mount == "free" and self.trim:
+        if self.mount == "free" and (self.trim or self.trims):
             raise InputError(
-                "trim",
+                "trim" if self.trim else "trims",
                 "a free vehicle rotates about its center of mass",
                 "mount: air_bearing",
             )

@@ -18,14 +18,14 @@ from skysim.camera import wcs
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
 from skysim.dynamics import guidance
-from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings
+from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import context_of
 from skysim.simulation.checks.facts import FACTS, Fact, errors_text
 from skysim.simulation.checks.findings import FINDINGS, hidden_lights
 from skysim.simulation.checks.sampling import Plan, sampled
 from skysim.simulation.lab import Lab
-from skysim.simulation.motion import check_reference, shortfall
+from skysim.simulation.motion import check_reference, forecast_torque, shortfall
 from skysim.sources.dome.layouts.ambiguity import Ambiguity
 
 # Keys of a head; findings with other keys are about the scene.
@@ -111,7 +111,10 @@ def check(
         facts.insert(2, dome_warnings.fact(alike))
         warning = dome_warnings.finding(alike, scene.dome)
         findings += [warning] if warning else []
-    findings += [*broken_assumptions(lab), *filter(None, [shortfall(lab)])]
+    forecast = forecast_torque(lab)
+    fuel, warning = vehicle_facts.propellant(plan, forecast)
+    facts += [fuel] if fuel else []
+    findings += filter(None, [*broken_assumptions(lab), shortfall(lab, forecast), warning])
     # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
     checked = [check(head, tilt_deg, rate_body_rad_s, drawn) for head in heads]

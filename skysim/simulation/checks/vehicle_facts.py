@@ -14,6 +14,7 @@ from skysim.core.units import significant
 from skysim.dynamics import guidance
 from skysim.dynamics.multibody.actuators import PREFIXES
 from skysim.simulation.checks.sampling import Plan
+from skysim.simulation.motion import TorqueForecast
 
 MAX_MANEUVERS = 12  # number of maneuvers that are printed
 CLOSE_NAME = 0.6  # likeness from which a joint's name was meant for an actuator
@@ -70,7 +71,10 @@ def actuators(plan: Plan) -> Fact | None:
         rows.append(("cmgs", limit, vehicle.gimbals, spun))
     if fans := config.fans:
         rows.append(("fans", f"{short(fans.thrust_limit_n)} N", vehicle.fans, None))
-    if trim := config.trim:
+    if thrusters := config.thrusters:
+        limit = f"{short(thrusters.thrust_n)} N"
+        rows.append(("thrusters", limit, vehicle.thrusters, None))
+    if trim := config.trims or config.trim:
         rows.append(("trim", f"{short(1e3 * trim.travel_m)} mm", vehicle.trims, None))
     lines = []
     values = Record()
@@ -91,6 +95,19 @@ def actuators(plan: Plan) -> Fact | None:
         lines.append(f"ideal torques to {short(config.torque_limit_nm)} N m about each axis")
         values["ideal"] = {"torque_limit_nm": config.torque_limit_nm}
     return Fact("actuators", lines, values) if lines else None
+
+
+def propellant(plan: Plan, forecast: TorqueForecast | None) -> tuple[Fact | None, str]:
+    """The propellant that the thrusters need for the maneuver, and a warning if the tank has less."""
+    config = plan.lab.vehicle.config.thrusters
+    if not (config and forecast and forecast.propellant_kg):
+        return None, ""
+    grams = [short(1e3 * one) for one in (forecast.propellant_kg, config.propellant_kg)]
+    text = f"the maneuver needs {' of '.join(grams)} g"
+    values = {"needed_kg": forecast.propellant_kg, "propellant_kg": config.propellant_kg}
+    warning = f"vehicle.thrusters.propellant: {text}; change it to a slower or smaller one, or take more"
+    is_short = forecast.propellant_kg > config.propellant_kg
+    return Fact("propellant", [text], values), warning if is_short else ""
 
 
 def maneuver(plan: Plan) -> Fact | None:
@@ -153,7 +170,7 @@ def ignored_parts(plan: Plan) -> str:
     ignored = ", ".join(plan.lab.vehicle.ignored)
     if not ignored:
         return ""
-    return f"vehicle.model: {ignored}: not used; the scene's vehicle.wheels, cmgs, fans and imu are; remove them"
+    return f"vehicle.model: {ignored}: not used; those of the scene's section vehicle are; remove them"
 
 
 FACTS: tuple[Callable[[Plan], Fact | None], ...] = (

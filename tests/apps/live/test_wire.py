@@ -158,6 +158,26 @@ def test_commands_of_motors_replace_the_law_only_if_they_are_its_own() -> None:
     np.testing.assert_allclose(computer.loads, 1.0)
 
 
+def test_a_trim_mass_is_moved_beside_the_law() -> None:
+    live = live_flight("cubesat_table", **{"vehicle.trims": "{travel: 10 mm}"})
+    start_m = live.flight.state.readings["trim_m"]
+    assert answer_to(live, {"trims": [0.001, 0, 0]}) == ""
+    for _ in range(20):
+        live.advance()
+    assert np.any(live.flight.motion.flight_computer.control_torque_nm)
+    moved_m = live.flight.state.readings["trim_m"] - start_m
+    np.testing.assert_allclose(moved_m, [0.001, 0, 0], atol=1e-6)
+
+
+def test_thrusters_push_one_way_and_replace_the_law() -> None:
+    live = live_flight("simsat_thrusters")
+    assert answer_to(live, {"thrusters": [9, -9] + [0] * 10}) == ""
+    live.advance()
+    np.testing.assert_array_equal(live.flight.motion.flight_computer.control_torque_nm, 0)
+    duty = live.flight.state.readings["thruster_duty"]
+    np.testing.assert_allclose(duty, [1] + [0] * 11)
+
+
 def test_each_channel_has_what_the_flight_has(live: Live) -> None:
     live.has_truth = server_of(live).has_truth = True
     client = Client(

@@ -1,0 +1,199 @@
+"""Cold-gas thrusters: sites `thruster_*`, whose jets push the body along their own z axis. A valve is open or closed.
+
+In every control period of length T the flight computer asks for thrusts f >= 0 (`ThrusterActuator`), and the valves
+give pulses of the full thrust F (`ValveDrive`):
+
+1. Pulse width: each valve is open for f / F of the period. A pulse shorter than the minimum impulse is not begun; its
+   impulse is saved up for a later period, so that the mean is right (sigma-delta modulation).
+2. Lag: the thrust follows its valve with a time constant tau,
+
+       df/dt = (F - f) / tau while it is open,    df/dt = -f / tau while it is closed
+
+3. Supply: the mass flow of propellant is f / (specific impulse g0), until the tank is empty. With blowdown F is
+   proportional to the pressure, and so to the propellant left. The vehicle's mass properties do not change.
+
+Every step of the integration gets the mean of f over it, so impulse and propellant are exact.
+"""
+
+import itertools
+from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
+
+from skysim.core.constants import STANDARD_GRAVITY_M_S2
+from skysim.core.types import Floats
+from skysim.dynamics.multibody.actuator_kind import (
+    ActuatorKind,
+    ControlInput,
+    MomentumFree,
+    scale_to_limit,
+    sites,
+)
+from skysim.dynamics.multibody.fans import Fans, FanSet, add_force
+from skysim.scene.sections.vehicle import ThrustersConfig
+
+THRUSTER = "thruster_"
+
+# Weight of the thrusts beside the torque, relative to the lever arms: the torque is smaller by its square, 1e-8.
+SHARING = 1e-4
+SHORTEST_LAG_S = 1e-15  # stands for no lag
+
+
+class ThrusterActuator(MomentumFree):
+    """Actuators of the flight computer: one-sided thrusters, commanded as if their thrust were continuous.
+
+    Parameters
+    ----------
+    model
+        Compiled model
+    config
+        The scene's `vehicle.thrusters`
+    """
+
+    def __init__(self, model: Any, config: ThrustersConfig) -> None:
+        thrusters = Fans.from_model(model, THRUSTER)
+        self.motor = thrusters.motor
+        self.model = FanSet(thrusters.axes, thrusters.positions_m, config.thrust_n)
+        lever_m = self.model.torque_per_thrust_m
+        self.weighted_m = np.vstack(
+            (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(thrusters)))
+        )
+
+    def thrusts(self, torque_nm: Floats) -> Floats:
+        """The smallest thrusts (n,) f >= 0 that give the torque (3,) T, or the nearest to it, without a limit.
+
+        They minimize |A f - T|^2 + |SHARING A|^2 |f|^2 for the lever arms A, by non-negative least squares (Lawson &
+        Hanson 1974). The second term shares the torque among thrusters that act alike.
+        """
+        return nnls(self.weighted_m, np.append(torque_nm, np.zeros(len(self.motor))))[0]
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        thrust = scale_to_limit(self.thrusts(torque_nm), self.model.thrust_limit_n)
+        return self.command(control, thrust, inputs)
+
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        control[self.motor] = thrust = np.clip(commands, 0.0, self.model.thrust_limit_n)
+        return self.model.torque(thrust)
+
+    def command_map(self) -> tuple[Floats, float]:
+        """As of thrusters that pushed both ways, scaled so that the greatest thrust is that of one-sided ones.
+
+        The scale is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
+        """
+        both_ways = self.model.thrust_from_torque
+        scales = [
+            self.thrusts(torque).max() / np.abs(both_ways @ torque).max()
+            for torque in map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=3))
+            if (both_ways @ torque).any()
+        ]
+        return both_ways * max(scales, default=1.0), self.model.thrust_limit_n
+
+
+def propellant_kg(impulse_ns: Floats, config: ThrustersConfig) -> Floats:
+    """Propellant of these impulses: impulse / (specific impulse g0)."""
+    return impulse_ns / (config.specific_impulse_s * STANDARD_GRAVITY_M_S2)
+
+
+class ValveDrive:
+    """Valves and tank of the thrusters, see the module's docstring.
+
+    Parameters
+    ----------
+    model
+        Compiled model
+    config
+        The scene's `vehicle.thrusters`
+
+    Attributes
+    ----------
+    readings
+        thruster_duty (n,): open fraction of the last period; propellant_kg (): propellant left
+    thrust_n
+        (n,) present thrusts
+    saved_ns, begun_ns
+        (n,) impulses saved up for a pulse, and left of a pulse that goes on, both of the full thrust at the start
+    """
+
+    def __init__(self, model: Any, config: ThrustersConfig) -> None:
+        self.config = config
+        self.motor = Fans.from_model(model, THRUSTER).motor
+        self.step_s = np.float64(model.opt.timestep)
+        self.lag_s = max(config.time_constant_s, SHORTEST_LAG_S)
+        zeros = np.zeros(len(self.motor))
+        self.thrust_n = self.saved_ns = self.begun_ns = zeros
+        self.readings = {
+            "thruster_duty": zeros,
+            "propellant_kg": np.array(config.propellant_kg),
+        }
+
+    def apply(self, control: Floats, angles_rad: Floats) -> None:
+        times_s = self.step_s * np.arange(len(control) + 1)[:, None]
+        # 1. Pulses.
+        open_s = self.pulses_s(control[0, self.motor], times_s[-1, 0])
+        # 2. Lag.
+        impulse_ns = self.impulses_ns(open_s, times_s)
+        # 3. Supply: the last of the propellant may not last a whole step.
+        left_kg = self.readings["propellant_kg"]
+        flow_kg = propellant_kg(impulse_ns.sum(axis=1), self.config)
+        before_kg = left_kg - np.cumsum(flow_kg) + flow_kg
+        share = np.clip(before_kg / np.maximum(flow_kg, np.finfo(float).tiny), 0.0, 1.0)
+        control[:, self.motor] = impulse_ns * (share / self.step_s)[:, None]
+        left_kg = np.maximum(left_kg - (flow_kg * share).sum(), 0.0)
+        self.thrust_n = self.thrust_n * (left_kg > 0)
+        self.readings = {
+            "thruster_duty": open_s / times_s[-1],
+            "propellant_kg": np.asarray(left_kg),
+        }
+
+    def pulses_s(self, wanted_n: Floats, period_s: float) -> Floats:
+        """(n,) times for which the valves open at the start of the period, for thrusts wanted_n (n,).
+
+        A pulse that is as long as the period may go on in the next.
+        """
+        thrust_n = self.config.thrust_n
+        shortest_ns = self.config.minimum_impulse_ns
+        # 1. A pulse begins when the saved impulse is large enough.
+        wanted_ns = self.saved_ns + np.clip(wanted_n, 0.0, thrust_n) * period_s
+        gives = (wanted_ns >= shortest_ns) | (self.begun_ns > 0)
+        pulse_ns = self.begun_ns + np.where(gives, wanted_ns, 0.0)
+        # 2. The rest is for later.
+        given_ns = np.minimum(pulse_ns, thrust_n * period_s)
+        self.begun_ns = pulse_ns - given_ns
+        self.saved_ns = np.where(gives, 0.0, wanted_ns)
+        return given_ns / thrust_n
+
+    def impulses_ns(self, open_s: Floats, times_s: Floats) -> Floats:
+        """(K, n) impulses between the times (K + 1, 1), of valves that are open until open_s (n,).
+
+        The integral of the thrust f(t) with f(0) = f0 is
+
+            F t + (f0 - F) tau (1 - exp(-t / tau))
+
+        and so on from the time when F becomes 0. Afterwards `thrust_n` is f at the last time.
+        """
+        left = self.readings["propellant_kg"] / self.config.propellant_kg
+        full_n = self.config.thrust_n * (
+            left if self.config.supply == "blowdown" else left > 0
+        )
+        opened_s = np.minimum(times_s, open_s)
+        closed_s = times_s - opened_s
+        excess_n = self.thrust_n - full_n
+        at_closing_n = full_n + excess_n * np.exp(-open_s / self.lag_s)
+        impulse_ns = full_n * opened_s - self.lag_s * (
+            excess_n * np.expm1(-opened_s / self.lag_s)
+            + at_closing_n * np.expm1(-closed_s / self.lag_s)
+        )
+        self.thrust_n = at_closing_n * np.exp(-closed_s[-1] / self.lag_s)
+        return np.diff(impulse_ns, axis=0)
+
+
+def add_thrusters(spec: Any, _: Any, config: ThrustersConfig) -> None:
+    """Add a one-sided force at each thruster along z of its site; `ValveDrive` has its lag."""
+    for site in sites(spec, THRUSTER):
+        add_force(spec, site.name, config.thrust_n).ctrlrange = [0.0, config.thrust_n]
+
+
+THRUSTERS = ActuatorKind(
+    "thrusters", add_thrusters, ThrusterActuator, sites=(THRUSTER,), drive=ValveDrive
+)
