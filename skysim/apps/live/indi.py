@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import io
 import logging
-import socket
 import threading
 import time
 from typing import Any
@@ -28,12 +27,12 @@ from indipydriver import (
 )
 from indipyserver import IPyServer
 
+from skysim.apps.access import listen
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.sinks import CLOSE_TIMEOUT_S, Sink
 from skysim.apps.plate_solver.plate_solution import wcs_header
 from skysim.camera.detector import saturation_dn
-from skysim.core.errors import InputError
 from skysim.core.types import Frame
 from skysim.results.files.recording import fits_image
 from skysim.scene.scene import Scene
@@ -41,7 +40,8 @@ from skysim.simulation.timing import longest_live_s
 
 HOST = "127.0.0.1"
 DEVICE = "skysim"
-CCD_INTERFACE = 2  # the bit of a camera in DRIVER_INTERFACE
+GROUP = "Main"
+CCD_INTERFACE = "2"  # the bit of a camera in DRIVER_INTERFACE
 MOST_CLIENTS = 10  # the most that IPyServer takes
 EXPOSURE = "CCD_EXPOSURE"
 SECONDS = "CCD_EXPOSURE_VALUE"
@@ -76,12 +76,8 @@ class IndiCamera(IPyDriver):
         self.vectors = {one.name: one for one in properties(self.scene)}
         super().__init__(Device(DEVICE, list(self.vectors.values())))
         self.exposure = self.vectors[EXPOSURE]
-        try:
-            with socket.create_server((HOST, port)) as free:
-                self.port = int(free.getsockname()[1])
-        except OSError as error:
-            problem = f"cannot listen on {HOST}:{port}: {error.strerror}"
-            raise InputError(f"--indi {port}", problem) from None
+        with listen("--indi", HOST, port) as free:
+            self.port = int(free.getsockname()[1])
         # Malformed elements are ignored, and not reported by their tracebacks.
         for package in ("indipydriver", "indipyserver"):
             logging.getLogger(package).setLevel(logging.CRITICAL)
@@ -92,9 +88,9 @@ class IndiCamera(IPyDriver):
         self.thread.start()
         while self.server.server is None and self.thread.is_alive():
             time.sleep(0.01)
-        self.frame: Packet | None = None
-        channels = ("frame", "solution") if self.scene.stars else ("frame",)
-        self.sink = Sink("indi", self.write, channels)
+        self.frame = Packet({"index": -1})
+        self.last = "solution" if self.scene.stars else "frame"
+        self.sink = Sink("indi", self.write, {"frame", self.last})
 
     async def serve(self) -> None:
         self.loop = asyncio.get_running_loop()
@@ -120,8 +116,7 @@ class IndiCamera(IPyDriver):
             await vector.send_setVector(state="Ok" if is_on else "Idle")
         elif vector.name == "CCD_ABORT_EXPOSURE":
             self.inbox.put({"abort": True}, self.refuse)
-            self.exposure[SECONDS] = 0
-            await self.exposure.send_setVector(state="Idle")
+            await self.show(0, "Idle")
             await vector.send_setVector(state="Ok")
         elif vector is self.exposure:
             await self.expose(event)
@@ -135,10 +130,14 @@ class IndiCamera(IPyDriver):
         except TypeError:
             return self.refuse(f"{EXPOSURE}: not a number")
         abort = self.exposure.state == "Busy"
-        self.exposure[SECONDS] = exposure_s
-        await self.exposure.send_setVector(state="Busy")
+        await self.show(exposure_s, "Busy")
         command = {"exposure_s": exposure_s, "trigger": True, "abort": abort}
         self.inbox.put(command, self.refuse)
+
+    async def show(self, exposure_s: float, state: str) -> None:
+        """Tell the clients the state of the exposure."""
+        self.exposure[SECONDS] = exposure_s
+        await self.exposure.send_setVector(state=state)
 
     def refuse(self, problem: str) -> None:
         """Tell the clients why there is no exposure."""
@@ -149,10 +148,8 @@ class IndiCamera(IPyDriver):
         """Keep a frame until its solution has come, then send both."""
         if packet.channel == "frame":
             self.frame = packet
-        index = packet.header["index"]
-        if packet.channel != self.sink.channels[-1] or not self.frame:
-            return
-        if index == self.frame.header["index"]:
+        is_same = packet.header["index"] == self.frame.header["index"]
+        if packet.channel == self.last and is_same:
             sent = self.send_image(fits_bytes(self.frame, packet, self.scene))
             asyncio.run_coroutine_threadsafe(sent, self.loop).result()
 
@@ -160,8 +157,7 @@ class IndiCamera(IPyDriver):
         """Send the image that the clients wait for; there is none after an abort."""
         if self.exposure.state != "Busy":
             return
-        self.exposure[SECONDS] = 0
-        await self.exposure.send_setVector(state="Ok")
+        await self.show(0, "Ok")
         blob = self.vectors["CCD1"]
         blob["CCD1"] = data
         blob.set_blobsize("CCD1", len(data))
@@ -178,14 +174,13 @@ def fits_bytes(frame: Packet, solution: Packet, scene: Scene) -> bytes:
         head["exposure_s"],
         saturation_dn(scene.camera.detector),
     )
+    attitude = solution.attitude
     cards = {}
     comment = "no WCS: the lights are in the laboratory"
-    if attitude := solution.attitude:
-        comment = f"WCS: of the tracker's solution, {attitude.status}"
-        if attitude.cam_from_ref is not None:
+    if attitude:
+        comment = f"WCS: of the solution; the tracker's status: {attitude.status}"
+        if attitude.status == "solved":
             cards = wcs_header(attitude, flipped=False)
-        else:
-            comment = f"no WCS: the tracker's status is {attitude.status}"
     file = io.BytesIO()
     fits_image(image, scene, cards, comment).writeto(file)
     return file.getvalue()
@@ -195,46 +190,42 @@ def properties(scene: Scene) -> list[Any]:
     """The standard properties of an INDI camera, https://docs.indilib.org/drivers/standard-properties."""
     camera = scene.camera
     detector = camera.detector
-    pixel_um = 1e6 * camera.pixel_m
     celsius = detector.temperature_c
     if celsius is None:
         celsius = detector.dark_temperature_c
-    info = {
-        "CCD_MAX_X": camera.width_px,
-        "CCD_MAX_Y": camera.height_px,
-        "CCD_PIXEL_SIZE": pixel_um,
-        "CCD_PIXEL_SIZE_X": pixel_um,
-        "CCD_PIXEL_SIZE_Y": pixel_um,
-        "CCD_BITSPERPIXEL": 16 if detector.noise else 64,
+    pixel_um = 1e6 * camera.pixel_m
+    readings: dict[str, dict[str, float]] = {
+        "CCD_INFO": {
+            "CCD_MAX_X": camera.width_px,
+            "CCD_MAX_Y": camera.height_px,
+            "CCD_PIXEL_SIZE": pixel_um,
+            "CCD_PIXEL_SIZE_X": pixel_um,
+            "CCD_PIXEL_SIZE_Y": pixel_um,
+            "CCD_BITSPERPIXEL": 16 if detector.noise else 64,
+        },
+        "CCD_FRAME": {"X": 0, "Y": 0, "WIDTH": camera.width_px, "HEIGHT": camera.height_px},
+        "CCD_BINNING": {"HOR_BIN": 1, "VER_BIN": 1},
+        "CCD_TEMPERATURE": {"CCD_TEMPERATURE_VALUE": celsius},
     }
-    area = {"X": 0, "Y": 0, "WIDTH": camera.width_px, "HEIGHT": camera.height_px}
-    driver = {
-        "DRIVER_NAME": DEVICE,
-        "DRIVER_EXEC": "skysim live",
-        "DRIVER_VERSION": "1.0",
-        "DRIVER_INTERFACE": str(CCD_INTERFACE),
-    }
+    driver = {"DRIVER_NAME": DEVICE, "DRIVER_INTERFACE": CCD_INTERFACE}
     texts = [TextMember(name, membervalue=value) for name, value in driver.items()]
     return [
         switches("CONNECTION", "OneOfMany", CONNECT="Off", DISCONNECT="On"),
-        TextVector("DRIVER_INFO", "Driver", "General", "ro", "Idle", texts),
-        numbers(EXPOSURE, {SECONDS: 0.0}, longest_live_s(scene), "rw"),
         switches("CCD_ABORT_EXPOSURE", "AtMostOne", ABORT="Off"),
-        numbers("CCD_INFO", info),
-        numbers("CCD_FRAME", area),
-        numbers("CCD_BINNING", {"HOR_BIN": 1, "VER_BIN": 1}),
-        numbers("CCD_TEMPERATURE", {"CCD_TEMPERATURE_VALUE": celsius}),
+        TextVector("DRIVER_INFO", "Driver", GROUP, "ro", "Idle", texts),
+        numbers(EXPOSURE, {SECONDS: 0}, longest_live_s(scene), "rw"),
+        *(numbers(name, values) for name, values in readings.items()),
         BLOBVector(
-            "CCD1", "Image", "Main", "ro", "Idle", [BLOBMember("CCD1", blobformat=".fits")]
+            "CCD1", "Image", GROUP, "ro", "Idle", [BLOBMember("CCD1", blobformat=".fits")]
         ),
     ]
 
 
 def numbers(name: str, values: dict[str, float], most: float = 0, perm: str = "ro") -> Any:
     members = [NumberMember(key, None, "%g", 0, most, 0, one) for key, one in values.items()]
-    return NumberVector(name, name, "Main", perm, "Idle", members)
+    return NumberVector(name, name, GROUP, perm, "Idle", members)
 
 
 def switches(name: str, rule: str, **states: str) -> Any:
     members = [SwitchMember(key, membervalue=state) for key, state in states.items()]
-    return SwitchVector(name, name, "Main", "rw", rule, "Idle", members)
+    return SwitchVector(name, name, GROUP, "rw", rule, "Idle", members)

@@ -274,7 +274,7 @@ def test_the_temperature_is_the_detector_s(celsius: str, shown: str) -> None:
     ("scene", "status", "comment"),
     [
         ("afit_simsat", None, "the lights are in the laboratory"),
-        ("shefex2", "no_match", "the tracker's status is no_match"),
+        ("shefex2", "no_match", "the tracker's status: no_match"),
     ],
 )
 def test_without_a_solution_there_is_no_wcs(
