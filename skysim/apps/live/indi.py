@@ -116,7 +116,7 @@ class IndiCamera(IPyDriver):
             await vector.send_setVector(state="Ok" if is_on else "Idle")
         elif vector.name == "CCD_ABORT_EXPOSURE":
             self.inbox.put({"abort": True}, self.refuse)
-            await self.show(0, "Idle")
+            await self.show(0, "Idle", "aborted")
             await vector.send_setVector(state="Ok")
         elif vector is self.exposure:
             await self.expose(event)
@@ -130,14 +130,14 @@ class IndiCamera(IPyDriver):
         except TypeError:
             return self.refuse(f"{EXPOSURE}: not a number")
         abort = self.exposure.state == "Busy"
-        await self.show(exposure_s, "Busy")
+        await self.show(exposure_s, "Busy", "exposing")
         command = {"exposure_s": exposure_s, "trigger": True, "abort": abort}
         self.inbox.put(command, self.refuse)
 
-    async def show(self, exposure_s: float, state: str) -> None:
-        """Tell the clients the state of the exposure."""
+    async def show(self, exposure_s: float, state: str, message: str) -> None:
+        """Tell the clients the state of the exposure; an empty message would repeat the one before it."""
         self.exposure[SECONDS] = exposure_s
-        await self.exposure.send_setVector(state=state)
+        await self.exposure.send_setVector(message, state=state)
 
     def refuse(self, problem: str) -> None:
         """Tell the clients why there is no exposure."""
@@ -157,7 +157,7 @@ class IndiCamera(IPyDriver):
         """Send the image that the clients wait for; there is none after an abort."""
         if self.exposure.state != "Busy":
             return
-        await self.show(0, "Ok")
+        await self.show(0, "Ok", "exposed")
         blob = self.vectors["CCD1"]
         blob["CCD1"] = data
         blob.set_blobsize("CCD1", len(data))

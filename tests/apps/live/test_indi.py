@@ -195,6 +195,9 @@ def test_the_wcs_is_that_of_the_solution(session: Session) -> None:
 def test_a_refused_exposure_says_why(session: Session, seconds: str, problem: str) -> None:
     session.client.set(EXPOSURE, **{SECONDS: seconds})
     assert problem in session.wait(EXPOSURE, "Alert").message
+    session.client.set(EXPOSURE, **{SECONDS: 0.1})
+    assert session.wait(EXPOSURE, "Busy").message == "exposing"
+    assert session.wait(EXPOSURE, "Ok").message == "exposed"
 
 
 @pytest.mark.slow
