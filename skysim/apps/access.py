@@ -1,6 +1,9 @@
 """Who may talk to a server of skysim: names of the host, and the token."""
 
 import hmac
+import socket
+
+from skysim.core.errors import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 
@@ -8,6 +11,15 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
 def token_matches(candidate: str, token: str) -> bool:
     """Compare with the token in constant time, so that timing reveals nothing about it."""
     return hmac.compare_digest(candidate.encode(), token.encode())
+
+
+def listen(option: str, host: str, port: int) -> socket.socket:
+    """A socket that listens; port 0 is any free one. Raises InputError for an address that cannot be bound."""
+    try:
+        return socket.create_server((host, port))
+    except OSError as error:
+        problem = f"cannot listen on {host}:{port}: {error.strerror or error}"
+        raise InputError(f"{option} {port}", problem) from None
 
 
 def host_of(header: str) -> str:

@@ -7,6 +7,7 @@
 | `attitude` | a solution of the client's tracker: t_s (of the frame), cam_from_ref_xyzw, covariance_rad2 (3, 3) |
 | `exposure_s` | exposure time of the next frames |
 | `trigger` | true: expose a frame from now on, where frames are triggered |
+| `abort` | true: forget the triggered exposures that have not ended |
 """
 
 from __future__ import annotations
@@ -118,8 +119,9 @@ class CommandState:
         command = dict(command)
         exposure_s = self.exposure_s(command.pop("exposure_s", None))
         trigger = command.pop("trigger", False)
-        if trigger is not False:
-            self.check_trigger(trigger)
+        self.check_trigger("trigger", trigger)
+        abort = command.pop("abort", False)
+        self.check_trigger("abort", abort)
         solution = command.pop("attitude", None)
         attitude = None if solution is None else self.solution(solution)
         # What is left are commands of actuators.
@@ -129,23 +131,25 @@ class CommandState:
         self.held |= {key: (value, now_s) for key, value in command.items()}
         if exposure_s:
             self.flight.schedules[0].exposure_control.exposure_s = exposure_s
+        if abort:
+            self.flight.schedules[0].triggers_s = {}
         if trigger:
             self.flight.schedules[0].trigger(now_s)
         if attitude and self.flight.motion.navigation:
             status = self.flight.motion.navigation.update_filter(solution["t_s"], attitude)
             self.updates[status] += 1
 
-    def check_trigger(self, value: Any) -> None:
-        """Raise InputError for a trigger that cannot be taken."""
+    def check_trigger(self, key: str, value: Any) -> None:
+        """Raise InputError for a trigger, or an abort, that cannot be taken."""
+        if value is False:
+            return
         if value is not True:
-            raise InputError("trigger", repr(value)[:40], "true")
+            raise InputError(key, repr(value)[:40], "true")
         if not self.has_triggers:
-            raise InputError(
-                "trigger", "the scene's schedule exposes the frames", "--trigger"
-            )
+            raise InputError(key, "the scene's schedule exposes the frames", "--trigger")
         schedule = self.flight.schedules[0]
         waiting = sum(index >= schedule.index for index in schedule.triggers_s or ())
-        if waiting >= MOST_TRIGGERS:
+        if key == "trigger" and waiting >= MOST_TRIGGERS:
             raise InputError("trigger", f"{MOST_TRIGGERS} exposures are waiting")
 
     def exposure_s(self, value: Any) -> float | None:

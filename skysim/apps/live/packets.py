@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.core.types import Attitude
 from skysim.core.errors import InputError
 from skysim.core.types import Truth
 from skysim.simulation.flight import Flight, Shot
@@ -50,11 +51,14 @@ class Packet(NamedTuple):
     truth
         Of a frame: cam_from_ref_xyzw (scalar last; ref: ICRS or the lab), rate_cam_rad_s, and ids, x_px, y_px of the
         lights on the detector
+    attitude
+        Of a solution: all that the tracker found, for outputs in this process
     """
 
     header: dict[str, Any]
     pixels: NDArray[Any] = NO_PIXELS
     truth: Mapping[str, Any] = MappingProxyType({})
+    attitude: Attitude | None = None
 
     @property
     def channel(self) -> str:
@@ -164,7 +168,7 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
     if solution.cam_from_ref is not None and solution.covariance_rad2 is not None:
         header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat().tolist()
         header["covariance_rad2"] = solution.covariance_rad2.tolist()
-    return Packet(header)
+    return Packet(header, attitude=solution)
 
 
 def period_values(flight: Flight, channel: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
-from skysim.apps.access import token_matches
+from skysim.apps.access import listen, token_matches
 from skysim.apps.live.commands import Inbox, parse
 from skysim.apps.live.packets import CHANNELS, Packet
 from skysim.apps.live.sinks import Sink
@@ -141,11 +141,7 @@ class WireServer:
         self.clients: list[WireClient] = []
         self.earlier: dict[str, Counter[str]] = {"sent": Counter(), "dropped": Counter()}
         self.served = 0
-        try:
-            self.listener = socket.create_server((host, port), backlog=MOST_CLIENTS)
-        except OSError as error:
-            problem = f"cannot listen on {host}:{port}: {error.strerror or error}"
-            raise InputError(f"--tcp {port}", problem) from None
+        self.listener = listen("--tcp", host, port)
         self.port = int(self.listener.getsockname()[1])
         threading.Thread(target=self.accept, name="wire accept", daemon=True).start()
 

@@ -253,7 +253,20 @@ def write_frame(folder: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
 
 
 def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
-    """Write a FITS file: uint16 (float64 for a noise-free frame) with exposure, time, scene and seed in the header."""
+    """Write a frame as FITS, under the stars with the WCS of the true attitude."""
+    cards = {}
+    comment = "no WCS: the lights are in the laboratory"
+    if scene.stars:
+        cards = wcs.header(scene.camera.calibration(), truth.mean_cam_from_lab)
+        comment = (
+            "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
+        )
+    with atomic_file(path) as temporary:
+        fits_image(frame, scene, cards, comment).writeto(temporary, overwrite=True)
+
+
+def fits_image(frame: Frame, scene: Scene, wcs_cards: Any, comment: str) -> Any:
+    """A FITS image: uint16 (float64 for a noise-free frame) with exposure, time, scene and seed in the header."""
     from astropy.io import fits
 
     header = fits.Header()
@@ -265,15 +278,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
     header["FRAME"] = (frame.index, "index of the frame")
     header.append(TOP_DOWN_CARD)
     header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
-    if scene.stars:
-        header.update(wcs.header(scene.camera.calibration(), truth.mean_cam_from_lab))
-        header["COMMENT"] = (
-            "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
-        )
-    else:
-        header["COMMENT"] = "no WCS: the lights are in the laboratory"
-    with atomic_file(path) as temporary:
-        fits.PrimaryHDU(frame.image_dn, header).writeto(temporary, overwrite=True)
+    header.update(wcs_cards)
+    header["COMMENT"] = comment
+    return fits.PrimaryHDU(frame.image_dn, header)
 
 
 def utc_text(scene: Scene, t_s: float) -> str:

@@ -49,6 +49,13 @@ def live(
             help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
         ),
     ] = None,
+    indi: Annotated[
+        int | None,
+        typer.Option(
+            **PORTS,
+            help="Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.",
+        ),
+    ] = None,
     pipe: Annotated[
         str | None,
         typer.Option(
@@ -118,6 +125,7 @@ def live(
         "pipe": pipe,
         "http": http,
         "display": display,
+        "indi": indi,
         "tcp": tcp,
     }
     chosen = {name: value for name, value in outputs.items() if value is not None}
@@ -142,10 +150,10 @@ def live(
         flight,
         Pace(speed, flight.lab.scene.exposure.rate_hz),
         [],
-        CommandState(flight, command_timeout, trigger),
+        CommandState(flight, command_timeout, trigger or indi is not None),
         has_truth=truth,
         solves_itself=not client_tracker,
-        may_solve=tcp is not None,
+        may_solve=tcp is not None or indi is not None,
     )
     with ExitStack() as stack:
         opening = Opening(flown, stack, host, token or new_token(host), wait)
@@ -244,6 +252,19 @@ def open_display(opening: Opening, bench: str) -> None:
     )
 
 
+def open_indi(opening: Opening, port: int) -> None:
+    try:
+        from skysim.apps.live.indi import IndiCamera
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "--indi", f"needs {error.name}", "after pip install 'skysim[indi]'"
+        ) from None
+    camera = IndiCamera(opening.live, port)
+    opening.stack.callback(camera.close)
+    opening.add(camera.sink)
+    opening.say(f"indi 127.0.0.1:{camera.port}")
+
+
 def open_tcp(opening: Opening, port: int) -> None:
     """Serve the wire, and wait for its first client if wanted."""
     from skysim.apps.live.wire import WireServer
@@ -263,6 +284,7 @@ OPENERS: dict[str, Callable[[Opening, Any], None]] = {
     "pipe": open_pipe,
     "http": open_http,
     "display": open_display,
+    "indi": open_indi,
     "tcp": open_tcp,
 }
 SERVERS = ("tcp", "http")
