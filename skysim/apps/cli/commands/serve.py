@@ -55,6 +55,17 @@ def live(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
         ),
     ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
+    ] = None,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(
+            **PORTS,
+            help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
+        ),
+    ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; other than loopback with a token.")
     ] = HOST,
@@ -66,7 +77,7 @@ def live(
     ] = "",
     truth: Annotated[
         bool,
-        typer.Option("--truth", help="Let clients, folder and /truth.json have the truth."),
+        typer.Option("--truth", help="Let clients, files and /truth.json have the truth."),
     ] = False,
     trigger: Annotated[
         bool,
@@ -118,6 +129,8 @@ def live(
         "pipe": pipe,
         "http": http,
         "display": display,
+        "mcap": mcap,
+        "foxglove": foxglove,
         "tcp": tcp,
     }
     chosen = {name: value for name, value in outputs.items() if value is not None}
@@ -145,7 +158,7 @@ def live(
         CommandState(flight, command_timeout, trigger),
         has_truth=truth,
         solves_itself=not client_tracker,
-        may_solve=tcp is not None,
+        may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
         opening = Opening(flown, stack, host, token or new_token(host), wait)
@@ -244,6 +257,29 @@ def open_display(opening: Opening, bench: str) -> None:
     )
 
 
+def open_mcap(opening: Opening, path: Path) -> None:
+    outputs, encoder = ros_parts(opening, "--mcap")
+    opening.add(outputs.McapSink(encoder, path))
+
+
+def open_foxglove(opening: Opening, port: int) -> None:
+    outputs, encoder = ros_parts(opening, "--foxglove")
+    sink = outputs.FoxgloveSink(encoder, port)
+    opening.add(sink)
+    opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
+
+
+def ros_parts(opening: Opening, option: str) -> tuple[Any, Any]:
+    """Module of the outputs of ROS 2 messages, and their encoder. Raises InputError without the extra."""
+    try:
+        from skysim.apps.live import ros_outputs
+    except ModuleNotFoundError as error:
+        raise InputError(
+            option, f"{error.name} is not installed", "after pip install 'skysim[ros]'"
+        ) from None
+    return ros_outputs, ros_outputs.RosEncoder(opening.live)
+
+
 def open_tcp(opening: Opening, port: int) -> None:
     """Serve the wire, and wait for its first client if wanted."""
     from skysim.apps.live.wire import WireServer
@@ -263,9 +299,12 @@ OPENERS: dict[str, Callable[[Opening, Any], None]] = {
     "pipe": open_pipe,
     "http": open_http,
     "display": open_display,
+    "mcap": open_mcap,
+    "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
 SERVERS = ("tcp", "http")
+TAKE_SOLUTIONS = {"mcap", "foxglove", "tcp"}
 
 
 def summary(statistics: dict[str, Any]) -> str:
