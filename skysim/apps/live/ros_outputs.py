@@ -195,7 +195,8 @@ class FoxgloveSink(Sink):
     def __init__(self, encoder: RosEncoder, port: int) -> None:
         super().__init__("foxglove", self.publish, ())
         self.encoder = encoder
-        context = foxglove.Context()
+        # The server and its channels end with the context, so that it is kept.
+        self.context = foxglove.Context()
         self.topics = {
             topic: foxglove.Channel(
                 topic.name,
@@ -203,7 +204,7 @@ class FoxgloveSink(Sink):
                     name=topic.type, encoding="ros2msg", data=topic.definition.encode()
                 ),
                 message_encoding="cdr",
-                context=context,
+                context=self.context,
             )
             for topic in encoder.topics
         }
@@ -214,7 +215,7 @@ class FoxgloveSink(Sink):
                 name="skysim live",
                 host=LOOPBACK_HOST,
                 port=port,
-                context=context,
+                context=self.context,
                 server_listener=Subscriptions(self, self.topics),
                 message_backlog_size=min(max(frames, LEAST_BACKLOG), MOST_BACKLOG),
             )
