@@ -26,7 +26,7 @@ from skysim.apps.live.commands import CommandState
 from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.ros_messages import TOPICS, TRUE_TOPICS, RosEncoder, mean_covariance
-from skysim.apps.live.ros_outputs import FoxgloveSink, McapSink
+from skysim.apps.live.ros_outputs import FoxgloveSink, McapSink, RecordFile
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.dynamics.imu import Imu, Increments
@@ -267,6 +267,24 @@ def test_a_full_disk_leaves_a_whole_file_and_counts_what_it_lacks(
     assert len(images) == sink.sent["frame"] == room // (3_840_000 + 100)
     for index, image in enumerate(images):
         assert bytes(image.data) == noisy_frame(flown, index).pixels.tobytes()
+
+
+def test_where_the_end_has_no_room_the_last_chunk_makes_room(tmp_path: Path) -> None:
+    """Two chunks fill the disk exactly; the file ends after the first."""
+    path = tmp_path / "data"
+    file = RecordFile(path)
+    with no_room(2000):
+        for letter in (b"x", b"y"):
+            file.write(1000 * letter)
+            file.flush()
+        with pytest.raises(OSError, match="File too large"):
+            file.write(b"z")
+        assert file.end_early() == 1
+    data = path.read_bytes()
+    assert data[:1000] == 1000 * b"x"
+    assert b"y" not in data
+    assert data.endswith(b"\x89MCAP0\r\n")
+    assert len(data) < 1060
 
 
 def test_a_file_is_never_overwritten(flown: Flown, tmp_path: Path) -> None:
