@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 pytest.importorskip("mcap_ros2", reason="the extra `ros` is not installed")
 
+from mcap.writer import MCAP0_MAGIC
 from rosbags.highlevel import AnyReader
 
 from skysim.apps.cli import main
@@ -165,7 +166,7 @@ def test_stamps_are_the_start_s_wall_clock_plus_the_simulator_s_time(flown: Flow
     times_s = {
         "/camera/image_raw": [one.header["t_s"] for one in flown.packets["frame"]],
         "/imu/data_raw": [t for one in flown.packets["imu"] for t in one.header["times_s"]],
-        "/truth/rate": [one.header["t_s"] for one in flown.packets["truth"]],
+        "/truth/attitude": [one.header["t_s"] for one in flown.packets["truth"]],
     }
     for topic, wanted_s in times_s.items():
         stamps_ns = [stamp_ns(one) - start_ns for one in flown.messages[topic]]
@@ -269,22 +270,23 @@ def test_a_full_disk_leaves_a_whole_file_and_counts_what_it_lacks(
         assert bytes(image.data) == noisy_frame(flown, index).pixels.tobytes()
 
 
-def test_where_the_end_has_no_room_the_last_chunk_makes_room(tmp_path: Path) -> None:
-    """Two chunks fill the disk exactly; the file ends after the first."""
+def test_the_file_is_whole_after_each_chunk_and_where_its_end_has_no_room(
+    tmp_path: Path,
+) -> None:
+    """The second chunk fills the disk exactly, and is lost."""
     path = tmp_path / "data"
     file = RecordFile(path)
+    file.write(1000 * b"x")
+    file.flush()
+    whole = path.read_bytes()
+    assert whole == 1000 * b"x" + file.end
+    assert whole.endswith(MCAP0_MAGIC)
     with no_room(2000):
-        for letter in (b"x", b"y"):
-            file.write(1000 * letter)
-            file.flush()
+        file.write(1000 * b"y")
         with pytest.raises(OSError, match="File too large"):
-            file.write(b"z")
-        assert file.end_early() == 1
-    data = path.read_bytes()
-    assert data[:1000] == 1000 * b"x"
-    assert b"y" not in data
-    assert data.endswith(b"\x89MCAP0\r\n")
-    assert len(data) < 1060
+            file.flush()
+        file.cut()
+    assert path.read_bytes() == whole
 
 
 def test_a_file_is_never_overwritten(flown: Flown, tmp_path: Path) -> None:
