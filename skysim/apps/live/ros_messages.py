@@ -15,9 +15,10 @@ from mcap_ros2._dynamic import serialize_dynamic
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.live.packets import Packet
 from skysim.apps.live.pacing import Live
+from skysim.apps.live.packets import Packet
 from skysim.core.paths import DATA
+from skysim.core.types import Floats
 from skysim.dynamics.imu import build_triad
 from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig
 from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard_dome
@@ -108,9 +109,9 @@ def camera_info(encoder: RosEncoder, _: Packet) -> list[Message]:
             "width": camera.width_px,
             "distortion_model": "plumb_bob",
             "d": camera.distortion,
-            "k": k.ravel().tolist(),
-            "r": np.eye(3).ravel().tolist(),
-            "p": np.column_stack([k, np.zeros(3)]).ravel().tolist(),
+            "k": flat(k),
+            "r": flat(np.eye(3)),
+            "p": flat(k @ np.eye(3, 4)),
         }
     ]
 
@@ -141,7 +142,11 @@ def mean_covariance(config: GyroConfig | AccelerometerConfig, step_s: float) -> 
     """
     triad = build_triad(config, np.zeros((4, 3)), np.zeros(3))
     variance = triad.white**2 / step_s + triad.quantum**2 / (6 * step_s**2)
-    return np.diag([variance] * 3).ravel().tolist()
+    return flat(variance * np.eye(3))
+
+
+def flat(matrix: Floats) -> list[float]:
+    return matrix.ravel().tolist()
 
 
 def named(numbers: ArrayLike) -> Message:
@@ -151,12 +156,6 @@ def named(numbers: ArrayLike) -> Message:
 
 def inverse(xyzw: ArrayLike) -> Message:
     return named(Rotation.from_quat(xyzw).inv().as_quat())
-
-
-def solved_attitude(_: RosEncoder, packet: Packet) -> list[Message]:
-    """Attitude of the camera, where the frame was solved."""
-    found = packet.header.get("cam_from_ref_xyzw")
-    return [{"quaternion": inverse(found)}] if found else []
 
 
 def transforms(encoder: RosEncoder, packet: Packet) -> list[Message]:
@@ -178,14 +177,15 @@ def transforms(encoder: RosEncoder, packet: Packet) -> list[Message]:
     return [{"transforms": made}]
 
 
-def true_camera(_: RosEncoder, packet: Packet) -> list[Message]:
-    """Mean attitude of the camera over the exposure, with which a solution is compared."""
-    return [{"quaternion": inverse(packet.truth["mean_cam_from_ref_xyzw"])}]
-
-
 def true_attitude(_: RosEncoder, packet: Packet) -> list[Message]:
     """Attitude of the body."""
     return [{"quaternion": named(packet.header["lab_from_body_xyzw"])}]
+
+
+def camera_attitude(_: RosEncoder, packet: Packet) -> list[Message]:
+    """Attitude of the camera: of a frame the true mean over its exposure, with which its solution is compared."""
+    found = packet.truth.get("mean_cam_from_ref_xyzw", packet.header.get("cam_from_ref_xyzw"))
+    return [{"quaternion": inverse(found)}] if found else []
 
 
 class Topic(NamedTuple):
@@ -208,10 +208,10 @@ TOPICS = (
     Topic("/camera/image_raw", "sensor_msgs/msg/Image", CAMERA, "frame", image),
     Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", CAMERA, "frame", camera_info),
     Topic("/imu/data_raw", "sensor_msgs/msg/Imu", BODY, "imu", imu),
-    Topic("/star_tracker/attitude", ATTITUDE, "", "solution", solved_attitude),
+    Topic("/star_tracker/attitude", ATTITUDE, "", "solution", camera_attitude),
     Topic("/tf", "tf2_msgs/msg/TFMessage", "", "telemetry", transforms),
 )
 TRUE_TOPICS = (
-    Topic("/truth/camera", ATTITUDE, "", "frame", true_camera),
+    Topic("/truth/camera", ATTITUDE, "", "frame", camera_attitude),
     Topic("/truth/attitude", ATTITUDE, "", "truth", true_attitude),
 )

@@ -11,7 +11,6 @@ from threading import Lock
 from typing import Any
 
 import foxglove
-from foxglove.websocket import ServerListener
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer
 from mcap.writer import MCAP0_MAGIC, Writer
@@ -77,14 +76,12 @@ class McapSink(Sink):
         self.is_open = True
         self.writer = Writer(self.file, chunk_size=1 << 62)  # chunks end by `flush` alone
         self.writer.start(profile="ros2")
-        schemas = {
-            one.type: self.writer.register_schema(
-                one.type, "ros2msg", one.definition.encode()
-            )
-            for one in {topic.type: topic for topic in encoder.topics}.values()
-        }
         self.numbers = {
-            topic: self.writer.register_channel(topic.name, "cdr", schemas[topic.type])
+            topic: self.writer.register_channel(
+                topic.name,
+                "cdr",
+                self.writer.register_schema(topic.type, "ros2msg", topic.definition.encode()),
+            )
             for topic in encoder.topics
         }
         self.flush()
@@ -146,6 +143,7 @@ class FoxgloveSink(Sink):
     def __init__(self, encoder: RosEncoder, port: int) -> None:
         super().__init__("foxglove", self.publish, ())
         self.encoder = encoder
+        self.clients = Counter[str]()  # by topic
         # The server and its channels end with the context, so that it is kept.
         self.context = foxglove.Context()
         self.topics = {
@@ -166,7 +164,7 @@ class FoxgloveSink(Sink):
                 host=LOOPBACK_HOST,
                 port=port,
                 context=self.context,
-                server_listener=Subscriptions(self),
+                server_listener=self,
                 message_backlog_size=max(BACKLOG_BYTES // frame_bytes, LEAST_BACKLOG),
             )
         except Exception as error:
@@ -184,22 +182,13 @@ class FoxgloveSink(Sink):
         super().close()
         self.server.stop()
 
-
-class Subscriptions(ServerListener):
-    """Keeps the channels of a sink those of the topics that clients take."""
-
-    def __init__(self, sink: FoxgloveSink) -> None:
-        self.sink = sink
-        self.clients = Counter[str]()
-
-    def on_subscribe(self, client: Any, channel: Any) -> None:
+    def on_subscribe(self, _: Any, channel: Any) -> None:
         self.count(channel.topic, 1)
 
-    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+    def on_unsubscribe(self, _: Any, channel: Any) -> None:
         self.count(channel.topic, -1)
 
     def count(self, name: str, more: int) -> None:
+        """Count the clients of a topic; the sink takes the channels that have any."""
         self.clients[name] += more
-        self.sink.channels = {
-            topic.channel for topic in self.sink.topics if self.clients[topic.name] > 0
-        }
+        self.channels = {one.channel for one in self.topics if self.clients[one.name] > 0}
