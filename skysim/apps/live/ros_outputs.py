@@ -68,14 +68,15 @@ class McapSink(Sink):
     def __init__(self, encoder: RosEncoder, path: Path) -> None:
         self.encoder = encoder
         self.path = path
-        try:
-            self.file = RecordFile(path)
-        except OSError as error:
-            raise InputError(f"--mcap {path}", error.strerror, "a new file") from None
         self.lock = Lock()
         self.is_open = True
-        self.writer = Writer(self.file, chunk_size=1 << 62)  # chunks end by `flush` alone
-        self.writer.start(profile="ros2")
+        try:
+            self.file = RecordFile(path)
+            self.writer = Writer(self.file, chunk_size=1 << 62)  # chunks end by `flush` alone
+            self.writer.start(profile="ros2")
+            self.flush()
+        except OSError as error:
+            raise InputError(f"--mcap {path}", error.strerror, "a new file") from None
         self.numbers = {
             topic: self.writer.register_channel(
                 topic.name,
@@ -84,7 +85,6 @@ class McapSink(Sink):
             )
             for topic in encoder.topics
         }
-        self.flush()
         super().__init__("mcap", self.record, {topic.channel for topic in encoder.topics})
 
     def flush(self) -> None:

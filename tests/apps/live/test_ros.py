@@ -295,6 +295,8 @@ def test_a_file_is_never_overwritten(flown: Flown, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"flight\.mcap: File exists; allowed: a new file"):
         McapSink(RosEncoder(flown.live), path)
     assert path.read_text() == "mine"
+    with no_room(20), pytest.raises(InputError, match=r"new\.mcap: File too large"):
+        McapSink(RosEncoder(flown.live), tmp_path / "new.mcap")
 
 
 def test_without_the_extra_a_line_says_what_to_install(
@@ -315,11 +317,12 @@ def test_foxglove_sends_the_same_messages_to_who_takes_them(flown: Flown) -> Non
     websockets = pytest.importorskip("websockets")
     sink = FoxgloveSink(RosEncoder(flown.live), 0)
     address = f"ws://127.0.0.1:{sink.server.port}"
+    other_site: Any = "http://other.example"  # which the server lets in, as the page says
     frames = flown.packets["frame"]
 
     async def receive() -> tuple[dict[str, Any], list[bytes]]:
         async with websockets.connect(
-            address, subprotocols=["foxglove.sdk.v1"], max_size=None
+            address, subprotocols=["foxglove.sdk.v1"], origin=other_site, max_size=None
         ) as client:
             await client.recv()
             offered = {
