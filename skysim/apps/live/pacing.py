@@ -173,6 +173,7 @@ class Live:
         flight = self.flight
         # 1. and 2. Commands and motion.
         self.commands.receive(self.inbox)
+        began_s = flight.now_s
         flight.motion.advance(flight.motion.period_steps, self.commands.in_force())
         # 3. Clock.
         now_s = flight.now_s
@@ -184,7 +185,7 @@ class Live:
         wanted = self.wanted
         made_unix_s = time.monotonic() + self.pace.offset_s
         for channel in PERIODIC:
-            values = period_values(flight, channel) if channel in wanted else {}
+            values = period_values(flight, channel, began_s) if channel in wanted else {}
             if values:
                 head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
                 self.send(Packet(head | values))

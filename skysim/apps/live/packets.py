@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
 from skysim.core.types import Truth
+from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
 
 CHANNELS = ("frame", "solution", "imu", "state", "telemetry", "truth")
@@ -171,8 +172,8 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
     return Packet(header, attitude=solution)
 
 
-def period_values(flight: Flight, channel: str) -> dict[str, Any]:
-    """The values of a periodic channel at the end of a control period."""
+def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any]:
+    """The values of a periodic channel at the end of a control period that began at began_s."""
     state = flight.state
     motion = flight.motion
     navigation = motion.navigation
@@ -188,16 +189,15 @@ def period_values(flight: Flight, channel: str) -> dict[str, Any]:
             "rate_body_rad_s": state.rate_body_rad_s.tolist(),
         }
     if channel == "imu":
-        since_s = flight.now_s - 0.5 * motion.flight_computer.period_s
-        samples = flight.imu_samples(since_s)
-        # A unit slower than the control has none in most periods.
-        if samples is None or not len(samples.t_s) or samples.t_s[-1] < since_s:
+        samples = flight.imu_samples(began_s)
+        # A unit slower than the control has none in most periods; those of earlier periods were sent.
+        if samples is None or not (new := samples.t_s > began_s + TIME_TOLERANCE_S).any():
             return {}
         return {
             "step_s": samples.step_s,
-            "times_s": samples.t_s.tolist(),
-            "angle_rad": samples.angle_rad.tolist(),
-            "velocity_m_s": samples.velocity_m_s.tolist(),
+            "times_s": samples.t_s[new].tolist(),
+            "angle_rad": samples.angle_rad[new].tolist(),
+            "velocity_m_s": samples.velocity_m_s[new].tolist(),
         }
     computer = motion.flight_computer
     values = {

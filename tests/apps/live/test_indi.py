@@ -300,5 +300,5 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "skysim.apps.live.indi")
     done = CliRunner().invoke(main.app, ["live", "shefex2", "--indi", "0"])
     assert isinstance(done.exception, InputError)
-    assert "needs indipyserver" in str(done.exception)
+    assert "indipyserver is not installed" in str(done.exception)
     assert "pip install 'skysim[indi]'" in str(done.exception)

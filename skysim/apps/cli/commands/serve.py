@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import secrets
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -62,6 +62,17 @@ def live(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
         ),
     ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
+    ] = None,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(
+            **PORTS,
+            help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
+        ),
+    ] = None,
     host: Annotated[
         str, typer.Option(help="Address to serve on; other than loopback with a token.")
     ] = HOST,
@@ -73,7 +84,7 @@ def live(
     ] = "",
     truth: Annotated[
         bool,
-        typer.Option("--truth", help="Let clients, folder and /truth.json have the truth."),
+        typer.Option("--truth", help="Let clients, files and /truth.json have the truth."),
     ] = False,
     trigger: Annotated[
         bool,
@@ -126,6 +137,8 @@ def live(
         "http": http,
         "display": display,
         "indi": indi,
+        "mcap": mcap,
+        "foxglove": foxglove,
         "tcp": tcp,
     }
     chosen = {name: value for name, value in outputs.items() if value is not None}
@@ -153,7 +166,7 @@ def live(
         CommandState(flight, command_timeout, trigger or indi is not None),
         has_truth=truth,
         solves_itself=not client_tracker,
-        may_solve=tcp is not None or indi is not None,
+        may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
         opening = Opening(flown, stack, host, token or new_token(host), wait)
@@ -252,17 +265,40 @@ def open_display(opening: Opening, bench: str) -> None:
     )
 
 
-def open_indi(opening: Opening, port: int) -> None:
+@contextmanager
+def extra_of(option: str, extra: str) -> Iterator[None]:
+    """Name the extra that an option needs, where a package is missing."""
     try:
-        from skysim.apps.live.indi import IndiCamera
+        yield
     except ModuleNotFoundError as error:
-        raise InputError(
-            "--indi", f"needs {error.name}", "after pip install 'skysim[indi]'"
-        ) from None
+        allowed = f"after pip install 'skysim[{extra}]'"
+        raise InputError(option, f"{error.name} is not installed", allowed) from None
+
+
+def open_indi(opening: Opening, port: int) -> None:
+    with extra_of("--indi", "indi"):
+        from skysim.apps.live.indi import IndiCamera
+
     camera = IndiCamera(opening.live, port)
     opening.stack.callback(camera.close)
     opening.add(camera.sink)
-    opening.say(f"indi 127.0.0.1:{camera.port}")
+    opening.say(f"indi {HOST}:{camera.port}")
+
+
+def open_mcap(opening: Opening, path: Path) -> None:
+    with extra_of("--mcap", "ros"):
+        from skysim.apps.live.ros_outputs import McapSink, RosEncoder
+
+    opening.add(McapSink(RosEncoder(opening.live), path))
+
+
+def open_foxglove(opening: Opening, port: int) -> None:
+    with extra_of("--foxglove", "ros"):
+        from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
+
+    sink = FoxgloveSink(RosEncoder(opening.live), port)
+    opening.add(sink)
+    opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
 
 
 def open_tcp(opening: Opening, port: int) -> None:
@@ -285,9 +321,12 @@ OPENERS: dict[str, Callable[[Opening, Any], None]] = {
     "http": open_http,
     "display": open_display,
     "indi": open_indi,
+    "mcap": open_mcap,
+    "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
 SERVERS = ("tcp", "http")
+TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
 
 
 def summary(statistics: dict[str, Any]) -> str:
