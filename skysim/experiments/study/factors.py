@@ -305,6 +305,21 @@ def make_point(chosen: Mapping[str, Option]) -> Point:
     return Point({name: level for name, (level, _) in chosen.items()}, settings)
 
 
+def each_level(factors: Factors) -> Iterator[tuple[str, Value, Settings, Settings]]:
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings.
+
+    Without factors the one point.
+    """
+    if not factors:
+        yield "", "", {}, {}
+    middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
+    for name, factor in factors.items():
+        # Its own settings are the last: they replace those of others.
+        others = {other: option for other, option in middle.items() if other != name}
+        for option in factor.options() or [middle[name]]:
+            yield name, *option, make_point(others | {name: option}).settings
+
+
 def factorial(design: Design, factors: Factors, seed: int) -> Points:
     """Every combination; the last factor changes fastest."""
     for levels in itertools.product(*(factor.options() for factor in factors.values())):
