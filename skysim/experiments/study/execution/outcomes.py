@@ -313,8 +313,6 @@ def count_wrong_matches(
 
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
     """RMS error of the centroids about each axis, of those within reach_px of a true image; NaN if there are none."""
-    if not len(centroids_px) or not len(true_px):
-        return nan
     _, distance_px = nearest_light(centroids_px, true_px)
     distance_px = distance_px[distance_px <= reach_px]
     return rms(distance_px) / math.sqrt(2)
@@ -322,14 +320,12 @@ def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) ->
 
 def near(xy_px: Floats, others_px: Floats, reach_px: float) -> int:
     """Number of positions with another one within reach_px."""
-    if not len(xy_px) or not len(others_px):
-        return 0
     return int(np.sum(nearest_light(xy_px, others_px)[1] <= reach_px))
 
 
 @jit
 def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """(K,) row of the light nearest to each position, and its distance."""
+    """(K,) row of the light nearest to each position, and its distance; 0 and infinity without lights."""
     nearest = np.zeros(len(xy_px), np.int64)
     distance_px = np.full(len(xy_px), math.inf)
     for k in range(len(xy_px)):

@@ -318,14 +318,15 @@ def points_section(
     named = [name for name, one in axes.items() if not one.numeric]
     columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, (number, *row_texts) in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [one.at(line) for one in axes.values()]
+    for line, row_texts in zip(lines[:ROWS], texts, strict=False):
+        keys = [line.point, *(one.at(line) for one in axes.values())]
         keys += [one.value for one in line.responses.values()]
-        row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
-        rows.append([Cell(number, "marked" if line.point in front else "", line.point), *row])
+        tones: list[Tone] = ["marked" if line.point in front else "", *[""] * len(keys)]
+        rows.append(list(map(Cell, row_texts, tones, keys)))
+        if study.optimize:
+            rows[-1].append(costs.get(line.point))
     if study.optimize:
         columns.append(Column("cost", format=".4g"))
-        rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
     note = "In brackets intervals of 95 %."
     if front:
         note += " Tinted: the front."
