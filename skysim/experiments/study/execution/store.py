@@ -411,20 +411,15 @@ class Store:
         query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
         cursor = self.db.execute(query, values)
         texts = dict[Any, Any]()
-        batches: list[list[Array]] = [[to_array(name, (), texts)] for name in COLUMNS]
+        columns = {name: [to_array(name, (), texts)] for name in COLUMNS}
         with self.corruption_as_input_error():
             while rows := cursor.fetchmany(10_000):
-                for name, arrays, column in zip(
-                    COLUMNS, batches, zip(*rows, strict=True), strict=True
-                ):
-                    arrays.append(to_array(name, column, texts))
+                for name, column in zip(COLUMNS, zip(*rows, strict=True), strict=True):
+                    columns[name].append(to_array(name, column, texts))
             self.checked(
                 [text for text in texts if not isinstance(text, str | None)][:1], str
             )
-            return {
-                name: np.concatenate(arrays)
-                for name, arrays in zip(COLUMNS, batches, strict=True)
-            }
+        return {name: np.concatenate(arrays) for name, arrays in columns.items()}
 
     def checked(self, row: Iterable[Any], *types: type) -> tuple[Any, ...]:
         """The values of a row. Raises InputError for a value of another type: SQLite stores any type in any column."""
