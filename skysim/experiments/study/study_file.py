@@ -202,9 +202,7 @@ def check(plan: Plan, to_run: bool) -> None:
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
-    check_measured(
-        study, {point.trial.kind for point in points}, [point.scene for point in points]
-    )
+    check_measured(study, points)
     unused_options.check(plan, points)
 
 
@@ -349,8 +347,10 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
     return error.within(f"{value!r}").within(f"factors.{owner}")
 
 
-def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> None:
+def check_measured(study: Study, points: Sequence[unused_options.CheckedPoint]) -> None:
     """Raise InputError for a response that no trial of the study measures."""
+    kinds = {point.trial.kind for point in points}
+    scenes = [point.scene for point in points]
     where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
     where |= {one.response: key for key, one in named_sections(study)}
     where |= {name: f"require.{name}" for name in study.require}

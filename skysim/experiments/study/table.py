@@ -303,7 +303,7 @@ def indices(plan: Plan, store: Store) -> list[Index]:
         sigma_arcsec = math.sqrt(variance * len(axes))
         names = [*plan.study.factors, "the rest"]
         for name, both in zip(names, values.T.tolist(), strict=False):
-            first, total = (Summary(*one, count) for one in both)
+            first, total = (Summary(value, low, high, count) for value, low, high in both)
             rms_arcsec = sigma_arcsec * math.sqrt(max(first.value, 0.0))
             found.append(Index(name, response, first, total, rms_arcsec))
     return found

@@ -378,6 +378,7 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
 
     solved = [one for one in outcomes if one.solved]
     last = outcomes[-1] if outcomes else Outcome("no frame after it settled")
+    x, y, roll = (rms(known(name)) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
     good = known("solved") > known("wrong")
     error = angles_arcsec(log.lab_from_filter, log, settle_s)
     pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
@@ -389,7 +390,9 @@ def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -
         len(outcomes),
         len(solved),
         int(known("wrong").sum()),
-        *(rms(known(name)) for name in ("x_arcsec", "y_arcsec", "roll_arcsec")),
+        x,
+        y,
+        roll,
         mean([one.nees for one in solved]),
         min(known("stars").tolist(), default=nan),
         availability=mean(error < limit if len(error) else good),

@@ -110,7 +110,7 @@ def halo() -> Any:
     return withStroke(linewidth=2.2, foreground="white")
 
 
-def annotate(axes: Any, text: str, at: Sequence[float], ink: str, **style: Any) -> None:
+def annotate(axes: Any, text: str, at: Any, ink: str, **style: Any) -> None:
     """Write a text beside a point, readable on any color."""
     beside = {"xytext": (5, 4), "textcoords": "offset points", "path_effects": [halo()]}
     axes.annotate(text, at, color=ink, **beside, **style)
