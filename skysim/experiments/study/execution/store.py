@@ -344,7 +344,7 @@ class Store:
 
     def point_columns(self, *points: int) -> Rows:
         """The columns of the trials of some points."""
-        if len(points) > 1 or not (parts := self.parts()):
+        if len(points) != 1 or not (parts := self.parts()):
             return self._rows(ranges_of(points, self._replicates()))
         # Reading one point of a part takes as long as reading all of its points.
         (point,), (near, rows) = points, self._near
@@ -480,7 +480,9 @@ def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> Array:
 
 
 def ranges_of(points: Sequence[int], replicates: int) -> list[tuple[int, int]]:
-    """The ranges (first, end) of the trials of some points."""
+    """The ranges (first, end) of the trials of some points; an empty one for none."""
+    if not points:
+        return [(0, 0)]
     ordered = np.array(sorted(points))
     runs = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
     return [(int(run[0]) * replicates, (int(run[-1]) + 1) * replicates) for run in runs]

@@ -87,8 +87,6 @@ def direction_maps(
 
 def direction_map(label: str, columns: metrics.Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
-    if not columns:
-        return DirectionMap(label, False, [], [])
     in_dome = np.isfinite(columns["body_tilt_deg"])
     in_sky = np.isfinite(columns["boresight_dec_deg"])
     if in_dome.any() and in_sky.any():
