@@ -7,7 +7,7 @@ import base64
 import math
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -131,42 +131,48 @@ FACT_WIDTH = 80  # of the lines of facts and warnings
 COLORS = {"good": "green", "warning": "yellow", "bad": "bold red"}
 
 
+def is_printed(block: Block) -> bool:
+    """Whether a terminal shows a block: it has no figures."""
+    return block.on_terminal and not isinstance(block, Figure)
+
+
 def print_blocks(blocks: Sequence[Block]) -> None:
-    """Print blocks one below the other; those without a terminal's form, such as figures, are skipped."""
-    for one in blocks:
-        if one.on_terminal and type(one) in PRINTERS:
-            PRINTERS[type(one)](one)
+    """Print blocks one below the other, a section under its title if it has something to print.
+
+    Warnings are named, and as narrow as facts.
+    """
+    for block in filter(is_printed, blocks):
+        match block:
+            case Section(title=title, blocks=inner) if any(map(is_printed, inner)):
+                console().print(styled(Cell(title), "bold"))
+                print_blocks(inner)
+                print()
+            case Items(lines=lines, title=title, tone=tone):
+                if title:
+                    print_wrapped(title)
+                for line in lines:
+                    if tone == "warning":
+                        print_wrapped(f"warning: {line}", width=FACT_WIDTH)
+                    else:
+                        print_wrapped(line)
+            case Facts(rows=rows):
+                for name, texts in rows:
+                    print_fact(name, texts)
+            case Table():
+                print_table(block)
+            case Code(text=text):
+                print(text)
+            case Text(text=text) | Verdict(text=text):
+                print_wrapped(text)
 
 
-def print_section(section: Section) -> None:
-    """Print a section under its title; nothing if it has nothing to print."""
-    if not any(one.on_terminal and type(one) in PRINTERS for one in section.blocks):
-        return
-    console().print(styled(Cell(section.title), "bold"))
-    print_blocks(section.blocks)
-    print()
-
-
-def print_items(items: Items) -> None:
-    """Print one wrapped sentence after the other; warnings are named, and as narrow as facts."""
-    if items.title:
-        print_wrapped(items.title)
-    for line in items.lines:
-        if items.tone == "warning":
-            print_wrapped(f"warning: {line}", width=FACT_WIDTH)
-        else:
-            print_wrapped(line)
-
-
-def print_facts(facts: Facts) -> None:
-    """Print facts, names at the left."""
-    for name, lines in facts.rows:
-        head = name
-        for one in lines:
-            text = printable(one.text if isinstance(one, Cell) else one)
-            for line in textwrap.wrap(text, FACT_WIDTH - FACT_COLUMN):
-                print(f"{head:{FACT_COLUMN}}{line}")
-                head = ""
+def print_fact(head: str, texts: Sequence[str | Cell]) -> None:
+    """Print the texts of a fact, its name at the left."""
+    for one in texts:
+        text = printable(one.text if isinstance(one, Cell) else one)
+        for line in textwrap.wrap(text, FACT_WIDTH - FACT_COLUMN):
+            print(f"{head:{FACT_COLUMN}}{line}")
+            head = ""
 
 
 def print_table(table: Table, title: str = "") -> None:
@@ -247,17 +253,6 @@ def terminal_width() -> int:
 
     shown = Console()
     return shown.width if shown.is_terminal else max(shown.width, WIDE)
-
-
-PRINTERS: dict[type[Block], Callable[[Any], None]] = {
-    Code: lambda one: print(one.text),
-    Facts: print_facts,
-    Items: print_items,
-    Section: print_section,
-    Table: print_table,
-    Text: lambda one: print_wrapped(one.text),
-    Verdict: lambda one: print_wrapped(one.text),
-}
 
 
 SUFFIXES = (".html", ".md", ".json")

@@ -7,6 +7,7 @@ sampled design therefore only generates points in the unit cube.
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -199,13 +200,6 @@ class Distribution(KeyedFactor):
 
 
 ALL_PARAMETERS = ("mean", "median", "sigma", "low", "mode", "high")
-PARAMETERS = {
-    "normal": ("mean", "sigma"),
-    "lognormal": ("median", "sigma"),
-    "triangular": ("low", "mode", "high"),
-    "truncated_normal": ("mean", "sigma", "low", "high"),
-    "integers": ("low", "high"),
-}
 QUANTILES: dict[str, Callable[..., Any]] = {
     "normal": lambda u, mean, sigma: scipy.stats.norm.ppf(u, mean, sigma),
     "lognormal": lambda u, median, sigma: median * np.exp(sigma * scipy.stats.norm.ppf(u)),
@@ -216,6 +210,11 @@ QUANTILES: dict[str, Callable[..., Any]] = {
         u, (low - mean) / sigma, (high - mean) / sigma, mean, sigma
     ),
     "integers": lambda u, low, high: min(np.floor(low + u * (high - low + 1)), high),
+}
+# Names of the parameters of a distribution.
+PARAMETERS = {
+    name: list(inspect.signature(quantile).parameters)[1:]
+    for name, quantile in QUANTILES.items()
 }
 
 
@@ -303,6 +302,21 @@ def make_point(chosen: Mapping[str, Option]) -> Point:
     for _, level_settings in chosen.values():
         settings |= level_settings
     return Point({name: level for name, (level, _) in chosen.items()}, settings)
+
+
+def each_level(factors: Factors) -> Iterator[tuple[str, Value, Settings, Settings]]:
+    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings.
+
+    Without factors the one point.
+    """
+    if not factors:
+        yield "", "", {}, {}
+    middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
+    for name, factor in factors.items():
+        # Its own settings are the last: they replace those of others.
+        others = {other: option for other, option in middle.items() if other != name}
+        for option in factor.options() or [middle[name]]:
+            yield name, *option, make_point(others | {name: option}).settings
 
 
 def factorial(design: Design, factors: Factors, seed: int) -> Points:

@@ -24,7 +24,6 @@ from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, Tri
 from skysim.experiments.study.factors import (
     Distribution,
     Factor,
-    Levels,
     Point,
     Range,
     Value,
@@ -46,17 +45,17 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
     """Raise InputError for prices of unknown factors or levels, and for prices per unit of a factor without numbers."""
     for name in config.per:
         where = f"optimize.cost.per.{name}"
-        factor = require_factor(name, factors, where)
-        values = [value for value, _ in factor.options()]
+        check_name(where, "factor", name, factors)
         try:
-            for value in values if not isinstance(factor, Levels) else [values[0]]:
+            for value, _ in factors[name].options():
                 si(value)
         except InputError as error:
             allowed = "numbers, or quantities with units; prices of named levels: optimize.cost.levels"
             raise InputError(where, error.problem, allowed) from None
     for name, prices in config.levels.items():
         where = f"optimize.cost.levels.{name}"
-        factor = require_factor(name, factors, where)
+        check_name(where, "factor", name, factors)
+        factor = factors[name]
         named = (
             [str(level) for level, _ in factor.options()]
             if not isinstance(factor, Range)
@@ -69,12 +68,6 @@ def check_cost(factors: Mapping[str, Factor], config: Cost) -> None:
                 else "optimize.cost.per, as it is a range"
             )
             raise InputError(where, f"prices {', '.join(prices) or 'nothing'}", allowed)
-
-
-def require_factor(name: str, factors: Mapping[str, Factor], where: str) -> Factor:
-    """The factor with a name. Raises InputError if there is none."""
-    check_name(where, "factor", name, factors)
-    return factors[name]
 
 
 def si(value: Value) -> float:

@@ -1,9 +1,10 @@
 """Load a study file, validate it and make its plan."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 from pydantic import ValidationError
 
 from estimator.trackers.dome_tracker import DomeTracker
@@ -25,11 +26,9 @@ from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import unused_options
 from skysim.experiments.study.factors import (
     Distribution,
-    Factor,
     Levels,
-    Settings,
     Value,
-    make_point,
+    each_level,
     points,
 )
 from skysim.experiments.study.own_code import digests_of
@@ -203,9 +202,7 @@ def check(plan: Plan, to_run: bool) -> None:
         except InputError as error:
             raise at_factor(study, name, level, error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
-    check_measured(
-        study, {point.trial.kind for point in points}, [point.scene for point in points]
-    )
+    check_measured(study, points)
     unused_options.check(plan, points)
 
 
@@ -350,8 +347,10 @@ def at_factor(study: Study, name: str, level: Value, error: InputError) -> Input
     return error.within(f"{value!r}").within(f"factors.{owner}")
 
 
-def check_measured(study: Study, kinds: set[str], scenes: Sequence[Scene]) -> None:
+def check_measured(study: Study, points: Sequence[unused_options.CheckedPoint]) -> None:
     """Raise InputError for a response that no trial of the study measures."""
+    kinds = {point.trial.kind for point in points}
+    scenes = [point.scene for point in points]
     where = {name: f"responses.{n}" for n, name in enumerate(study.responses)}
     where |= {one.response: key for key, one in named_sections(study)}
     where |= {name: f"require.{name}" for name in study.require}
@@ -400,9 +399,7 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
                 f"has no effect with light of kind {scene.light.kind}",
                 "none",
             )
-    greatest_deg = (
-        max(start.tilt_deg) if isinstance(start.tilt_deg, tuple) else start.tilt_deg
-    )
+    greatest_deg = np.max(start.tilt_deg)
     vehicle = scene.vehicle
     if scene.dome and vehicle.mount == "air_bearing" and greatest_deg > vehicle.tilt_stop_deg:
         raise InputError(
@@ -410,21 +407,3 @@ def check_random_start(scene: Scene, start: AttitudeRange) -> None:
             f"{greatest_deg:g}",
             f"up to vehicle.tilt_stop_deg {vehicle.tilt_stop_deg:g}",
         )
-
-
-def each_level(
-    factors: Mapping[str, Factor],
-) -> Iterator[tuple[str, Value, Settings, Settings]]:
-    """Every level of every factor with the other factors at their middle: factor, level, its settings, all settings.
-
-    Without factors the one point.
-    """
-    if not factors:
-        yield "", "", {}, {}
-    middle = {name: factor.value_at(0.5) for name, factor in factors.items()}
-    for name, factor in factors.items():
-        others = make_point(
-            {other: chosen for other, chosen in middle.items() if other != name}
-        ).settings
-        for level, settings in factor.options() or [middle[name]]:
-            yield name, level, settings, others | settings

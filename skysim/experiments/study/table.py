@@ -24,7 +24,7 @@ from skysim.experiments.study.factors import (
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
 from skysim.results.files.row_parts import Array, Rows, subset
-from skysim.results.metrics import NO_VALUE, Columns, Summary
+from skysim.results.metrics import Columns, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")
 ROUNDING = 1e-9  # a smaller response is the rounding error of 0
@@ -249,8 +249,12 @@ def switches_causes(study: Study) -> bool:
     return not is_sampled(study) and all(sorted(one) == [False, True] for one in levels)
 
 
-def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
-    """The part of each cause, and of the rest, in the mean square m of one error with all causes on.
+# (3, 2, D) first and total indices of each factor: values, low ends, high ends; their count; variance about one axis.
+Estimate = tuple[Floats, int, float]
+
+
+def switched_causes(plan: Plan, outputs: Floats) -> Estimate:
+    """The part of each cause, and of the rest, in the mean square m of (S, P) errors with all causes on.
 
     Its first index is what it adds alone, its total one what goes without it,
 
@@ -260,10 +264,7 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
     without that of all causes m(all) is m({}) + sum of m({i}) - m({}). The intervals are of the percentile bootstrap
     over replicates, none of fewer than MIN_VALUES.
     """
-    squares = complete_outputs(plan, store, AXES[response]) ** 2
-    if not len(squares):
-        squares = np.full((1, len(plan.points)), np.nan)
-    names = [*plan.study.factors, "the rest"]
+    squares = outputs**2 if len(outputs) else np.full((1, len(plan.points)), np.nan)
     count = len(squares)
     drawn = random_stream(1).integers(count, size=(RESAMPLES, count))
     means = np.concatenate([[squares.mean(axis=0)], squares[drawn].mean(axis=1)])
@@ -286,59 +287,47 @@ def switched_causes(plan: Plan, store: Store, response: str) -> list[Index]:
     shares = np.array([[*alone, none], [*without, np.nan * none]]) / every
     ends = np.quantile(shares[..., 1:], metrics.TAILS, axis=-1)
     ends[...] = ends if count >= MIN_VALUES else np.nan
-    sigma_arcsec = math.sqrt(every[0] * len(AXES[response]))
-    return to_indices(names, response, [shares[..., 0], *ends], count, sigma_arcsec)
-
-
-def to_indices(
-    names: Sequence[str],
-    response: str,
-    estimates: Sequence[Floats],
-    count: int,
-    sigma_arcsec: float,
-) -> list[Index]:
-    """The indices of factors from (2, D) first and total values and their ends."""
-    first, total = (
-        [Summary(value, least, most, count) for value, least, most in index]
-        for index in np.stack(estimates, axis=-1).tolist()
-    )
-    return [
-        Index(name, response, one, other, sigma_arcsec * math.sqrt(max(one.value, 0.0)))
-        for name, one, other in zip(names, first, total, strict=True)
-    ]
+    return np.array([shares[..., 0], *ends]), count, every[0]
 
 
 def indices(plan: Plan, store: Store) -> list[Index]:
     """Indices of every factor for the cross-boresight and roll errors. Raises InputError for another design."""
     kind = plan.study.design.kind
-    found = switched_causes if switches_causes(plan.study) else response_indices
-    if found is response_indices and (kind != "saltelli" or plan.study.optimize):
+    estimate = switched_causes if switches_causes(plan.study) else response_indices
+    if estimate is response_indices and (kind != "saltelli" or plan.study.optimize):
         raise InputError("design.kind", kind, "saltelli, without optimize, for Sobol indices")
-    return [index for response in AXES for index in found(plan, store, response)]
+    found = []
+    for response, axes in AXES.items():
+        values, count, variance = estimate(plan, complete_outputs(plan, store, axes))
+        # The variance of the cross-boresight error is the sum of the variances about its two axes.
+        sigma_arcsec = math.sqrt(variance * len(axes))
+        names = [*plan.study.factors, "the rest"]
+        for name, both in zip(names, values.T.tolist(), strict=False):
+            first, total = (Summary(value, low, high, count) for value, low, high in both)
+            rms_arcsec = sigma_arcsec * math.sqrt(max(first.value, 0.0))
+            found.append(Index(name, response, first, total, rms_arcsec))
+    return found
 
 
-def response_indices(plan: Plan, store: Store, response: str) -> list[Index]:
-    """Indices of every factor for one error; NaN if no replicate is complete."""
-    names = list(plan.study.factors)
-    outputs = complete_outputs(plan, store, AXES[response])
+def response_indices(plan: Plan, outputs: Floats) -> Estimate:
+    """Indices of every factor for (S, P) errors; NaN if no replicate is complete."""
+    width = len(plan.study.factors)
+    if not len(outputs):
+        return np.full((3, 2, width), np.nan), 0, np.nan
     # (S, N) errors at A and at B, and (D, S, N) at A with one column of B: points are in the order A, B, AB_1 .. AB_D.
-    count = len(plan.points) // (len(names) + 2)
-    blocks = outputs.reshape(len(outputs), len(names) + 2, count)
+    count = len(plan.points) // (width + 2)
+    blocks = outputs.reshape(len(outputs), width + 2, count)
     a = blocks[:, 0]
     b = blocks[:, 1]
     ab = blocks[:, 2:].transpose(1, 0, 2)
-    if not len(a):
-        return [Index(name, response, NO_VALUE, NO_VALUE, np.nan) for name in names]
     estimate = generalized(a, b, ab)
     rng = random_stream(1)
     # Resample rows of A, B and AB together, so that each resample is a valid Saltelli sample.
     selections = rng.integers(count, size=(RESAMPLES, count))
     resampled = [generalized(a[:, rows], b[:, rows], ab[:, :, rows]) for rows in selections]
-    low, high = np.quantile(resampled, metrics.TAILS, axis=0)
-    # The variance of the cross-boresight error is the sum of the variances about its two axes.
-    variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean() * len(AXES[response])
-    sigma_arcsec = math.sqrt(variance)
-    return to_indices(names, response, [estimate, low, high], count, sigma_arcsec)
+    ends = np.quantile(resampled, metrics.TAILS, axis=0)
+    variance = np.var(np.concatenate([a, b], axis=1), axis=1).mean()
+    return np.array([estimate, *ends]), count, variance
 
 
 def complete_outputs(plan: Plan, store: Store, axes: tuple[str, ...]) -> Floats:

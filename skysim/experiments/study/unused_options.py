@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from skysim.core.yaml_reader import OverrideTexts
-from skysim.experiments.study.factors import Settings, Value, make_point
+from skysim.experiments.study.factors import Settings, Value, each_level
 from skysim.experiments.study.plan import (
     TRIAL,
     CentroidTrial,
@@ -307,15 +307,11 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
 
 def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str) -> bool:
     """Whether a key of one factor's level has an effect at some level of another factor, varied alone."""
-    others = {
-        name: factor for name, factor in plan.study.factors.items() if name != point.factor
-    }
-    middle = {name: factor.value_at(0.5) for name, factor in others.items()}
-    for name, factor in others.items():
-        for option in factor.options():
-            settings = make_point(middle | {name: option}).settings | point.own
-            scene, trial = resolve_point(plan.spec, settings)
-            varied = point._replace(settings=settings, scene=scene, trial=trial)
-            if find(key, plan, varied) is None:
-                return True
+    factors = plan.study.factors
+    others = {name: factor for name, factor in factors.items() if name != point.factor}
+    for *_, settings in each_level(others):
+        scene, trial = resolve_point(plan.spec, settings | point.own)
+        varied = point._replace(settings=settings | point.own, scene=scene, trial=trial)
+        if find(key, plan, varied) is None:
+            return True
     return False

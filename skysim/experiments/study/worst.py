@@ -117,8 +117,6 @@ def worst_trials(
     For a proportion they are trials that count for it (for `identified`, that do not): trials without a solution first,
     then by error and by the number of lights. None if there is no such trial.
     """
-    if not columns:
-        return []
     keys, values = ranking(columns, response)
     counted = np.isfinite(values)
     near = math.inf if flights else NEAR

@@ -25,6 +25,7 @@ from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
+from skysim.experiments.study.report import maps
 from tests.helpers.study_stores import STRAYS, contents, done
 
 
@@ -250,6 +251,17 @@ def test_a_value_of_a_wrong_type_is_refused_in_one_line(
         r"[^\n]*odd\.sqlite: not a valid study store: [^\n]+", str(refused.value)
     )
     assert str(refused.value).count("odd.sqlite") == 1
+
+
+def test_no_points_have_columns_without_rows(tmp_path: Path) -> None:
+    """A map with a panel for each level has a level without points if `where` chooses another one."""
+    path = tmp_path / "s.sqlite"
+    with store.writing(path) as kept:
+        kept.begin([], replicates="1")
+        kept.add([Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)])
+        columns = kept.point_columns()
+        assert len(columns["trial"]) == len(columns["status"]) == 0
+        assert maps.direction_map("", columns, "wrong").cells == []
 
 
 def test_a_resumed_store_with_text_for_a_number_is_refused(tmp_path: Path) -> None:

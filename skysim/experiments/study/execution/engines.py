@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
 from skysim.experiments.study.execution.setups import code_version
-from skysim.experiments.study.execution.trials import Segment
+from skysim.experiments.study.execution.trials import Segment, divided
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
@@ -189,9 +189,7 @@ def run_timed(job: Job, chunk: Chunk) -> TimedRows:
 def split_chunk(chunk: Chunk) -> Iterator[Chunk]:
     """Split a chunk into chunks of one trial each."""
     for segment in chunk:
-        for n, replicate in enumerate(segment.replicates):
-            single = range(replicate, replicate + 1)
-            yield (segment._replace(first=segment.first + n, replicates=single),)
+        yield from ((single,) for single in divided(segment, 1))
 
 
 def cores() -> int:

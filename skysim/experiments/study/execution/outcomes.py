@@ -313,8 +313,6 @@ def count_wrong_matches(
 
 def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
     """RMS error of the centroids about each axis, of those within reach_px of a true image; NaN if there are none."""
-    if not len(centroids_px) or not len(true_px):
-        return nan
     _, distance_px = nearest_light(centroids_px, true_px)
     distance_px = distance_px[distance_px <= reach_px]
     return rms(distance_px) / math.sqrt(2)
@@ -322,14 +320,12 @@ def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) ->
 
 def near(xy_px: Floats, others_px: Floats, reach_px: float) -> int:
     """Number of positions with another one within reach_px."""
-    if not len(xy_px) or not len(others_px):
-        return 0
     return int(np.sum(nearest_light(xy_px, others_px)[1] <= reach_px))
 
 
 @jit
 def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """(K,) row of the light nearest to each position, and its distance."""
+    """(K,) row of the light nearest to each position, and its distance; 0 and infinity without lights."""
     nearest = np.zeros(len(xy_px), np.int64)
     distance_px = np.full(len(xy_px), math.inf)
     for k in range(len(xy_px)):
@@ -374,46 +370,46 @@ def angles_arcsec(lab_from_other: Rotation | None, log: Telemetry, settle_s: flo
 
 def summarize_flight(log: Telemetry, outcomes: list[Outcome], settle_s: float) -> Outcome:
     """Outcome of a flight trial from the outcomes of its frames and, with a filter, from its error at every tick."""
-    solved = [outcome for outcome in outcomes if outcome.solved]
-    x, y, roll = (
-        rms([getattr(one, name) for one in solved])
-        for name in ("x_arcsec", "y_arcsec", "roll_arcsec")
-    )
-    good = [bool(one.solved and not one.wrong) for one in outcomes]
+
+    def known(name: str) -> Floats:
+        """The values of the frames that have one."""
+        values = np.array([getattr(one, name) for one in outcomes], dtype=float)
+        return values[np.isfinite(values)]
+
+    solved = [one for one in outcomes if one.solved]
+    last = outcomes[-1] if outcomes else Outcome("no frame after it settled")
+    x, y, roll = (rms(known(name)) for name in ("x_arcsec", "y_arcsec", "roll_arcsec"))
+    good = known("solved") > known("wrong")
     error = angles_arcsec(log.lab_from_filter, log, settle_s)
     pointing = angles_arcsec(log.lab_from_ref, log, settle_s)
     quarter = len(error) // 4
     limit = metrics.WRONG_RAD / ARCSEC_RAD
     worst = worst_frame(outcomes)
     return Outcome(
-        "solved"
-        if solved
-        else outcomes[-1].status
-        if outcomes
-        else "no frame after it settled",
+        "solved" if solved else last.status,
         len(outcomes),
         len(solved),
-        sum(one.wrong for one in outcomes),
+        int(known("wrong").sum()),
         x,
         y,
         roll,
         mean([one.nees for one in solved]),
-        min((one.stars for one in outcomes), default=nan),
-        availability=mean(error < limit) if len(error) else mean(good),
+        min(known("stars").tolist(), default=nan),
+        availability=mean(error < limit if len(error) else good),
         filter_arcsec=rms(error),
-        filter_worst_arcsec=float(error.max()) if len(error) else nan,
+        filter_worst_arcsec=max(error.tolist(), default=nan),
         drift_arcsec=rms(error[-quarter:]) - rms(error[:quarter]) if quarter else nan,
         pointing_arcsec=rms(pointing),
-        pointing_worst_arcsec=float(pointing.max()) if len(pointing) else nan,
+        pointing_worst_arcsec=max(pointing.tolist(), default=nan),
         saturated_s=saturated_s(log, settle_s) if len(pointing) else nan,
-        ambiguous=sum(one.ambiguous for one in outcomes),
+        ambiguous=int(known("ambiguous").sum()),
         **{
             name: sum(getattr(one, name) for one in outcomes) if outcomes else nan
             for name in IDENTITY
         },
-        centroid_px=rms(finite([one.centroid_px for one in outcomes])),
-        **{name: mean(finite([getattr(one, name) for one in outcomes])) for name in MEANS},
-        exposure_ms=outcomes[-1].exposure_ms if outcomes else nan,
+        centroid_px=rms(known("centroid_px")),
+        **{name: mean(known(name)) for name in MEANS},
+        exposure_ms=last.exposure_ms,
         **{name: getattr(worst, name) for name in DIRECTION},
     )
 
@@ -435,15 +431,9 @@ def worst_frame(outcomes: list[Outcome]) -> Outcome:
     return max(outcomes, key=badness, default=FAILED)
 
 
-def finite(values: list[float]) -> Floats:
-    """The finite values."""
-    array = np.asarray(values, dtype=float)
-    return array[np.isfinite(array)]
-
-
-def rms(values: list[float] | Floats) -> float:
+def rms(values: Floats) -> float:
     """Root mean square; NaN without values."""
-    return float(metrics.rms(np.asarray(values))) if len(values) else nan
+    return float(metrics.rms(values)) if len(values) else nan
 
 
 def mean(values: list[Any] | NDArray[Any]) -> float:

@@ -344,7 +344,7 @@ class Store:
 
     def point_columns(self, *points: int) -> Rows:
         """The columns of the trials of some points."""
-        if len(points) > 1 or not (parts := self.parts()):
+        if len(points) != 1 or not (parts := self.parts()):
             return self._rows(ranges_of(points, self._replicates()))
         # Reading one point of a part takes as long as reading all of its points.
         (point,), (near, rows) = points, self._near
@@ -411,20 +411,15 @@ class Store:
         query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
         cursor = self.db.execute(query, values)
         texts = dict[Any, Any]()
-        batches: list[list[Array]] = [[to_array(name, (), texts)] for name in COLUMNS]
+        columns = {name: [to_array(name, (), texts)] for name in COLUMNS}
         with self.corruption_as_input_error():
             while rows := cursor.fetchmany(10_000):
-                for name, arrays, column in zip(
-                    COLUMNS, batches, zip(*rows, strict=True), strict=True
-                ):
-                    arrays.append(to_array(name, column, texts))
+                for name, column in zip(COLUMNS, zip(*rows, strict=True), strict=True):
+                    columns[name].append(to_array(name, column, texts))
             self.checked(
                 [text for text in texts if not isinstance(text, str | None)][:1], str
             )
-            return {
-                name: np.concatenate(arrays)
-                for name, arrays in zip(COLUMNS, batches, strict=True)
-            }
+        return {name: np.concatenate(arrays) for name, arrays in columns.items()}
 
     def checked(self, row: Iterable[Any], *types: type) -> tuple[Any, ...]:
         """The values of a row. Raises InputError for a value of another type: SQLite stores any type in any column."""
@@ -485,7 +480,9 @@ def to_array(name: str, column: Sequence[Any], texts: dict[Any, Any]) -> Array:
 
 
 def ranges_of(points: Sequence[int], replicates: int) -> list[tuple[int, int]]:
-    """The ranges (first, end) of the trials of some points."""
+    """The ranges (first, end) of the trials of some points; an empty one for none."""
+    if not points:
+        return [(0, 0)]
     ordered = np.array(sorted(points))
     runs = np.split(ordered, np.flatnonzero(np.diff(ordered) != 1) + 1)
     return [(int(run[0]) * replicates, (int(run[-1]) + 1) * replicates) for run in runs]

@@ -228,29 +228,25 @@ def solved_centroids(
     attitude_rngs, noise = zip(*(streams(setup, seed) for seed in seeds), strict=True)
     lab_from_body = random_attitudes(setup, attitude_rngs)
     if isinstance(estimator, CodedTracker):
-        coded = [
+        found = [
             solve_coded(lab, estimator, trial, *each)
             for each in zip(lab_from_body, noise, strict=True)
         ]
-        seen_px = [xy_px for xy_px, _ in coded]
-        reports = [report for _, report in coded]
     else:
         views = visible_rows(lab, lab_from_body)
-        seen_px = [view.xy_px for view in views]
-        scene = lab.scene
         detections = [
-            simulate_detections(trial, view.xy_px, view.electrons, scene, rng)
+            simulate_detections(trial, view.xy_px, view.electrons, lab.scene, rng)
             for view, rng in zip(views, noise, strict=True)
         ]
-        reports = [
-            Report(factory.solve_centroids(estimator, each, scene.exposure.time_s), each)
-            for each in detections
+        exposure_s = lab.scene.exposure.time_s
+        found = [
+            (view.xy_px, Report(factory.solve_centroids(estimator, each, exposure_s), each))
+            for view, each in zip(views, detections, strict=True)
         ]
-    lights = [
-        TrueLights(attitude, attitude, xy_px, xy_px, None)
-        for attitude, xy_px in zip(lab_from_body, seen_px, strict=True)
+    return [
+        (TrueLights(attitude, attitude, xy_px, xy_px, None), report)
+        for attitude, (xy_px, report) in zip(lab_from_body, found, strict=True)
     ]
-    return list(zip(lights, reports, strict=True))
 
 
 def streams(setup: TrialSetup, seed: int) -> tuple[Generator, Generator]:

@@ -110,6 +110,12 @@ def halo() -> Any:
     return withStroke(linewidth=2.2, foreground="white")
 
 
+def annotate(axes: Any, text: str, at: Any, ink: str, **style: Any) -> None:
+    """Write a text beside a point, readable on any color."""
+    beside = {"xytext": (5, 4), "textcoords": "offset points", "path_effects": [halo()]}
+    axes.annotate(text, at, color=ink, **beside, **style)
+
+
 MAX_TICKS = 16  # maximum number of levels that have a tick each
 # Maximum number of tick labels that are wrapped; with more, long ones are rotated.
 MAX_WRAPPED_LABELS = 8
@@ -141,25 +147,27 @@ def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
     """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
     axes = fig.subplots()
     x_axis = axis(study, lines, figure.x)
-    sampled = is_sampled(study)
     shown = series(lines, figure, study)
     dots = draws_medians(study, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
-    set_up_x_axis(axes, x_axis)
+    set_up_axis(axes, "x", x_axis)
     if (expected := expected_value(figure.y)) is not None:
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
     group_axis = axis(study, lines, figure.by) if figure.by is not None else None
-    inks = colors(len(shown), group_axis)
-    # Bars of several series are side by side.
+    # Sampled points are not joined. Bars of several series with common levels are side by side.
+    line = "-" if x_axis.numeric else ":"
     widest_pt, room_pt = (3.0, 20.0) if x_axis.numeric else (6.0, 60.0)
     step_pt = min(widest_pt, room_pt / max(len(shown), 1))
-    middle = (len(shown) - 1) / 2
-    for n, (one, ink) in enumerate(zip(shown, inks, strict=True)):
+    if is_sampled(study):
+        line = "none"
+        step_pt = 0.0
+    for n, (one, ink) in enumerate(zip(shown, colors(len(shown), group_axis), strict=True)):
         mark = MARKS[n % len(MARKS)]
-        if sampled:
-            draw_points(axes, one, ink, mark, x_axis.numeric, dots)
+        if dots:
+            draw_dots(axes, one, ink, mark, x_axis.numeric)
         else:
-            draw_line(axes, one, ink, mark, x_axis, (n - middle) * step_pt)
+            shift_pt = (n - (len(shown) - 1) / 2) * step_pt
+            draw_line(axes, one, ink, mark, line, shift_pt)
     draw_thresholds(axes, figure, study, lines, group_axis)
     if not any(np.isfinite(one.value).any() for one in shown):
         axes.text(
@@ -206,73 +214,46 @@ def set_up_y_axis(
 
 
 def draw_line(
-    axes: Any, one: Series, ink: Any, mark: str, x_axis: Axis, step_pt: float
+    axes: Any, one: Series, ink: Any, mark: str, line: str, shift_pt: float
 ) -> None:
-    """Draw one series, offset sideways by `step_pt` points; named levels are joined by a dotted line.
+    """Draw one series with its intervals, offset sideways: bars, or a band along a line of many points.
 
-    On a logarithmic axis a value of zero cannot be drawn; an open triangle marks its upper bound.
+    The line skips points with few values, because these come from the easy trials only: they are hollow marks, each
+    with its number of values. On a logarithmic axis a value of zero cannot be drawn; an open triangle marks its upper
+    bound.
     """
     from matplotlib.transforms import offset_copy
 
-    offset = offset_copy(axes.transData, axes.figure, x=step_pt, units="points")
-    low, high = drawn_interval(axes, one)
-    if x_axis.numeric and len(x_axis.levels) > MAX_X_WITH_BARS:
+    offset = offset_copy(axes.transData, axes.figure, x=shift_pt, units="points")
+    if line == "-" and len(one.x) > MAX_X_WITH_BARS:
         offset = axes.transData
-        axes.fill_between(one.x, low, high, color=ink, alpha=0.15, linewidth=0)
+        axes.fill_between(
+            one.x, *drawn_interval(axes, one), color=ink, alpha=0.15, linewidth=0
+        )
     else:
         draw_bars(axes, one.x, one, ink, offset)
-    # The line skips points with few values, because these come from the easy trials only.
     style = {"color": ink, "transform": offset}
     joined = np.where(one.few, np.nan, one.value)
-    line = "-" if x_axis.numeric else ":"
     axes.plot(one.x, joined, label=one.label or None, marker=mark, linestyle=line, **style)
-    draw_few(axes, one, mark, **style)
+    style["markerfacecolor"] = "white"
+    axes.plot(one.x[one.few], one.value[one.few], mark, **style)
+    for n in np.flatnonzero(one.few & np.isfinite(one.value)):
+        at = one.x[n], one.value[n]
+        annotate(axes, f"n={one.values[n]}", at, ink, fontsize=6.5, xycoords=offset)
     if axes.get_yscale() == "log":
         none = (one.value <= 0) & (one.high > 0)
-        axes.plot(one.x[none], one.high[none], "v", markerfacecolor="white", **style)
+        axes.plot(one.x[none], one.high[none], "v", **style)
 
 
-def draw_few(axes: Any, one: Series, mark: str, **style: Any) -> None:
-    """Draw points that have few values as hollow marks, each with its number of values."""
-    axes.plot(one.x[one.few], one.value[one.few], mark, markerfacecolor="white", **style)
-    text = {
-        "fontsize": 6.5,
-        "color": style["color"],
-        "path_effects": [halo()],
-        "xytext": (4, 4),
-        "textcoords": "offset points",
-        "xycoords": style["transform"],
-    }
-    for n in np.flatnonzero(one.few & np.isfinite(one.value)):
-        axes.annotate(f"n={one.values[n]}", (one.x[n], one.value[n]), **text)
-
-
-def draw_points(
-    axes: Any, one: Series, ink: Any, mark: str, numeric: bool, dots: bool
-) -> None:
-    """Draw sampled points: with error bars, or, if they are many, with their running median.
-
-    On an axis of named levels the median at each level replaces the running median.
-    """
-    style = {"marker": mark, "color": ink, "linestyle": "none"}
-    if not dots:
-        draw_bars(axes, one.x, one, ink, axes.transData)
-        axes.plot(
-            one.x, np.where(one.few, np.nan, one.value), label=one.label or None, **style
-        )
-        draw_few(axes, one, mark, color=ink, transform=axes.transData)
-        return
+def draw_dots(axes: Any, one: Series, ink: Any, mark: str, numeric: bool) -> None:
+    """Draw many sampled points with their running median, or with the median at each named level."""
     size = min(max(4.5 * (MAX_POINTS_WITH_BARS / len(one.x)) ** 0.3, 1.8), 4.5)
-    axes.plot(one.x, one.value, markersize=size, markeredgewidth=0, alpha=0.5, **style)
-    style = {"linewidth": 2.2}
-    if not numeric:
-        style = {
-            "marker": "_",
-            "markersize": 26,
-            "markeredgewidth": 2.2,
-            "linestyle": "none",
-        }
-    axes.plot(*medians(one, numeric), color=ink, label=one.label or None, **style)
+    axes.plot(
+        one.x, one.value, mark, color=ink, markersize=size, markeredgewidth=0, alpha=0.5
+    )
+    thick = {"linewidth": 2.2, "markeredgewidth": 2.2, "markersize": 26}
+    shape = "-" if numeric else "_"
+    axes.plot(*medians(one, numeric), shape, color=ink, label=one.label or None, **thick)
 
 
 def draw_bars(axes: Any, x: Floats, one: Series | Panel, ink: Any, where: Any) -> None:
@@ -313,28 +294,34 @@ def colors(count: int, group_axis: Axis | None) -> list[Any]:
     return [INK[n % len(INK)] for n in range(count)]
 
 
-def set_up_x_axis(axes: Any, x_axis: Axis) -> None:
-    """Set up the x axis: one tick per level if they are few, with labels rotated if they would overlap."""
-    axes.set_xlabel(x_axis.label)
-    places = np.array([x_axis.coordinate(one) for one in x_axis.levels])
-    if x_axis.log:
+def set_up_axis(axes: Any, which: str, one: Axis) -> None:
+    """Set up axis `which`: one tick per level if they are few, with labels of x rotated if they would overlap.
+
+    Named levels of y go from the top down.
+    """
+    places = np.array([one.coordinate(level) for level in one.levels])
+    if one.log:
         pad = max((places[-1] / places[0]) ** 0.04, 1.05)
         ends = places[0] / pad, places[-1] * pad
-        logarithmic(axes, "x", *ends)
+        logarithmic(axes, which, *ends)
     else:
-        pad = (0.04 * np.ptp(places) or 0.5) if x_axis.numeric else 0.5
+        pad = (0.04 * np.ptp(places) or 0.5) if one.numeric else 0.5
         ends = places[0] - pad, places[-1] + pad
-    axes.set_xlim(*ends)
-    positions = np.log(places) if x_axis.log else places
+    if which == "y" and not one.numeric:
+        ends = ends[::-1]
+    axes.set(**{f"{which}label": one.label, f"{which}lim": ends})
+    positions = np.log(places) if one.log else places
     close = len(places) > 1 and np.diff(positions).min() < 0.055 * np.ptp(positions)
-    if x_axis.numeric and (len(places) > MAX_TICKS or close):
+    if one.numeric and (len(places) > MAX_TICKS or close):
         return
-    names = [wrapped(x_axis.tick_label(one), len(places)) for one in x_axis.levels]
+    count = len(places) if which == "x" else 4
+    names = [wrapped(one.tick_label(level), count) for level in one.levels]
     width = max(map(len, names)) * len(names)
-    rotated = len(places) > MAX_WRAPPED_LABELS and width > LABEL_WIDTH
-    axes.set_xticks(places, names, rotation=25 * rotated, ha="right" if rotated else "center")
-    if x_axis.log:
-        axes.tick_params(axis="x", which="minor", length=0)
+    rotated = count > MAX_WRAPPED_LABELS and width > LABEL_WIDTH
+    style = {"rotation": 25, "ha": "right"} if rotated else {}
+    getattr(axes, f"set_{which}ticks")(places, names, **style)
+    if one.log:
+        axes.tick_params(axis=which, which="minor", length=0)
 
 
 def wrapped(name: str, count: int) -> str:
@@ -348,7 +335,7 @@ def logarithmic(axes: Any, which: str, low: float, high: float) -> None:
     """Make axis `which` logarithmic, with plain decimal tick labels."""
     from matplotlib.ticker import NullFormatter
 
-    getattr(axes, f"set_{which}scale")("log")
+    axes.set(**{f"{which}scale": "log"})
     one = getattr(axes, f"{which}axis")
     locator, formatter = ticks(low, high)
     one.set_major_locator(locator)
@@ -383,8 +370,8 @@ def draw_heat(fig: Any, cells: Grid, figure: Heat) -> None:
         step = math.ceil(count / most) if count > MAX_CELLS_WITH_TEXT else 1
         width = max(columns, 4) if which == "x" else 4
         names = [wrapped(one.tick_label(level), width) for level in one.levels[::step]]
-        getattr(axes, f"set_{which}ticks")(range(0, len(one.levels), step), names)
-        getattr(axes, f"set_{which}label")(one.label)
+        getattr(axes, f"set_{which}ticks")(range(0, count, step), names)
+        axes.set(**{f"{which}label": one.label})
     axes.grid(False)
     add_color_bar(fig, image, figure)
 
@@ -404,22 +391,14 @@ def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None
     """Draw sampled points over two factors, colored by response."""
     axes = fig.subplots()
     points = shown_points(lines, figure, study)
-    x = axis(study, lines, figure.x)
-    y = axis(study, lines, figure.y)
-    across = list(map(x.at, points))
-    up = list(map(y.at, points))
+    places = []
+    for which, name in (("x", figure.x), ("y", figure.y)):
+        one = axis(study, lines, name)
+        set_up_axis(axes, which, one)
+        places.append(list(map(one.at, points)))
     values = np.array([line.responses[figure.value].value for line in points])
     size = min(max(6000 / max(len(points), 1), 4), 45)
-    set_up_x_axis(axes, x)
-    if y.log:
-        logarithmic(axes, "y", min(up), max(up))
-    elif not y.numeric:
-        axes.set_yticks(
-            range(len(y.levels)), [wrapped(y.tick_label(one), 4) for one in y.levels]
-        )
-        axes.set_ylim(len(y.levels) - 0.5, -0.5)
-    dots = axes.scatter(across, up, c=values, s=size, **color_scale(values, figure))
-    axes.set_ylabel(y.label)
+    dots = axes.scatter(*places, c=values, s=size, **color_scale(values, figure))
     add_color_bar(fig, dots, figure)
 
 
@@ -430,26 +409,20 @@ def indices_png(indices: Sequence[Index], response: str) -> bytes:
     """Bar chart of the first-order and total indices of one response, largest total first, as PNG."""
     selected = [one for one in indices if one.response == response]
     selected.sort(key=lambda one: -np.nan_to_num(one.total.value, nan=-np.inf))
+    # (2, 3, F) value and ends of both indices of each factor.
+    parts = np.array([[one.first[:3], one.total[:3]] for one in selected], dtype=float)
+    parts = np.nan_to_num(parts, posinf=0.0, neginf=0.0).transpose(1, 2, 0)
 
     def draw(fig: Any) -> None:
         """Two bars per factor, with their intervals."""
         axes = fig.subplots()
         rows = np.arange(len(selected))
-        for shift, name, ink, parts in (
-            (-0.19, "first order", INK[0], [one.first[:3] for one in selected]),
-            (0.19, "total", GRAY, [one.total[:3] for one in selected]),
-        ):
-            value, low, high = np.array(parts, dtype=float).reshape(-1, 3).T
-            axes.barh(rows + shift, np.nan_to_num(value), 0.36, color=ink, label=name)
-            ends = np.clip([low, high], -9, 9)
+        looks = ((-0.19, "first order", INK[0]), (0.19, "total", GRAY))
+        for (shift, name, ink), (value, *ends) in zip(looks, parts, strict=True):
+            axes.barh(rows + shift, value, 0.36, color=ink, label=name)
             axes.hlines(rows + shift, *ends, color="#333333", linewidth=1)
-        bounds = np.array(
-            [end for one in selected for end in (*one.first[:3], *one.total[:3], 0.0)]
-        )
-        bounds = bounds[np.isfinite(bounds)]
-        left = min(1.05 * bounds.min(), 0.0)
-        right = np.clip(1.05 * bounds.max(), 0.1, 2.0)
-        axes.set_xlim(left, right)
+        right = np.clip(1.05 * parts.max(), 0.1, 2.0)
+        axes.set(xlim=(min(1.05 * parts.min(), 0.0), right))
         axes.set_yticks(rows, [one.factor for one in selected])
         axes.set_ylim(len(selected) - 0.4, -0.6)
         axes.grid(False, axis="y")
@@ -505,18 +478,10 @@ def pareto_png(
         axes.set_ylim(*limits([other.value], [low, high], False, False))
         axes.vlines(x, low, high, color=ORANGE, alpha=0.5, linewidth=1)
         axes.plot(x, y, "D--", color=ORANGE, label="front")
-        style: Any = {
-            "fontsize": 8,
-            "color": ORANGE,
-            "path_effects": [halo()],
-            "xytext": (5, 5),
-            "textcoords": "offset points",
-        }
         if len(x) <= MAX_LABELED_POINTS:
             for n, *at in zip(marked.tolist(), x, y, strict=True):
-                axes.annotate(str(points[n]), at, **style)
-        axes.set_xlabel(one.label)
-        axes.set_ylabel(other.label)
+                annotate(axes, str(points[n]), at, ORANGE, fontsize=8)
+        axes.set(xlabel=one.label, ylabel=other.label)
         fig.legend(loc="outside right upper")
 
     return png(draw, (7.0, 4.4))

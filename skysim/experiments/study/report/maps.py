@@ -14,6 +14,7 @@ from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report.figures import (
     HATCHED,
     add_color_bar,
+    annotate,
     color_scale,
     halo,
     is_light,
@@ -86,8 +87,6 @@ def direction_maps(
 
 def direction_map(label: str, columns: metrics.Columns, response: str) -> DirectionMap:
     """One panel, from the columns of its trials."""
-    if not columns:
-        return DirectionMap(label, False, [], [])
     in_dome = np.isfinite(columns["body_tilt_deg"])
     in_sky = np.isfinite(columns["boresight_dec_deg"])
     if in_dome.any() and in_sky.any():
@@ -301,10 +300,9 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
         xy = place(one.tilt_deg, one.azimuth_deg, False)
         if panel.sky:
             xy = place(one.dec_deg, (one.ra_deg - 180) % 360 + 180, True)
-        style = {"color": MARK, "path_effects": [halo()]}
-        axes.plot(*xy, "o", markersize=8, markerfacecolor="none", **style)
-        near = {"xytext": (5, 4), "textcoords": "offset points"}
-        axes.annotate(str(rank), xy, **near, fontsize=8, **style)
+        style = {"markerfacecolor": "none", "path_effects": [halo()]}
+        axes.plot(*xy, "o", markersize=8, color=MARK, **style)
+        annotate(axes, str(rank), xy, MARK, fontsize=8)
 
 
 # Caption.

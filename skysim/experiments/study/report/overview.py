@@ -77,17 +77,15 @@ class Overview(NamedTuple):
 
 def overview(plan: Plan) -> Overview:
     """The overview of a study. The finding of a scene that cannot be built is the reason."""
+    points = dict(itertools.islice(checked_points(plan), MAX_CHECKED))
     rows: Texts = []
     found: dict[str, Texts] = {}
     leds: dict[str, int] = {}
-    checked = 0
     may_be_ambiguous = False
     fixed = dict[str, None]()
     require = plan.study.require
     share = 0.0
-    for levels, point in checked_points(plan):
-        if checked == MAX_CHECKED:
-            break
+    for levels, point in points.items():
         try:
             scene, trial = resolve_point(
                 plan.spec, plan.spec.trial_settings(point.settings, 0)
@@ -100,21 +98,20 @@ def overview(plan: Plan) -> Overview:
                 not isinstance(trial, FlightTrial) or trial.start is not None,
             )
         except InputError as error:
-            found.setdefault(NUMBER.sub("#", str(error)), []).append((str(error), levels))
-            continue
-        finally:
-            checked += 1
-        if scene.dome:
-            leds[levels] = len(lab.camera.sources)
-        may_be_ambiguous |= may_report_ambiguity(scene)
-        if not plan.study.optimize:  # candidates need not meet them
-            require = require or scene.require
-        seeds = fixed_seeds(plan.study, scene)
-        fixed |= dict.fromkeys(seeds)
-        if SURVEY_SEED in seeds or scene.tracker.map:
-            share = max(share, survey_share(found_here, trial))
-        rows = rows or scene_rows(plan, lab, found_here.facts)
-        for line in found_here.findings:
+            lines = [str(error)]
+        else:
+            lines = found_here.findings
+            rows = rows or scene_rows(plan, lab, found_here.facts)
+            if scene.dome:
+                leds[levels] = len(lab.camera.sources)
+            may_be_ambiguous |= may_report_ambiguity(scene)
+            if not plan.study.optimize:  # candidates need not meet them
+                require = require or scene.require
+            seeds = fixed_seeds(plan.study, scene)
+            fixed |= dict.fromkeys(seeds)
+            if SURVEY_SEED in seeds or scene.tracker.map:
+                share = max(share, survey_share(found_here, trial))
+        for line in lines:
             found.setdefault(NUMBER.sub("#", line), []).append((line, levels))
     # The number of LEDs is in the name of a checked point if the points of the study differ in it.
     if len(set(leds.values())) > 1:
@@ -122,7 +119,7 @@ def overview(plan: Plan) -> Overview:
             key: [(line, f"{at}, {leds[at]} LEDs" if at in leds else at) for line, at in one]
             for key, one in found.items()
         }
-    findings = [finding_text(one, checked) for one in found.values()]
+    findings = [finding_text(one, len(points)) for one in found.values()]
     return Overview(rows, findings, may_be_ambiguous, tuple(fixed), require, share)
 
 

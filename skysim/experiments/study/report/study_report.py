@@ -318,14 +318,19 @@ def points_section(
     named = [name for name, one in axes.items() if not one.numeric]
     columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, (number, *row_texts) in zip(lines[:ROWS], texts[:ROWS], strict=True):
-        keys = [one.at(line) for one in axes.values()]
+    for line, row_texts in zip(lines[:ROWS], texts, strict=False):
+        keys = [line.point, *(one.at(line) for one in axes.values())]
         keys += [one.value for one in line.responses.values()]
-        row = [Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)]
-        rows.append([Cell(number, "marked" if line.point in front else "", line.point), *row])
+        row: list[Any] = [
+            Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)
+        ]
+        if line.point in front:
+            row[0] = row[0]._replace(tone="marked")
+        if study.optimize:
+            row.append(costs.get(line.point))
+        rows.append(row)
     if study.optimize:
         columns.append(Column("cost", format=".4g"))
-        rows = [[*row, costs.get(line.point)] for row, line in zip(rows, lines, strict=False)]
     note = "In brackets intervals of 95 %."
     if front:
         note += " Tinted: the front."
@@ -362,7 +367,7 @@ def pooled_blocks(plan: Plan, columns: metrics.Columns, replay: str) -> list[Blo
         ),
         Table(
             [text_column("quantity"), text_column("factor"), Column("rank correlation")],
-            [[quantity, factor, with_key(one)] for quantity, factor, one in found],
+            [[*names, with_key(one)] for *names, one in found],
         ),
         Table([Column(f"worst {ranked(response)}", format=".4g"), *heads], worst),
     ]
@@ -429,10 +434,10 @@ def runs_section(store: Store) -> Section:
         Column("trials/s", format=".2g"),
     ]
     runs = store.runs()
-    rows = []
-    for run in runs:
-        rate = run["trials"] / run["seconds"] if run["seconds"] else None
-        rows.append([run["engine"], run["workers"], run["trials"], run["seconds"], rate])
+    rows = [
+        [*run.values(), run["trials"] / run["seconds"] if run["seconds"] else None]
+        for run in runs
+    ]
     untimed = store.counts()["done"] - sum(run["trials"] for run in runs)
     note = f"{untimed} trials are of runs that were killed." if untimed > 0 else ""
     return Section("Runs", [Table(columns, rows), Text(note)], folded=True)
