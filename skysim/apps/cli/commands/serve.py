@@ -74,6 +74,13 @@ def live(
             "--trigger", help="Expose frames when a client triggers, not by the scene."
         ),
     ] = False,
+    poses: Annotated[
+        bool,
+        typer.Option(
+            "--poses",
+            help="A client simulates the motion: expose a frame for each of its poses.",
+        ),
+    ] = False,
     client_tracker: Annotated[
         bool,
         typer.Option(
@@ -109,6 +116,7 @@ def live(
     """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
     from skysim.apps.live.commands import CommandState
     from skysim.apps.live.pacing import Live, Pace
+    from skysim.apps.live.poses import PosedLive
     from skysim.apps.live.sinks import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
@@ -130,7 +138,11 @@ def live(
     }
     check_needed(needs_server, chosen, SERVERS)
     needs_tcp = {"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait}
-    check_needed(needs_tcp, chosen, ("tcp",))
+    check_needed(needs_tcp | {"--poses": poses}, chosen, ("tcp",))
+    needs_motion = {"--trigger": trigger, "--client-tracker": client_tracker}
+    for option, is_used in (needs_motion | {"--display": bool(display)}).items():
+        if poses and is_used:
+            raise InputError(option, "has no effect with --poses", "one of the two")
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(
@@ -138,9 +150,9 @@ def live(
     )
     if client_tracker and not flight.lab.scene.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
-    flown = Live(
+    flown = (PosedLive if poses else Live)(
         flight,
-        Pace(speed, flight.lab.scene.exposure.rate_hz),
+        Pace(0.0 if poses else speed, flight.lab.scene.exposure.rate_hz),
         [],
         CommandState(flight, command_timeout, trigger),
         has_truth=truth,
