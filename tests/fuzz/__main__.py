@@ -46,6 +46,7 @@ TARGETS = {
     "orbits": (),
     "torques": (),
     "packets": (),
+    "poses": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

@@ -17,7 +17,9 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.live.commands import parse
 from skysim.apps.live.packets import unpack
+from skysim.apps.live.poses import pose_samples
 from skysim.apps.plate_solver import picture
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader
@@ -244,6 +246,10 @@ def packets(data: bytes) -> None:
     rejects(lambda: unpack(BytesIO(data)), InputError)
 
 
+def poses(data: bytes) -> None:
+    rejects(lambda: pose_samples(parse(data).get("pose"), in_orbit=True), InputError)
+
+
 def quantities(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     rejects(lambda: units.quantity("m", "length", '"35 mm"')(text), ValueError)
@@ -269,6 +275,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         orbits,
         torques,
         packets,
+        poses,
         quantities,
     )
 }
