@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import socket
+import time
 from collections import Counter, deque
 from typing import Any
 
@@ -102,6 +103,8 @@ class StarCamera(sysModel.SysModel):  # type: ignore[misc]
         Number of frames by status of the solution
     solutions
         Packets of the solutions, as skysim has sent them
+    exchange_s
+        Wall-clock time of each exchange
     """
 
     def __init__(
@@ -124,6 +127,7 @@ class StarCamera(sysModel.SysModel):  # type: ignore[misc]
         self.has_orbit = has_orbit
         self.statuses: Counter[str] = Counter()
         self.solutions: list[dict[str, Any]] = []
+        self.exchange_s: list[float] = []
         self.wire = Wire(host, port, token, timeout_s)
         self.exposure_s = float(self.wire.hello["exposure_s"])
         self.cam_from_body = np.array(self.wire.hello["cam_from_body_xyzw"])
@@ -185,8 +189,10 @@ class StarCamera(sysModel.SysModel):  # type: ignore[misc]
         states = [state for _, state in self.samples]
         pose = {key: [one[key] for one in states] for key in states[0]}
         pose["t_s"] = [t_s for t_s, _ in self.samples]
+        begun_s = time.perf_counter()
         self.wire.send({"pose": pose})
         solution = self.wire.receive()
+        self.exchange_s.append(time.perf_counter() - begun_s)
         self.statuses[solution["status"]] += 1
         self.solutions.append(solution)
         if solution["status"] == "solved":
