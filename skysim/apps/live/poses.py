@@ -1,10 +1,10 @@
-"""A flight whose motion a client simulates: the command `pose` gives samples, a frame and its solution answer it.
+"""A flight whose motion a client simulates: a frame and its solution answer each command `pose`, samples at n times.
 
-| key of `pose` | value at each of n times |
+| key of `pose` | value |
 |---|---|
-| `t_s` | (n,) time since the scene's start; the exposure ends at the last one |
-| `lab_from_body_xyzw` | (n, 4) attitude, scalar last; under the stars the lab's axes are those of the ICRS |
-| `rate_body_rad_s` | (n, 3) rate in body axes |
+| `t_s` | (n,) times since the scene's start; the exposure ends at the last one |
+| `lab_from_body_xyzw` | (n, 4) attitudes, scalar last; under the stars the lab's axes are those of the ICRS |
+| `rate_body_rad_s` | (n, 3) rates in body axes |
 | `position_m`, `velocity_m_s` | (n, 3) from the Earth's center in axes of the ICRS, in scenes with an orbit |
 """
 
@@ -16,31 +16,24 @@ import numpy as np
 from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
-from estimator.trackers.pipeline import Clock
-from skysim.apps.live.commands import QUATERNION_TOLERANCE
 from skysim.apps.live.pacing import Live
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
-from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Shot
 from skysim.simulation.timing import window_from
 from skysim.sources.orbit_elements import OemOrbit
-from skysim.tracking import factory
 from skysim.tracking.onboard_model import OrbitStarTracker
 
 MOST_SAMPLES = 150  # what a line of the wire holds
 LATEST_S = 1e7  # since the scene's start
 STEP_S = (1e-6, 1.0)  # between two samples
-ROUNDING_S = 1e-9
+ROUNDING = 1e-9
 POLL_S = 0.2  # time in which a flight whose outputs have failed ends
 
 # Number of components, and limits of a vector's length.
-MOTION = {
-    "lab_from_body_xyzw": (4, 1 - QUATERNION_TOLERANCE, 1 + QUATERNION_TOLERANCE),
-    "rate_body_rad_s": (3, 0.0, 10.0),
-}
+MOTION = {"lab_from_body_xyzw": (4, 0.999, 1.001), "rate_body_rad_s": (3, 0.0, 10.0)}
 PLACE = {"position_m": (3, 6.36e6, 1e9), "velocity_m_s": (3, 0.0, 1e5)}
 
 
@@ -49,32 +42,29 @@ def pose_samples(pose: Any, in_orbit: bool) -> dict[str, Floats]:
     vectors = MOTION | (PLACE if in_orbit else {})
     keys = ("t_s", *vectors)
     if not isinstance(pose, dict) or set(pose) != set(keys):
-        found = list(pose) if isinstance(pose, dict) else pose
-        raise InputError("pose", repr(found)[:80], ", ".join(keys))
+        raise InputError("pose", f"{pose!r:.60}", ", ".join(keys))
     count = len(pose["t_s"]) if isinstance(pose["t_s"], list) else 0
-    if not 2 <= count <= MOST_SAMPLES:
-        raise InputError("pose", f"t_s has {count} samples", f"2 to {MOST_SAMPLES}")
+    require_within("number of samples", np.array([count]), 2, MOST_SAMPLES)
     try:
         values = {"t_s": finite_array(pose["t_s"], "t_s", (count,))}
         for key, (size, _, _) in vectors.items():
             values[key] = finite_array(pose[key], key, (count, size))
     except ValueError as error:
         raise InputError("pose", error) from None
-    t_s = values["t_s"]
-    require_within("t_s", t_s, 0.0, LATEST_S)
-    require_within("step of t_s", np.diff(t_s), *STEP_S)
+    require_within("t_s", values["t_s"], 0.0, LATEST_S)
+    require_within("step of t_s", np.diff(values["t_s"]), *STEP_S)
     for key, (_, least, most) in vectors.items():
-        with np.errstate(over="ignore"):
-            length = np.linalg.norm(values[key], axis=1)
+        # Without overflow.
+        length = np.hypot.reduce(values[key], axis=1)
         require_within(f"length of {key}", length, least, most)
     return values
 
 
 def require_within(name: str, values: Floats, least: float, most: float) -> None:
     """Raise InputError for values (n,) of a pose beyond these limits."""
-    beyond = values[(values < least) | (values > most)]
+    beyond = values[(values < least - ROUNDING) | (values > most + ROUNDING)]
     if len(beyond):
-        raise InputError("pose", f"{name} {beyond[0]:.9g}", f"{least:g} to {most:g}")
+        raise InputError("pose", f"{name} {beyond[0]:.9g}", f"{least:.9g} to {most:.9g}")
 
 
 @dataclass
@@ -92,8 +82,7 @@ class PosedLive(Live):
     @property
     def greeting(self) -> dict[str, Any]:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
-        window = self.window(0.0)
-        return super().greeting | {"exposure_s": -window.open_s}
+        return super().greeting | {"exposure_s": -self.window(0.0).open_s}
 
     def window(self, close_s: float) -> Window:
         """Window of an exposure whose last row ends at a time."""
@@ -111,36 +100,18 @@ class PosedLive(Live):
             except queue.Empty:
                 continue
             try:
-                self.answer(command)
+                if set(command) != {"pose"}:
+                    raise InputError("", f"no commands {list(command)!r:.60}", "pose")
+                self.send_shot(self.expose(command["pose"]))
                 self.commands.received += 1
             except InputError as error:
                 self.commands.refused += 1
                 reply(str(error))
 
-    def answer(self, command: dict[str, Any]) -> None:
-        """Carry out a command: an exposure time, a pose. Raises InputError."""
-        unknown = [key for key in command if key not in ("pose", "exposure_s")]
-        if unknown:
-            raise InputError(
-                repr(unknown[0])[:40], "the client gives the motion", "pose, exposure_s"
-            )
-        exposure_s = self.commands.exposure_s(command.get("exposure_s"))
-        control = self.flight.schedules[0].exposure_control
-        before_s = control.exposure_s
-        control.exposure_s = exposure_s or before_s
-        if "pose" in command:
-            try:
-                shot = self.expose(command["pose"])
-            except InputError:
-                # A refused line changes nothing.
-                control.exposure_s = before_s
-                raise
-            self.send_shot(shot)
-
     def expose(self, pose: Any) -> Shot:
         """Render an exposure that ends at the last sample, and solve it if a client takes the solutions.
 
-        1. Check the samples and the exposure's window: it lies within them, after the last one.
+        1. Check the samples: they cover the exposure, which begins after the last one.
         2. The camera is where the client says; its tracker knows the velocity as it knows that of the scene's orbit.
         3. Render and solve.
 
@@ -150,49 +121,36 @@ class PosedLive(Live):
             For a pose that cannot be taken; then nothing is exposed.
         """
         # 1. Window.
-        flight = self.flight
-        schedule = flight.schedules[0]
-        camera = schedule.camera
-        values = pose_samples(pose, camera.orbit is not None)
+        schedule = self.flight.schedules[0]
+        values = pose_samples(pose, schedule.camera.orbit is not None)
         t_s = values["t_s"]
-        close_s = float(t_s[-1])
-        window = self.window(close_s)
-        if t_s[0] > window.open_s + ROUNDING_S:
-            raise InputError(
-                "pose",
-                f"samples from {t_s[0]:.9g} s",
-                f"from {window.open_s:.9g} s or before",
-            )
-        if window.open_s < self.closed_s - ROUNDING_S:
-            raise InputError(
-                "pose",
-                f"the exposure opens at {window.open_s:.9g} s",
-                f"{self.closed_s:.9g} s, the end of the last one, or later",
-            )
-        # 2. Motion and place.
-        trajectory = Trajectory(
-            t_s,
-            Rotation.from_quat(values["lab_from_body_xyzw"]),
-            values["rate_body_rad_s"],
-        )
-        orbit = None
-        if camera.orbit is not None:
+        window = self.window(float(t_s[-1]))
+        open_s = np.array([window.open_s])
+        require_within("exposure's start", open_s, max(self.closed_s, t_s[0]), LATEST_S)
+        # 2. Place.
+        if schedule.camera.orbit is not None:
             states = np.stack([values[key] for key in PLACE], axis=1)
-            path = BPoly.from_derivatives(t_s, states)
-            # Rounding may place the exposure's ends beyond the samples.
-            orbit = OemOrbit("pose", np.array([-np.inf, np.inf]), path)
-            camera = replace(camera, orbit=orbit)
-        # 3. Frame and solution.
-        clock = Clock()
-        index = schedule.index
-        frame, truth = render_frame(camera, trajectory, index, clock, window)
-        report = None
-        if "solution" in self.wanted:
-            tracker = flight.tracker_of(schedule, frame)
-            if orbit and isinstance(tracker, OrbitStarTracker):
+            # Rounding may place the exposure's end beyond the samples.
+            always = np.array([-np.inf, np.inf])
+            orbit = OemOrbit("pose", always, BPoly.from_derivatives(t_s, states))
+            schedule.camera = replace(schedule.camera, orbit=orbit)
+            tracker = self.flight.trackers.get(0)
+            if isinstance(tracker, OrbitStarTracker):
                 tracker.orbit = orbit
-            report = factory.solve_frame(tracker, frame)
+        # 3. Frame and solution.
+        shot = self.flight.capture(
+            schedule,
+            schedule.index,
+            window,
+            "solution" in self.wanted,
+            updates_filter=False,
+            given=Trajectory(
+                t_s,
+                Rotation.from_quat(values["lab_from_body_xyzw"]),
+                values["rate_body_rad_s"],
+            ),
+        )
         schedule.index += 1
-        schedule.exposure_control.update(frame)
-        self.closed_s = close_s
-        return Shot(camera, window, frame, truth, report, None, "", clock.seconds)
+        schedule.exposure_control.update(shot.frame)
+        self.closed_s = float(t_s[-1])
+        return shot

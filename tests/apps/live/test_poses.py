@@ -184,14 +184,14 @@ def test_the_place_of_the_client_moves_the_stars_by_aberration() -> None:
         ({"t_s": None}, "allowed: t_s, lab_from_body_xyzw, rate_body_rad_s"),
         ({"more": 1}, "allowed: t_s, lab_from_body_xyzw, rate_body_rad_s"),
         ({"position_m": None, "velocity_m_s": None}, "allowed: t_s, .*, position_m"),
-        ({"t_s": 3}, "t_s has 0 samples; allowed: 2 to 150"),
-        ({"t_s": [1.0]}, "t_s has 1 samples"),
-        ({"t_s": list(range(MOST_SAMPLES + 1))}, "t_s has 151 samples"),
+        ({"t_s": 3}, "number of samples 0; allowed: 2 to 150"),
+        ({"t_s": [1.0]}, "number of samples 1; allowed: 2 to 150"),
+        ({"t_s": list(range(MOST_SAMPLES + 1))}, "number of samples 151"),
         ({"t_s": [0.95, "x"]}, "t_s is not an array of numbers"),
         ({"t_s": [1.0, 0.95]}, "step of t_s -0.05; allowed: 1e-06 to 1"),
-        ({"t_s": [-0.05, 0.0]}, "t_s -0.05; allowed: 0 to 1e"),
+        ({"t_s": [-0.05, 0.0]}, "t_s -0.05; allowed: 0 to 10000000"),
         ({"t_s": [1e308, 1.0]}, r"t_s 1e\+308; allowed"),
-        ({"t_s": [0.98, 1.0]}, "samples from 0.98 s; allowed: from 0.97 s or before"),
+        ({"t_s": [0.98, 1.0]}, "exposure's start 0.96; allowed: 0.98 to 10000000"),
         ({"lab_from_body_xyzw": [[0, 0, 0, 1]]}, r"lab_from_body_xyzw has shape \(1, 4\)"),
         ({"lab_from_body_xyzw": [[0, 0, 0, 2]] * 2}, "length of lab_from_body_xyzw 2"),
         (
@@ -199,21 +199,18 @@ def test_the_place_of_the_client_moves_the_stars_by_aberration() -> None:
             "length of rate_body_rad_s .*; allowed: 0 to 10",
         ),
         ({"rate_body_rad_s": [[0, 0, None]] * 2}, "not finite|not an array"),
-        ({"position_m": [[6e6, 0, 0]] * 2}, "length of position_m 6000000; allowed: 6.36e"),
+        ({"position_m": [[6e6, 0, 0]] * 2}, "length of position_m 6000000; allowed: 6360000"),
         ({"velocity_m_s": [[1e6, 0, 0]] * 2}, "length of velocity_m_s 1000000"),
     ],
 )
 def test_a_wrong_pose_is_refused_in_one_line(changes: dict[str, Any], problem: str) -> None:
     live = posed_without_warm_up()
-    answers = answer_to(live, {"pose": good_pose(**changes), "exposure_s": 0.03})
+    answers = answer_to(live, {"pose": good_pose(**changes)})
     with pytest.raises(AssertionError, match=problem):
         raise AssertionError(*answers)
     assert "\n" not in answers[0]
     assert packets_of(live) == []
-    # Nothing has changed.
-    schedule = live.flight.schedules[0]
-    assert schedule.index == 0
-    assert schedule.exposure_control.exposure_s == pytest.approx(0.04)
+    assert live.flight.schedules[0].index == 0
 
 
 @pytest.mark.parametrize(
@@ -221,8 +218,8 @@ def test_a_wrong_pose_is_refused_in_one_line(changes: dict[str, Any], problem: s
     [
         ({"pose": 3}, "pose: 3; allowed: t_s"),
         ({"pose": [[]]}, r"pose: \[\[\]\]; allowed: t_s"),
-        ({"torque_nm": [0, 0, 0]}, "the client gives the motion; allowed: pose, exposure_s"),
-        ({"exposure_s": -1}, "exposure_s: -1"),
+        ({"torque_nm": [0, 0, 0]}, r"no commands \['torque_nm'\]; allowed: pose"),
+        ({}, r"no commands \[\]; allowed: pose"),
     ],
 )
 def test_another_command_is_refused(command: dict[str, Any], problem: str) -> None:
@@ -243,9 +240,7 @@ def test_time_does_not_go_back() -> None:
     live = posed()
     again, later = good_pose(), good_pose(t_s=[1.0, 1.04])
     answers = answer_to(live, {"pose": again}, {"pose": again}, {"pose": later})
-    assert answers == [
-        "pose: the exposure opens at 0.96 s; allowed: 1 s, the end of the last one, or later"
-    ]
+    assert answers == ["pose: exposure's start 0.96; allowed: 1 to 10000000"]
     headers = [one.header for one in packets_of(live) if one.channel == "frame"]
     assert [one["index"] for one in headers] == [0, 1]
     assert [one["t_s"] for one in headers] == pytest.approx([0.98, 1.02])
@@ -281,7 +276,6 @@ def test_the_longest_pose_fits_in_a_line() -> None:
 def test_what_needs_a_simulated_motion_is_refused(option: str) -> None:
     words = ["live", "shefex2", "--tcp", "0", "--poses", option]
     done = CliRunner().invoke(main.app, words)
-    assert (
-        str(done.exception)
-        == f"{option}: has no effect with --poses; allowed: one of the two"
+    assert str(done.exception).startswith(
+        "--poses: no motion is simulated; allowed: no --trigger"
     )

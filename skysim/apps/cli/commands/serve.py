@@ -139,10 +139,10 @@ def live(
     check_needed(needs_server, chosen, SERVERS)
     needs_tcp = {"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait}
     check_needed(needs_tcp | {"--poses": poses}, chosen, ("tcp",))
-    needs_motion = {"--trigger": trigger, "--client-tracker": client_tracker}
-    for option, is_used in (needs_motion | {"--display": bool(display)}).items():
-        if poses and is_used:
-            raise InputError(option, "has no effect with --poses", "one of the two")
+    if poses and (trigger or client_tracker or display):
+        raise InputError(
+            "--poses", "no motion is simulated", "no --trigger, --client-tracker, --display"
+        )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(
