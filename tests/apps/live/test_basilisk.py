@@ -182,6 +182,7 @@ def python_with_basilisk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
+@pytest.fixture(scope="module")
 def own_pointing_rms_arcsec() -> np.ndarray:
     """Pointing of our own loop with the same scene, after 40 s."""
     with open_flight(loader.load(str(FOLDER / "orbit.yaml"))) as flight:
@@ -195,7 +196,7 @@ def own_pointing_rms_arcsec() -> np.ndarray:
 @pytest.mark.long
 @pytest.mark.parametrize("latency_s", [0.0, 0.1])
 def test_basilisk_holds_an_attitude_on_rendered_stars(
-    latency_s: float, python_with_basilisk: Path
+    latency_s: float, python_with_basilisk: Path, own_pointing_rms_arcsec: np.ndarray
 ) -> None:
     """200 s at 8 Hz: all frames are solved within their claimed errors, and it points as our own loop does."""
     words = f"live {FOLDER / 'orbit.yaml'} --tcp 0 --poses --endless".split()
@@ -216,7 +217,9 @@ def test_basilisk_holds_an_attitude_on_rendered_stars(
     assert figures["statuses"] == {"solved": 1600}
     # Of 1600 frames the worst of a chi-square with three degrees of freedom is 4.5 sigma (1 in 50).
     assert figures["worst_sigma"] < 5
-    assert 2 < figures["mean_nees"] < 3.5
-    ratio = np.array(figures["pointing_rms_arcsec"]) / own_pointing_rms_arcsec()
-    assert (ratio > 0.5).all()
-    assert (ratio < 1.8).all()
+    # Below 3, since the claims allow for errors of the stars' places, which one field shares.
+    assert 1 < figures["mean_nees"] < 3.5
+    ratio = np.array(figures["pointing_rms_arcsec"]) / own_pointing_rms_arcsec
+    # Over 160 s an rms is uncertain by about 10 %.
+    assert (ratio > 0.6).all()
+    assert (ratio < 1.6).all()
