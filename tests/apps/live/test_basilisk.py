@@ -219,7 +219,12 @@ def test_basilisk_holds_an_attitude_on_rendered_stars(
     assert figures["worst_sigma"] < 5
     # Below 3, since the claims allow for errors of the stars' places, which one field shares.
     assert 1 < figures["mean_nees"] < 3.5
-    ratio = np.array(figures["pointing_rms_arcsec"]) / own_pointing_rms_arcsec
+    rms_arcsec = np.array(figures["pointing_rms_arcsec"])
+    # A PD law on rates with white noise N points within N sqrt(damping / bandwidth).
+    noise_arcsec_sqrt_s = 0.07 * 3600 / 60
+    expected_arcsec = noise_arcsec_sqrt_s * np.sqrt(0.8 / 0.3)
+    assert np.sqrt(np.mean(rms_arcsec**2)) == pytest.approx(expected_arcsec, rel=0.25)
+    ratio = rms_arcsec / own_pointing_rms_arcsec
     # Over 160 s an rms is uncertain by about 10 %.
     assert (ratio > 0.6).all()
     assert (ratio < 1.6).all()
