@@ -499,6 +499,7 @@ class Flight:
         window: Window,
         solves: bool,
         updates_filter: bool,
+        given: Trajectory | None = None,
     ) -> Shot:
         """Render an exposure, solve it, and update the filter with the solution.
 
@@ -512,6 +513,8 @@ class Flight:
             Whether to solve the frame
         updates_filter
             Whether to update the filter with the solution
+        given
+            Motion in place of the flight's, which no gyro measures
 
         Raises
         ------
@@ -529,14 +532,14 @@ class Flight:
             )
         # Render.
         clock = Clock()
-        trajectory = (
+        trajectory = given or (
             self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
         )
         frame, truth = render_frame(
             camera, trajectory.since(window.open_s), index, clock, window
         )
         # Solve.
-        rate = self.measured_rate(camera, window)
+        rate = None if given else self.measured_rate(camera, window)
         report = None
         if solves:
             tracker = self.tracker_of(schedule, frame)

@@ -47,6 +47,7 @@ TARGETS = {
     "torques": (),
     "packets": (),
     "commands": (),
+    "poses": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

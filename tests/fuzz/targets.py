@@ -19,6 +19,7 @@ from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.packets import unpack
+from skysim.apps.live.poses import pose_samples
 from skysim.apps.plate_solver import picture
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader
@@ -263,6 +264,10 @@ def commands(data: bytes) -> None:
     state.in_force()
 
 
+def poses(data: bytes) -> None:
+    rejects(lambda: pose_samples(parse(data).get("pose"), in_orbit=True), InputError)
+
+
 def quantities(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     rejects(lambda: units.quantity("m", "length", '"35 mm"')(text), ValueError)
@@ -289,6 +294,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         torques,
         packets,
         commands,
+        poses,
         quantities,
     )
 }

@@ -92,6 +92,13 @@ def live(
             "--trigger", help="Expose frames when a client triggers, not by the scene."
         ),
     ] = False,
+    poses: Annotated[
+        bool,
+        typer.Option(
+            "--poses",
+            help="A client simulates the motion: expose a frame for each of its poses.",
+        ),
+    ] = False,
     client_tracker: Annotated[
         bool,
         typer.Option(
@@ -127,6 +134,7 @@ def live(
     """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
     from skysim.apps.live.commands import CommandState
     from skysim.apps.live.pacing import Live, Pace
+    from skysim.apps.live.poses import PosedLive
     from skysim.apps.live.sinks import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
@@ -151,7 +159,11 @@ def live(
     }
     check_needed(needs_server, chosen, SERVERS)
     needs_tcp = {"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait}
-    check_needed(needs_tcp, chosen, ("tcp",))
+    check_needed(needs_tcp | {"--poses": poses}, chosen, ("tcp",))
+    if poses and (trigger or client_tracker or display):
+        raise InputError(
+            "--poses", "no motion is simulated", "no --trigger, --client-tracker, --display"
+        )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
     flight = open_flight(
@@ -159,9 +171,9 @@ def live(
     )
     if client_tracker and not flight.lab.scene.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
-    flown = Live(
+    flown = (PosedLive if poses else Live)(
         flight,
-        Pace(speed, flight.lab.scene.exposure.rate_hz),
+        Pace(0.0 if poses else speed, flight.lab.scene.exposure.rate_hz),
         [],
         CommandState(flight, command_timeout, trigger or indi is not None),
         has_truth=truth,
