@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import secrets
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -35,6 +37,12 @@ def live(
         int | None,
         typer.Option(**PORTS, help="Serve MJPEG and packets on this port; 0: any free port."),
     ] = None,
+    gige: Annotated[
+        bool,
+        typer.Option(
+            "--gige", help="Be a GigE Vision camera, which GenICam clients control."
+        ),
+    ] = False,
     folder: Annotated[
         Path | None,
         typer.Option(
@@ -83,7 +91,10 @@ def live(
     ] = 0.5,
     wait: Annotated[
         bool,
-        typer.Option("--wait", help="Start when the first client of --tcp takes channels."),
+        typer.Option(
+            "--wait",
+            help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
+        ),
     ] = False,
     frames: Frames = None,
     endless: Annotated[
@@ -106,9 +117,20 @@ def live(
     from skysim.simulation.flight import open_flight
 
     check_outputs(
-        outputs={"--tcp": tcp, "--http": http, "--folder": folder, "--pipe": pipe},
-        needs_server={"--host": host != HOST, "--token": bool(token)},
-        needs_tcp={"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait},
+        outputs={
+            "--tcp": tcp,
+            "--http": http,
+            "--gige": gige or None,
+            "--folder": folder,
+            "--pipe": pipe,
+        },
+        needs={
+            ("--host", "--tcp", "--http", "--gige"): host != HOST,
+            ("--token", "--tcp", "--http"): bool(token),
+            ("--trigger", "--tcp", "--gige"): trigger,
+            ("--client-tracker", "--tcp"): client_tracker,
+            ("--wait", "--tcp", "--gige"): wait,
+        },
     )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
@@ -130,7 +152,16 @@ def live(
     with ExitStack() as stack:
         try:
             open_outputs(
-                flown, stack, folder, pipe, tcp, http, host, token or new_token(host), wait
+                flown,
+                stack,
+                folder,
+                pipe,
+                tcp,
+                http,
+                gige,
+                host,
+                token or new_token(host),
+                wait,
             )
             flown.run()
         except KeyboardInterrupt:
@@ -147,26 +178,25 @@ def live(
             raise InputError(f"--{output.name}", output.fault)
 
 
-def check_outputs(
-    outputs: dict[str, Any], needs_server: dict[str, bool], needs_tcp: dict[str, bool]
-) -> None:
+def check_outputs(outputs: dict[str, Any], needs: dict[tuple[str, ...], bool]) -> None:
     """Raise InputError if there is no output, or for an option that has no effect without another.
 
     Parameters
     ----------
     outputs
         Value of each output's option; None without it
-    needs_server, needs_tcp
-        Whether an option is used that needs a server, or the wire
+    needs
+        Whether an option is used, by it and the outputs of which it needs one
     """
     if all(value is None for value in outputs.values()):
         raise InputError("", "no output", ", ".join(outputs))
-    if outputs["--tcp"] is None and outputs["--http"] is None:
-        for option in (option for option, is_used in needs_server.items() if is_used):
-            raise InputError(option, "has no effect without --tcp or --http", "one of them")
-    if outputs["--tcp"] is None:
-        for option in (option for option, is_used in needs_tcp.items() if is_used):
-            raise InputError(option, "has no effect without --tcp", "--tcp PORT")
+    for (option, *servers), is_used in needs.items():
+        if is_used and all(outputs[server] is None for server in servers):
+            raise InputError(
+                option,
+                f"has no effect without {' or '.join(servers)}",
+                "one of them" if servers[1:] else "--tcp PORT",
+            )
 
 
 def new_token(host: str) -> str:
@@ -183,6 +213,7 @@ def open_outputs(
     pipe: str | None,
     tcp: int | None,
     http: int | None,
+    gige: bool,
     host: str,
     token: str,
     wait: bool,
@@ -192,9 +223,12 @@ def open_outputs(
     The stack closes them. Raises InputError for a port that cannot be served, and for a folder or pipe that cannot be
     used.
     """
+    from skysim.apps.live.gige import GigeCamera
     from skysim.apps.live.http import FrameHub, start_server
     from skysim.apps.live.sinks import Sink, folder_writer, pipe_writer
     from skysim.apps.live.wire import WireServer
+
+    started = list[Event]()
 
     def add(output: Output) -> None:
         flown.outputs.append(output)
@@ -219,8 +253,15 @@ def open_outputs(
         server = WireServer(host, tcp, token, flown.greeting, flown.inbox, flown.has_truth)
         add(server)
         tell(f"tcp {host}:{server.port}" + (f", token {token}" if token else ""))
-        while wait and not server.entered.wait(0.1):
-            pass
+        started.append(server.entered)
+    if gige:
+        camera = GigeCamera(flown, host)
+        add(camera)
+        risk = "" if camera.is_local else ", no token: all that reach it can control it"
+        tell(f"gige {camera.host}:{camera.port}{risk}")
+        started.append(camera.entered)
+    while wait and not any(one.is_set() for one in started):
+        time.sleep(0.05)
 
 
 def summary(statistics: dict[str, Any]) -> str:
