@@ -23,6 +23,7 @@ from collections import deque
 from typing import Any
 
 from skysim.apps.live.gvcp import (
+    DISCOVERY,
     DISCOVERY_BYTES,
     GVCP_PORT,
     HEARTBEAT,
@@ -296,8 +297,10 @@ class GigeCamera(Sink):
             try:
                 for ready in select.select(self.sockets, (), (), POLL_S)[0]:
                     datagram, sender = ready.recvfrom(1 << 16)
-                    # A broadcast of another machine is not for a camera on the loopback address.
-                    if not self.is_local or sender[0].startswith("127."):
+                    # A camera on the loopback address does not hear other machines; by a broadcast no camera is
+                    # controlled, only found.
+                    is_heard = not self.is_local or sender[0].startswith("127.")
+                    if is_heard and (ready is main or datagram[2:4] == bytes((0, DISCOVERY))):
                         self.reply(main, datagram, sender)
                 self.control.check_heartbeat(time.monotonic())
             except (OSError, ValueError):

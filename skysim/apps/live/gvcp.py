@@ -22,6 +22,7 @@ KEY = 0x42
 MOST_BYTES = 536  # of the memory in a datagram
 
 DISCOVERY = 0x0002
+FORCEIP = 0x0004
 PACKETRESEND = 0x0040
 READREG = 0x0080
 WRITEREG = 0x0082
@@ -209,6 +210,8 @@ class ControlChannel:
         if (sender, datagram) == self.newest:
             return self.newest_answer
         _, flags, command, length, number = HEADER.unpack_from(datagram)
+        if command == FORCEIP:
+            return None  # the address is that of the machine
         payload = datagram[HEADER.size :]
         data = b""
         try:
