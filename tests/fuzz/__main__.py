@@ -46,6 +46,7 @@ TARGETS = {
     "orbits": (),
     "torques": (),
     "packets": (),
+    "datagrams": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

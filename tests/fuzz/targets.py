@@ -17,6 +17,10 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.live import gvcp
+from skysim.apps.live.commands import CommandState
+from skysim.apps.live.gige import GigeCamera
+from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import unpack
 from skysim.apps.plate_solver import picture
 from skysim.camera.psf import otf
@@ -36,6 +40,7 @@ from skysim.results.files.parts import read_prices
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 from skysim.scene import loader, opencv_calibration
+from skysim.simulation.flight import Flight, open_flight
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
@@ -244,6 +249,35 @@ def packets(data: bytes) -> None:
     rejects(lambda: unpack(BytesIO(data)), InputError)
 
 
+@cache
+def camera_flight() -> Flight:
+    """A flight whose camera the datagrams control."""
+    return open_flight(loader.load("shefex2"), keeps_history=False)
+
+
+def datagrams(data: bytes) -> None:
+    """Datagrams to a GigE Vision camera, one after another: each is ignored, or answered as the standard says."""
+    flight = camera_flight()
+    camera = GigeCamera(
+        Live(flight, Pace(0.0, 1.0), [], CommandState(flight, 1.0, False)), "127.0.0.1", 0
+    )
+    camera.stream.close()  # nothing leaves the process
+    sent = 0
+    try:
+        while sent < len(data):
+            length = int.from_bytes(data[sent + 4 : sent + 6])
+            one = data[sent : sent + 8 + length]
+            sent += len(one)
+            answer = camera.control.answer(one, ("127.0.0.1", 1), 0.0)
+            if answer is not None:
+                status, _, size, number = gvcp.ANSWER.unpack_from(answer)
+                gvcp.GvcpStatus(status)
+                if size != len(answer) - 8 or number != int.from_bytes(one[6:8]):
+                    raise AssertionError(f"a malformed answer: {answer!r}")
+    finally:
+        camera.close()
+
+
 def quantities(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     rejects(lambda: units.quantity("m", "length", '"35 mm"')(text), ValueError)
@@ -269,6 +303,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         orbits,
         torques,
         packets,
+        datagrams,
         quantities,
     )
 }
