@@ -18,7 +18,7 @@ from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.live import gvcp
-from skysim.apps.live.commands import CommandState
+from skysim.apps.live.commands import CommandState, parse
 from skysim.apps.live.gige import GigeCamera
 from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import unpack
@@ -246,7 +246,9 @@ def torques(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
+    """A packet of a live flight, and a client's command."""
     rejects(lambda: unpack(BytesIO(data)), InputError)
+    rejects(lambda: parse(data), InputError)
 
 
 @cache

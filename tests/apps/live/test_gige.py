@@ -205,6 +205,15 @@ def test_a_refused_command_says_why_and_changes_nothing(
     assert not camera.live.inbox.waiting
 
 
+def test_a_forced_address_and_what_is_no_command_are_ignored(camera: GigeCamera) -> None:
+    for datagram in (
+        struct.pack(">BBHHH", 0x42, 1, 4, 56, 1) + bytes(56),
+        b"\x42\1\0",
+        b"A" * 8,
+    ):
+        assert camera.control.answer(datagram, CLIENT, 0.0) is None
+
+
 def test_a_command_of_another_length_than_it_says_is_refused(camera: GigeCamera) -> None:
     client = Client(camera)
     assert client.status(gvcp.READREG, bytes(4), 8) == GvcpStatus.INVALID_HEADER

@@ -125,7 +125,7 @@ def live(
             "--pipe": pipe,
         },
         needs={
-            ("--host", "--tcp", "--http", "--gige"): host != HOST,
+            (f"--host {host}", "--tcp", "--http", "--gige"): host != HOST,
             ("--token", "--tcp", "--http"): bool(token),
             ("--trigger", "--tcp", "--gige"): trigger,
             ("--client-tracker", "--tcp"): client_tracker,
