@@ -11,6 +11,8 @@ from contextlib import redirect_stdout
 from functools import cache
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +42,6 @@ from skysim.results.files.parts import read_prices
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
 from skysim.scene import loader, opencv_calibration
-from skysim.simulation.flight import Flight, open_flight
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
@@ -252,9 +253,14 @@ def packets(data: bytes) -> None:
 
 
 @cache
-def camera_flight() -> Flight:
-    """A flight whose camera the datagrams control."""
-    return open_flight(loader.load("shefex2"), keeps_history=False)
+def camera_flight() -> Any:
+    """What a camera needs of a flight."""
+    control = SimpleNamespace(exposure_s=0.01)
+    return SimpleNamespace(
+        lab=SimpleNamespace(scene=loader.load("shefex2")),
+        now_s=1.0,
+        schedules=[SimpleNamespace(triggers_s=None, exposure_control=control)],
+    )
 
 
 def datagrams(data: bytes) -> None:
@@ -270,7 +276,7 @@ def datagrams(data: bytes) -> None:
             length = int.from_bytes(data[sent + 4 : sent + 6])
             one = data[sent : sent + 8 + length]
             sent += len(one)
-            answer = camera.control.answer(one, ("127.0.0.1", 1), 0.0)
+            answer = camera.answer(one, ("127.0.0.1", 1), 0.0)
             if answer is not None:
                 status, _, size, number = gvcp.ANSWER.unpack_from(answer)
                 gvcp.GvcpStatus(status)

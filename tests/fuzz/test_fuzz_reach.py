@@ -46,6 +46,7 @@ OUT_OF_REACH = {
     "skysim.apps.cli.commands.camera.CameraGroup.parse_args": "words of the command line",
     "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
+    "skysim.apps.live.wire.WireClient.read": "needs a connection; a line of it is target `packets`",
     "skysim.apps.plate_solver.picture.load_picture": "hands the file on to `read_picture`",
     "skysim.apps.plate_solver.picture.read_and_solve": "hands the file on to `load_picture`",
     "skysim.apps.plate_solver.solver.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",

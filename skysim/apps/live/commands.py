@@ -70,11 +70,6 @@ class Inbox:
             yield self.waiting[0]
             self.waiting.popleft()
 
-    def newest(self, key: str, reply: Reply) -> Any:
-        """What a client, by its `reply`, commanded last and is not yet in force; None if nothing was."""
-        waiting = reversed(self.waiting.copy())
-        return next((one[key] for one, to in waiting if to == reply and key in one), None)
-
 
 @dataclass
 class CommandState:

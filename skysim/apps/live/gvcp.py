@@ -1,15 +1,14 @@
 """GVCP, the control protocol of GigE Vision: datagrams that read and write a camera's registers.
 
 A command is key 0x42, flags (1: an answer is wanted), command, length of what follows, number; its answer is status,
-command + 1, length, number. All numbers are big-endian. Sources: the registers' addresses and the codes are those of
-GigE Vision 1.2, which Aravis names in arvgvcpprivate.h.
+command + 1, length, number. All numbers are big-endian. Source: GigE Vision 1.2, whose registers and codes Aravis
+names in arvgvcpprivate.h.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Container
 from enum import IntEnum
 from typing import Any
 
@@ -28,6 +27,7 @@ READREG = 0x0080
 WRITEREG = 0x0082
 READMEM = 0x0084
 WRITEMEM = 0x0086
+SILENT = (FORCEIP, PACKETRESEND)  # have no answer; the address is that of the machine
 
 # Registers that the protocol itself needs.
 DISCOVERY_BYTES = 0xF8
@@ -54,114 +54,91 @@ class GvcpStatus(IntEnum):
 
 
 class RefusedError(Exception):
-    """A command that is answered with an error."""
-
-    def __init__(self, status: GvcpStatus) -> None:
-        super().__init__(status.name)
-        self.status = status
-
-
-@dataclass(frozen=True, slots=True)
-class Writable:
-    """A register that the application in control may write.
-
-    Attributes
-    ----------
-    code
-        Its type: struct's I (unsigned, 4 bytes) or d (8 bytes)
-    take
-        Takes a value and returns what the register then holds. Raises InputError or RefusedError, and the register
-        keeps its value
-    """
-
-    code: str
-    take: Callable[[Any], Any]
+    """A command that is answered with the status in its argument."""
 
 
 class ControlChannel:
-    """Registers, and the one application that may write them.
+    """Registers, and the one application that may write them. A camera adds `refresh`, `resend` and `stop`.
 
     Parameters
     ----------
-    sizes
-        Bytes of each range of addresses that can be read, by its first address
-    writable
-        Registers that can be written, by their address; the privilege is not among them
-    refresh
-        Updates the registers whose values change, before they are read
-    resend
-        Sends packets again: resend(block, first, last)
-    released
-        Called when the application has given up the control, or was not heard for the heartbeat's timeout
+    ranges
+        First addresses and ends of what can be read
+    allowed
+        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which its
+        effect checks
+    effects
+        What the writing of some of them does: effect(value). Raises InputError or RefusedError, and the register
+        keeps its value
     """
 
     def __init__(
         self,
-        sizes: dict[int, int],
-        writable: dict[int, Writable],
-        refresh: Callable[[], None],
-        resend: Callable[[int, int, int], None],
-        released: Callable[[], None],
+        ranges: tuple[tuple[int, int], ...],
+        allowed: dict[int, Container[int] | None],
+        effects: dict[int, Callable[[Any], None]],
     ) -> None:
-        self.memory = {first: bytearray(size) for first, size in sizes.items()}
-        self.writable = writable
-        self.refresh = refresh
-        self.resend = resend
-        self.released = released
+        self.ranges = ranges
+        self.allowed = allowed
+        self.effects = effects
+        self.memory = bytearray(ranges[-1][1])
         self.controller: Sender | None = None
         self.heard_s = 0.0
         self.newest: tuple[Sender, bytes] | None = None
         self.newest_answer: bytes | None = None
 
+    def refresh(self) -> None:
+        """Update the registers whose values change, before they are read."""
+
+    def resend(self, block: int, first: int, last: int) -> None:
+        """Send packets of a block again."""
+
+    def stop(self, _: int = 0) -> None:
+        """Send no more frames."""
+
     # Memory
 
-    def place(self, address: int, size: int) -> tuple[bytearray, int]:
-        """The range that holds some bytes, and their place in it. Raises RefusedError if there is none."""
-        for first, data in self.memory.items():
-            if first <= address and address + size <= first + len(data):
-                return data, address - first
-        raise RefusedError(GvcpStatus.INVALID_ADDRESS)
+    def check(self, address: int, size: int) -> None:
+        """Raise RefusedError for bytes that cannot be read."""
+        if not any(first <= address <= end - size for first, end in self.ranges):
+            raise RefusedError(GvcpStatus.INVALID_ADDRESS)
 
-    def put(self, address: int, value: Any, code: str = "I") -> None:
-        """Set a register, by its type in struct."""
-        data, at = self.place(address, struct.calcsize(f">{code}"))
-        struct.pack_into(f">{code}", data, at, value)
+    def put(self, address: int, value: float | bytes) -> None:
+        """Set a register: an int of 4 bytes, a float of 8, or bytes."""
+        if not isinstance(value, bytes):
+            value = struct.pack(">d" if isinstance(value, float) else ">I", value)
+        self.memory[address : address + len(value)] = value
 
     def value(self, address: int) -> int:
-        """A register's four bytes."""
-        data, at = self.place(address, 4)
-        return int.from_bytes(data[at : at + 4])
+        """A register of 4 bytes."""
+        return int.from_bytes(self.memory[address : address + 4])
 
     def read(self, address: int, size: int) -> bytes:
-        """Bytes at an address, up to date."""
+        """Bytes at an address, up to date. Raises RefusedError."""
         if address % 4 or size % 4:
             raise RefusedError(GvcpStatus.BAD_ALIGNMENT)
-        data, at = self.place(address, size)
+        if size > MOST_BYTES:
+            raise RefusedError(GvcpStatus.INVALID_PARAMETER)
+        self.check(address, size)
         self.refresh()
-        return bytes(data[at : at + size])
+        return bytes(self.memory[address : address + size])
 
-    def write(self, sender: Sender, address: int, data: bytes) -> None:
-        """Write the registers from an address on, one after another, until one refuses."""
-        if address == PRIVILEGE and len(data) == 4:
-            self.set_privilege(sender, int.from_bytes(data))
-            return
-        if sender != self.controller:
+    def write_register(self, sender: Sender, address: int, data: bytes) -> None:
+        """Write a register. Raises RefusedError, InputError, and struct.error for a wrong length."""
+        if address != PRIVILEGE and sender != self.controller:
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
-        while data:
-            self.place(address, 4)
-            register = self.writable.get(address)
-            if register is None:
-                raise RefusedError(GvcpStatus.WRITE_PROTECT)
-            size = struct.calcsize(f">{register.code}")
-            if len(data) < size:
-                raise RefusedError(GvcpStatus.BAD_ALIGNMENT)
-            try:
-                held = register.take(struct.unpack(f">{register.code}", data[:size])[0])
-            except InputError:
-                raise RefusedError(GvcpStatus.INVALID_PARAMETER) from None
-            self.put(address, held, register.code)
-            address += size
-            data = data[size:]
+        self.check(address, len(data))
+        if address not in self.allowed:
+            raise RefusedError(GvcpStatus.WRITE_PROTECT)
+        allowed = self.allowed[address]
+        (value,) = struct.unpack(">d" if allowed is None else ">I", data)
+        if allowed is not None and value not in allowed:
+            raise RefusedError(GvcpStatus.INVALID_PARAMETER)
+        if address == PRIVILEGE:
+            self.set_privilege(sender, value)
+        if address in self.effects:
+            self.effects[address](value)
+        self.put(address, value)
 
     # Privilege
 
@@ -169,18 +146,15 @@ class ControlChannel:
         """Give the control to an application, or take it back from it."""
         if self.controller not in (None, sender):
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
-        if value & (CONTROL | EXCLUSIVE):
-            self.controller = sender
-            self.put(PRIVILEGE, value & (CONTROL | EXCLUSIVE))
-        else:
+        self.controller = sender
+        if not value:
             self.release()
 
     def release(self) -> None:
-        """Take the control from the application that has it."""
+        """Take the control from its application, and stop."""
+        self.controller = None
         self.put(PRIVILEGE, 0)
-        if self.controller is not None:
-            self.controller = None
-            self.released()
+        self.stop()
 
     def check_heartbeat(self, now_s: float) -> None:
         """Take the control from an application that was not heard for the heartbeat's timeout."""
@@ -202,37 +176,36 @@ class ControlChannel:
         now_s
             Monotonic time
         """
-        self.check_heartbeat(now_s)
-        if len(datagram) < HEADER.size or datagram[0] != KEY:
-            return None
+        if (sender, datagram) != self.newest:
+            self.newest_answer = self.first_answer(datagram, sender)
+            self.newest = (sender, datagram)
         if sender == self.controller:
             self.heard_s = now_s
-        if (sender, datagram) == self.newest:
-            return self.newest_answer
-        _, flags, command, length, number = HEADER.unpack_from(datagram)
-        if command == FORCEIP:
-            return None  # the address is that of the machine
-        payload = datagram[HEADER.size :]
-        data = b""
-        try:
-            if len(payload) != length:
-                raise RefusedError(GvcpStatus.INVALID_HEADER)
-            data = self.execute(command, payload, sender)
-            status = GvcpStatus.SUCCESS
-        except RefusedError as error:
-            status = error.status
-        except struct.error:
-            status = GvcpStatus.INVALID_HEADER
-        if sender == self.controller:
-            self.heard_s = now_s  # by this command, perhaps
-        self.newest = (sender, datagram)
-        wants_answer = flags & 1 and command != PACKETRESEND
-        head = ANSWER.pack(status, (command + 1) & 0xFFFF, len(data), number)
-        self.newest_answer = head + data if wants_answer else None
         return self.newest_answer
 
-    def execute(self, command: int, payload: bytes, sender: Sender) -> bytes:
-        """Carry out a command; return the answer's data. Raises RefusedError, and struct.error for a wrong length."""
+    def first_answer(self, datagram: bytes, sender: Sender) -> bytes | None:
+        """Carry out a command that is no second try; return as `answer` does."""
+        if len(datagram) < HEADER.size or datagram[0] != KEY:
+            return None
+        _, flags, command, length, number = HEADER.unpack_from(datagram)
+        status = GvcpStatus.SUCCESS
+        data = b""
+        try:
+            data = self.execute(command, datagram[HEADER.size :], length, sender)
+        except RefusedError as error:
+            status = error.args[0]
+        except InputError:
+            status = GvcpStatus.INVALID_PARAMETER
+        except struct.error:
+            status = GvcpStatus.INVALID_HEADER
+        if not flags & 1 or command in SILENT:
+            return None
+        return ANSWER.pack(status, (command + 1) & 0xFFFF, len(data), number) + data
+
+    def execute(self, command: int, payload: bytes, length: int, sender: Sender) -> bytes:
+        """Carry out a command; return the answer's data. Raises as `write_register` does."""
+        if len(payload) != length:
+            raise RefusedError(GvcpStatus.INVALID_HEADER)
         if command == DISCOVERY:
             return self.read(0, DISCOVERY_BYTES)
         if command == PACKETRESEND:
@@ -242,22 +215,17 @@ class ControlChannel:
         if self.controller != sender and self.value(PRIVILEGE) & EXCLUSIVE:
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
         if command == READREG:
-            addresses = struct.unpack(f">{len(payload) // 4}I", payload)
-            if len(payload) > MOST_BYTES:
-                raise RefusedError(GvcpStatus.INVALID_PARAMETER)
-            return b"".join(self.read(address, 4) for address in addresses)
+            addresses = struct.iter_unpack(">I", payload[:MOST_BYTES])
+            return b"".join(self.read(address, 4) for (address,) in addresses)
         if command == READMEM:
             address, size = struct.unpack(">II", payload)
-            if size > MOST_BYTES:
-                raise RefusedError(GvcpStatus.INVALID_PARAMETER)
-            return struct.pack(">I", address) + self.read(address, size)
+            return payload[:4] + self.read(address, size)
         if command == WRITEREG:
-            pairs = list(struct.iter_unpack(">I4s", payload))
-            for address, data in pairs:
-                self.write(sender, address, data)
-            return struct.pack(">HH", 0, len(pairs))
+            for address, data in struct.iter_unpack(">I4s", payload):
+                self.write_register(sender, address, data)
+            return struct.pack(">I", len(payload) // 8)
         if command == WRITEMEM:
             (address,) = struct.unpack_from(">I", payload)
-            self.write(sender, address, payload[4:])
-            return struct.pack(">HH", 0, len(payload) - 4)
+            self.write_register(sender, address, payload[4:])
+            return struct.pack(">I", len(payload) - 4)
         raise RefusedError(GvcpStatus.NOT_IMPLEMENTED)

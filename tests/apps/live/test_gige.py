@@ -93,7 +93,7 @@ class Client:
             len(payload) if length is None else length,
             self.number,
         )
-        answer = self.camera.control.answer(head + payload, self.address, self.now_s)
+        answer = self.camera.answer(head + payload, self.address, self.now_s)
         assert answer is not None
         status, answered, size, number = struct.unpack_from(">4H", answer)
         assert (answered, size, number) == (command + 1, len(answer) - 8, self.number)
@@ -139,9 +139,9 @@ def test_the_xml_is_well_formed_and_every_register_of_it_is_there(camera: GigeCa
     for node in (one for one in tree.iter() if one.find("g:Address", space) is not None):
         address = int(node.findtext("g:Address", "", space), 16)
         length = int(node.findtext("g:Length", "", space))
-        assert len(camera.control.read(address, length)) == length
+        assert len(camera.read(address, length)) == length
         is_writable = node.findtext("g:AccessMode", "", space) != "RO"
-        assert is_writable == (address in camera.control.writable), node.get("Name")
+        assert is_writable == (address in camera.allowed), node.get("Name")
     assert registers
 
 
@@ -180,17 +180,20 @@ def test_discovery_tells_names_and_the_xml_where_it_is(camera: GigeCamera) -> No
             struct.pack(">II", gige.PIXEL_FORMAT, 9),
             GvcpStatus.INVALID_PARAMETER,
         ),
-        (gvcp.WRITEREG, struct.pack(">II", 0xA038, 2), GvcpStatus.INVALID_PARAMETER),
-        (gvcp.WRITEREG, struct.pack(">II", 0xA048, 1), GvcpStatus.WRITE_PROTECT),
+        (
+            gvcp.WRITEREG,
+            struct.pack(">II", gige.ACQUISITION_MODE, 2),
+            GvcpStatus.INVALID_PARAMETER,
+        ),
+        (gvcp.WRITEREG, struct.pack(">II", gige.TRIGGER, 1), GvcpStatus.WRITE_PROTECT),
         (
             gvcp.WRITEREG,
             struct.pack(">II", gige.PACKET_SIZE, 60),
             GvcpStatus.INVALID_PARAMETER,
         ),
-        (gvcp.WRITEREG, struct.pack(">II", 0xA010, 1), GvcpStatus.BAD_ALIGNMENT),
+        (gvcp.WRITEREG, struct.pack(">II", 0xA010, 1), GvcpStatus.INVALID_HEADER),
         (gvcp.WRITEMEM, struct.pack(">Id", 0xA020, 1.0), GvcpStatus.WRITE_PROTECT),
         (gvcp.WRITEMEM, b"12", GvcpStatus.INVALID_HEADER),
-        (gvcp.WRITEREG, struct.pack(">II", 0x0D18, 0x08080808), GvcpStatus.INVALID_PARAMETER),
         (0x0100, b"", GvcpStatus.NOT_IMPLEMENTED),
     ],
 )
@@ -199,9 +202,9 @@ def test_a_refused_command_says_why_and_changes_nothing(
 ) -> None:
     client = Client(camera).control()
     camera.refresh()
-    before = {first: bytes(data) for first, data in camera.control.memory.items()}
+    before = bytes(camera.memory)
     assert client.status(command, payload) == status
-    assert {first: bytes(data) for first, data in camera.control.memory.items()} == before
+    assert bytes(camera.memory) == before
     assert not camera.live.inbox.waiting
 
 
@@ -211,7 +214,7 @@ def test_a_forced_address_and_what_is_no_command_are_ignored(camera: GigeCamera)
         b"\x42\1\0",
         b"A" * 8,
     ):
-        assert camera.control.answer(datagram, CLIENT, 0.0) is None
+        assert camera.answer(datagram, CLIENT, 0.0) is None
 
 
 def test_a_command_of_another_length_than_it_says_is_refused(camera: GigeCamera) -> None:
@@ -235,7 +238,7 @@ def test_the_exposure_reads_as_written_before_and_after_the_flight_takes_it(
     client = Client(camera).control()
     live = camera.live
     assert client.read_double(gige.EXPOSURE_US) == pytest.approx(4000, rel=1e-12)
-    assert client.write_exposure_us(client.read_double(0xA018)) == 0  # the longest
+    assert client.write_exposure_us(client.read_double(gige.LONGEST_US)) == 0  # the longest
     assert client.write_exposure_us(2500) == 0
     assert client.read_double(gige.EXPOSURE_US) == pytest.approx(2500, rel=1e-12)
     live.commands.receive(live.inbox)
@@ -250,7 +253,7 @@ def test_the_exposure_reads_as_written_before_and_after_the_flight_takes_it(
 def test_zero_degrees_is_a_temperature() -> None:
     for detector, celsius in (({"camera.detector.temperature_c": "0"}, 0.0), ({}, 20.0)):
         with camera_of(live_flight(**detector)) as camera:
-            assert Client(camera).read_double(0xA028) == celsius
+            assert Client(camera).read_double(gige.CELSIUS) == celsius
 
 
 def test_a_camera_without_noise_is_refused() -> None:
@@ -286,13 +289,13 @@ def test_an_application_that_is_not_heard_loses_the_control(camera: GigeCamera) 
     client = Client(camera).control()
     client.write(gvcp.HEARTBEAT, 500)
     client.write(gige.STREAM_PORT, 4000)
-    client.write(0xA03C, 1)
+    client.write(gige.START, 1)
     for _ in range(3):
         client.now_s += 0.4
         assert client.read(gvcp.PRIVILEGE) == gvcp.CONTROL
     assert camera.channels
     # The camera's own thread sees it, without a datagram. Its clock is that of the client's last one.
-    camera.control.heard_s = time.monotonic() - 0.4
+    camera.heard_s = time.monotonic() - 0.4
     deadline_s = time.monotonic() + 10
     while camera.channels and time.monotonic() < deadline_s:
         time.sleep(0.02)
@@ -347,7 +350,7 @@ def test_packets_hold_the_pixels_by_the_law_of_their_format(
     client = Client(camera).control()
     assert client.write(gige.PIXEL_FORMAT, code) == 0
     assert client.write(gige.PACKET_SIZE, 576) == 0
-    client.write(0xA03C, 1)
+    client.write(gige.START, 1)
     assert client.write(gige.PIXEL_FORMAT, code) == GvcpStatus.WRITE_PROTECT
     (frame, *_) = frames_of(camera, 12)
     packets = camera.packets_of(frame)
@@ -367,7 +370,7 @@ def test_single_frame_stops_after_one(camera: GigeCamera) -> None:
     assert client.write(gige.ACQUISITION_MODE, 1) == 0
     assert not frames_of(camera, 20)  # not started
     for _ in range(2):
-        assert client.write(0xA03C, 1) == 0
+        assert client.write(gige.START, 1) == 0
         started_s = camera.live.flight.now_s
         (frame,) = frames_of(camera, 30)
         assert frame.header["t_s"] > started_s
@@ -376,17 +379,17 @@ def test_single_frame_stops_after_one(camera: GigeCamera) -> None:
 
 def test_triggers_take_the_place_of_the_schedule_and_give_it_back(camera: GigeCamera) -> None:
     client = Client(camera).control()
-    client.write(0xA03C, 1)
+    client.write(gige.START, 1)
     scheduled = frames_of(camera, 30)
     assert len(scheduled) >= 3
     assert client.write(gige.TRIGGER_MODE, 1) == 0
     assert client.read(gige.TRIGGER_MODE) == 1
     assert not frames_of(camera, 30)
     now_s = camera.live.flight.now_s
-    assert client.write(0xA048, 1) == 0
+    assert client.write(gige.TRIGGER, 1) == 0
     # The same datagram again is a second try: the trigger is not taken twice.
     client.number -= 1
-    assert client.write(0xA048, 1) == 0
+    assert client.write(gige.TRIGGER, 1) == 0
     (frame,) = frames_of(camera, 30)
     assert frame.header["t_s"] == pytest.approx(now_s + 2e-3, abs=1e-9)
     assert client.write(gige.TRIGGER_MODE, 0) == 0
@@ -402,7 +405,7 @@ def test_triggers_take_the_place_of_the_schedule_and_give_it_back(camera: GigeCa
     assert camera.live.commands.refused == 0
 
 
-def test_lost_packets_come_again_and_forgotten_ones_are_refused(camera: GigeCamera) -> None:
+def test_lost_packets_come_again_while_they_are_kept(camera: GigeCamera) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(10)
@@ -410,20 +413,20 @@ def test_lost_packets_come_again_and_forgotten_ones_are_refused(camera: GigeCame
         client.write(gige.STREAM_ADDRESS, 0x7F000001)
         client.write(gige.STREAM_PORT, receiver.getsockname()[1])
         client.write(gige.ACQUISITION_MODE, 1)
-        client.write(0xA03C, 1)
+        client.write(gige.START, 1)
         for _ in range(12):
             camera.live.advance()
         packets = [receiver.recv(2000) for _ in range(7)]
         assembled(packets)
         resend = struct.pack(">BBHHHHHII", 0x42, 0, gvcp.PACKETRESEND, 12, 9, 0, 1, 2, 3)
-        assert camera.control.answer(resend, OTHER, client.now_s) is None
+        assert camera.answer(resend, OTHER, client.now_s) is None
         assert [receiver.recv(2000) for _ in range(2)] == packets[2:4]
         resend = struct.pack(">BBHHHHHII", 0x42, 0, gvcp.PACKETRESEND, 12, 9, 0, 7, 2, 3)
-        camera.control.answer(resend, OTHER, client.now_s)
-        assert receiver.recv(2000) == struct.pack(">HHI", 0x800C, 7, 3 << 24 | 2)
-        client.write(gige.PACKET_SIZE, 1 << 31 | 1200)
-        assert len(receiver.recv(2000)) == 1200 - 28
-        assert camera.counters()["resent"] == 2
+        assert camera.answer(resend, OTHER, client.now_s) is None
+        assert camera.answer(resend[:-1], OTHER, client.now_s) is None
+        receiver.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            receiver.recv(2000)
 
 
 def test_any_datagram_is_answered_or_ignored(camera: GigeCamera) -> None:
@@ -438,7 +441,7 @@ def test_any_datagram_is_answered_or_ignored(camera: GigeCamera) -> None:
             client.send(data)
         client.send(struct.pack(">BBHHH", 0x42, 1, gvcp.DISCOVERY, 0, 0xFFFF))
         while client.recv(2000)[2:] != struct.pack(">HHH", 3, 248, 0xFFFF) + bytes(
-            camera.control.memory[0]
+            camera.memory[:248]
         ):
             pass
 
@@ -470,6 +473,11 @@ class Lossy(GigeCamera):
     """A camera that loses every 97th packet."""
 
     count = 0
+    resent = 0
+
+    def resend(self, *words: int) -> None:
+        self.resent += 1
+        super().resend(*words)
 
     def send(self, packets: list[bytes], delay_s: float = 0.0) -> None:
         kept = []
@@ -512,7 +520,8 @@ def test_aravis_receives_a_hundred_frames_as_the_renderer_makes_them(
     received = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(received) == 100
     assert {one["status"] for one in received} == {"success"}
-    assert (camera.counters()["resent"] > 0) == (kind is Lossy)
+    if isinstance(camera, Lossy):
+        assert camera.resent > 10
     flight = open_flight(loader.load("shefex2", SMALL | {"exposure.frames": "2000"}))
     flight.schedules[0].exposure_control.exposure_s = 6e-3
     wanted = {one["t_ns"]: one["digest"] for one in received}
