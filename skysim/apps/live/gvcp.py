@@ -8,7 +8,7 @@ names in arvgvcpprivate.h.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
 from enum import IntEnum
 from typing import Any
 
@@ -75,7 +75,7 @@ class ControlChannel:
     def __init__(
         self,
         ranges: tuple[tuple[int, int], ...],
-        allowed: dict[int, Container[int] | None],
+        allowed: Mapping[int, Container[int] | None],
         effects: dict[int, Callable[[Any], None]],
     ) -> None:
         self.ranges = ranges
