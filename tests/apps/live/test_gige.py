@@ -217,6 +217,22 @@ def test_a_forced_address_and_what_is_no_command_are_ignored(camera: GigeCamera)
         assert camera.answer(datagram, CLIENT, 0.0) is None
 
 
+def test_a_broadcast_only_finds_a_camera_and_only_from_where_it_can_be_reached(
+    camera: GigeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard: list[bytes] = []
+    monkeypatch.setattr(camera, "answer", lambda datagram, *_: heard.append(datagram))
+    discovery = struct.pack(">BBHHH", 0x42, 0x11, gvcp.DISCOVERY, 0, 1)
+    reading = struct.pack(">BBHHHI", 0x42, 1, gvcp.READREG, 4, 1, 0)
+    camera.reply(discovery, ("192.0.2.9", 1), True)
+    camera.reply(reading, CLIENT, True)
+    assert not heard
+    camera.reply(discovery, CLIENT, True)
+    camera.is_local = False
+    camera.reply(discovery, ("192.0.2.9", 1), True)
+    assert heard == [discovery] * 2
+
+
 def test_a_command_of_another_length_than_it_says_is_refused(camera: GigeCamera) -> None:
     client = Client(camera)
     assert client.status(gvcp.READREG, bytes(4), 8) == GvcpStatus.INVALID_HEADER
