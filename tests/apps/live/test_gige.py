@@ -468,8 +468,9 @@ def test_any_datagram_is_answered_or_ignored(camera: GigeCamera) -> None:
 @cache
 def aravis_problem() -> str:
     """Why Aravis cannot be used; empty if it can."""
-    if not shutil.which("arv-tool-0.8"):
-        return "needs arv-tool-0.8 of Debian's aravis-tools-cli"
+    for program in ("arv-tool-0.8", SYSTEM_PYTHON):
+        if not shutil.which(program):
+            return f"needs {program}; Debian's aravis-tools-cli, python3"
     check = "import gi; gi.require_version('Aravis', '0.8'); from gi.repository import Aravis"
     done = subprocess.run([SYSTEM_PYTHON, "-c", check], capture_output=True, check=False)
     return "needs Debian's python3-gi and gir1.2-aravis-0.8" if done.returncode else ""
