@@ -124,6 +124,8 @@ class Schedule:
         Exposure times of the frames exposed so far, by index; empty in an endless flight
     triggers_s
         Times at which triggered exposures open, by index; None: the scene's schedule
+    skipped
+        Number of the scene's exposures that were left out for triggered ones; negative if these were more
     """
 
     def __init__(self, camera: StarCamera, number: int, frames: float) -> None:
@@ -135,13 +137,14 @@ class Schedule:
         self.index = 0
         self.exposures_s: dict[int, float] = {}
         self.triggers_s: dict[int, float] | None = None
+        self.skipped = 0
 
     @property
     def is_over(self) -> bool:
         """Whether all frames were exposed."""
         if self.triggers_s is not None:
             return self.index not in self.triggers_s
-        return self.index >= self.frames
+        return self.index + self.skipped >= self.frames
 
     def trigger(self, now_s: float) -> None:
         """Open an exposure now, or at the end of those that were triggered before."""
@@ -155,6 +158,13 @@ class Schedule:
             open_s = max(now_s, last.close_s(rows))
         self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
+    def resume(self, now_s: float) -> None:
+        """Expose by the scene's schedule again, from its next time on; triggers that wait are dropped."""
+        exposure = self.camera.scene.exposure
+        due = max(math.ceil((now_s - exposure.first_s) * exposure.rate_hz), 0)
+        self.skipped = due - self.index
+        self.triggers_s = None
+
     @property
     def window(self) -> Window:
         """Exposure window of the next frame."""
@@ -163,7 +173,9 @@ class Schedule:
             return timing.window_from(
                 self.camera.scene, self.triggers_s[self.index], exposure_s
             )
-        return timing.exposure_window(self.camera.scene, self.index, exposure_s)
+        return timing.exposure_window(
+            self.camera.scene, self.index + self.skipped, exposure_s
+        )
 
     @property
     def close_s(self) -> float:

@@ -6,6 +6,7 @@
 | `wheels`, `cmgs`, `fans`, `thrusters`, `trims`, `ideal` | (n,) commands of the single motors, see `Flight.commands` |
 | `attitude` | a solution of the client's tracker: t_s (of the frame), cam_from_ref_xyzw, covariance_rad2 (3, 3) |
 | `exposure_s` | exposure time of the next frames |
+| `triggered` | true: expose frames at triggers from now on; false: by the scene's schedule |
 | `trigger` | true: expose a frame from now on, where frames are triggered |
 | `abort` | true: forget the triggered exposures that have not ended |
 """
@@ -13,9 +14,8 @@
 from __future__ import annotations
 
 import json
-import queue
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,18 +57,22 @@ class Inbox:
     """Commands that wait for the next control period, with the function that reports an error to their client."""
 
     def __init__(self) -> None:
-        self.waiting: queue.Queue[tuple[dict[str, Any], Reply]] = queue.Queue(MOST_WAITING)
+        self.waiting: deque[tuple[dict[str, Any], Reply]] = deque()
 
-    def put(self, command: dict[str, Any], reply: Reply) -> None:
-        """Add a command; refuse it where too many wait."""
-        try:
-            self.waiting.put_nowait((command, reply))
-        except queue.Full:
+    def put(self, command: dict[str, Any], reply: Reply) -> bool:
+        """Add a command; refuse it where too many wait. Return whether it waits."""
+        has_room = len(self.waiting) < MOST_WAITING
+        if has_room:
+            self.waiting.append((command, reply))
+        else:
             reply(f"more than {MOST_WAITING} commands in a control period")
+        return has_room
 
-    def take(self) -> list[tuple[dict[str, Any], Reply]]:
-        """All that waits."""
-        return [self.waiting.get_nowait() for _ in range(self.waiting.qsize())]
+    def take(self) -> Iterator[tuple[dict[str, Any], Reply]]:
+        """All that waits; each command waits until its caller asks for the next."""
+        for _ in range(len(self.waiting)):
+            yield self.waiting[0]
+            self.waiting.popleft()
 
 
 @dataclass
@@ -83,6 +87,8 @@ class CommandState:
         Time of the simulator after which a command of actuators ends
     has_triggers
         Whether frames are exposed at triggers
+    longest_exposure_s
+        Longest exposure time that may be commanded
     held
         Value and time of each command of actuators, by its key
     received, refused, timeouts
@@ -94,6 +100,7 @@ class CommandState:
     flight: Flight
     timeout_s: float
     has_triggers: bool
+    longest_exposure_s: float = field(init=False)
     held: dict[str, tuple[Any, float]] = field(default_factory=dict)
     received: int = 0
     refused: int = 0
@@ -101,8 +108,17 @@ class CommandState:
     updates: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
-        if self.has_triggers:
-            self.flight.schedules[0].triggers_s = {}
+        self.longest_exposure_s = longest_live_s(self.flight.lab.scene)
+        self.set_triggered(self.has_triggers)
+
+    def set_triggered(self, triggered: bool) -> None:
+        """Expose frames at triggers, or by the scene's schedule."""
+        schedule = self.flight.schedules[0]
+        self.has_triggers = triggered
+        if triggered and schedule.triggers_s is None:
+            schedule.triggers_s = {}
+        elif not triggered and schedule.triggers_s is not None:
+            schedule.resume(self.flight.now_s)
 
     def receive(self, inbox: Inbox) -> None:
         """Take what has arrived; a refused command changes nothing, and its client gets the reason."""
@@ -118,10 +134,13 @@ class CommandState:
         """Check a command as a whole, then take it. Raises InputError."""
         command = dict(command)
         exposure_s = self.exposure_s(command.pop("exposure_s", None))
+        triggered = command.pop("triggered", self.has_triggers)
+        if not isinstance(triggered, bool):
+            raise InputError("triggered", repr(triggered)[:40], "true or false")
         trigger = command.pop("trigger", False)
-        self.check_trigger("trigger", trigger)
+        self.check_trigger("trigger", trigger, triggered)
         abort = command.pop("abort", False)
-        self.check_trigger("abort", abort)
+        self.check_trigger("abort", abort, triggered)
         solution = command.pop("attitude", None)
         attitude = None if solution is None else self.solution(solution)
         # What is left are commands of actuators.
@@ -131,6 +150,7 @@ class CommandState:
         self.held |= {key: (value, now_s) for key, value in command.items()}
         if exposure_s:
             self.flight.schedules[0].exposure_control.exposure_s = exposure_s
+        self.set_triggered(triggered)
         if abort:
             self.flight.schedules[0].triggers_s = {}
         if trigger:
@@ -139,14 +159,15 @@ class CommandState:
             status = self.flight.motion.navigation.update_filter(solution["t_s"], attitude)
             self.updates[status] += 1
 
-    def check_trigger(self, key: str, value: Any) -> None:
+    def check_trigger(self, key: str, value: Any, triggered: bool) -> None:
         """Raise InputError for a trigger, or an abort, that cannot be taken."""
         if value is False:
             return
         if value is not True:
             raise InputError(key, repr(value)[:40], "true")
-        if not self.has_triggers:
-            raise InputError(key, "the scene's schedule exposes the frames", "--trigger")
+        if not triggered:
+            problem = "the scene's schedule exposes the frames"
+            raise InputError(key, problem, "--trigger, or triggered")
         schedule = self.flight.schedules[0]
         waiting = sum(index >= schedule.index for index in schedule.triggers_s or ())
         if key == "trigger" and waiting >= MOST_TRIGGERS:
@@ -156,7 +177,7 @@ class CommandState:
         """A commanded exposure time, checked."""
         if value is None:
             return None
-        longest_s = longest_live_s(self.flight.lab.scene)
+        longest_s = self.longest_exposure_s
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float))

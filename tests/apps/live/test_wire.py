@@ -77,6 +77,7 @@ def answer_to(live: Live, command: dict[str, Any]) -> str:
         ({"exposure_s": True}, "exposure_s: True"),
         ({"exposure_s": 1e9}, "allowed: more than 0, to 0.5"),
         ({"trigger": True}, "schedule exposes the frames; allowed: --trigger"),
+        ({"triggered": 1}, "triggered: 1; allowed: true or false"),
         ({"attitude": 3}, "attitude: 3; allowed: t_s, cam_from_ref_xyzw"),
     ],
 )

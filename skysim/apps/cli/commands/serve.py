@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import secrets
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -36,6 +38,12 @@ def live(
         int | None,
         typer.Option(**PORTS, help="Serve MJPEG and packets on this port; 0: any free port."),
     ] = None,
+    gige: Annotated[
+        bool,
+        typer.Option(
+            "--gige", help="Be a GigE Vision camera, which GenICam clients control."
+        ),
+    ] = False,
     folder: Annotated[
         Path | None,
         typer.Option(
@@ -116,7 +124,10 @@ def live(
     ] = 0.5,
     wait: Annotated[
         bool,
-        typer.Option("--wait", help="Start when the first client of --tcp takes channels."),
+        typer.Option(
+            "--wait",
+            help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
+        ),
     ] = False,
     frames: Frames = None,
     endless: Annotated[
@@ -144,6 +155,7 @@ def live(
         "pipe": pipe,
         "http": http,
         "display": display,
+        "gige": gige or None,
         "indi": indi,
         "mcap": mcap,
         "foxglove": foxglove,
@@ -152,14 +164,19 @@ def live(
     chosen = {name: value for name, value in outputs.items() if value is not None}
     if not chosen:
         raise InputError("", "no output", ", ".join(f"--{name}" for name in outputs))
-    needs_server = {
-        "--host": host != HOST,
-        "--token": bool(token),
-        "--display": bool(display),
+    needs: dict[tuple[str, ...], bool] = {
+        (f"--host {host}", "tcp", "http", "gige"): host != HOST,
+        ("--token", "tcp", "http"): bool(token),
+        ("--display", "http"): bool(display),
+        ("--trigger", "tcp", "gige"): trigger,
+        ("--wait", "tcp", "gige"): wait,
+        ("--client-tracker", "tcp"): client_tracker,
+        ("--poses", "tcp"): poses,
     }
-    check_needed(needs_server, chosen, SERVERS)
-    needs_tcp = {"--trigger": trigger, "--client-tracker": client_tracker, "--wait": wait}
-    check_needed(needs_tcp | {"--poses": poses}, chosen, ("tcp",))
+    for (option, *servers), is_used in needs.items():
+        if is_used and not chosen.keys() & set(servers):
+            names = " or ".join(f"--{server}" for server in servers)
+            raise InputError(option, f"has no effect without {names}", f"with {names}")
     if poses and (trigger or client_tracker or display):
         raise InputError(
             "--poses", "no motion is simulated", "no --trigger, --client-tracker, --display"
@@ -181,10 +198,12 @@ def live(
         may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
-        opening = Opening(flown, stack, host, token or new_token(host), wait)
+        opening = Opening(flown, stack, host, token or new_token(host), [])
         try:
             for name, value in chosen.items():
                 OPENERS[name](opening, value)
+            while wait and not any(one.is_set() for one in opening.entered):
+                time.sleep(0.05)
             flown.run()
         except KeyboardInterrupt:
             print(file=sys.stderr)
@@ -200,14 +219,6 @@ def live(
             raise InputError(f"--{output.name}", output.fault)
 
 
-def check_needed(used: dict[str, bool], chosen: dict[str, Any], needs: Sequence[str]) -> None:
-    """Raise InputError for an option that is used without one of the outputs that it needs."""
-    if not chosen.keys() & set(needs):
-        for option in (option for option, is_used in used.items() if is_used):
-            names = " or ".join(f"--{name}" for name in needs)
-            raise InputError(option, f"has no effect without {names}", f"with {names}")
-
-
 def new_token(host: str) -> str:
     """A random token where other machines can connect, else none."""
     from skysim.apps.access import LOOPBACK
@@ -216,13 +227,23 @@ def new_token(host: str) -> str:
 
 
 class Opening(NamedTuple):
-    """What the outputs of a flight share: the flight, what closes them, and who may connect."""
+    """What the outputs of a flight share.
+
+    Attributes
+    ----------
+    live, stack
+        The flight, and what closes its outputs
+    host, token
+        Address to serve on, and the token of its clients
+    entered
+        Set when the first client of a server has begun, for each server that `--wait` waits for
+    """
 
     live: Live
     stack: ExitStack
     host: str
     token: str
-    waits: bool
+    entered: list[Event]
 
     def add(self, output: Output) -> None:
         """Send the flight's packets to an output, which the stack closes."""
@@ -314,7 +335,7 @@ def open_foxglove(opening: Opening, port: int) -> None:
 
 
 def open_tcp(opening: Opening, port: int) -> None:
-    """Serve the wire, and wait for its first client if wanted."""
+    """Serve the wire."""
     from skysim.apps.live.wire import WireServer
 
     live = opening.live
@@ -322,22 +343,31 @@ def open_tcp(opening: Opening, port: int) -> None:
     server = WireServer(opening.host, port, token, live.greeting, live.inbox, live.has_truth)
     opening.add(server)
     opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
-    while opening.waits and not server.entered.wait(0.1):
-        pass
+    opening.entered.append(server.entered)
 
 
-# By the option's name; the wire, which may wait for its client, comes last.
+def open_gige(opening: Opening, _: bool) -> None:
+    from skysim.apps.live.gige import GigeCamera
+
+    camera = GigeCamera(opening.live, opening.host)
+    opening.add(camera)
+    risk = "" if camera.is_local else ", no token: all that reach it can control it"
+    opening.say(f"gige {camera.host}:{camera.port}{risk}")
+    opening.entered.append(camera.entered)
+
+
+# By the option's name, in the order in which they are opened.
 OPENERS: dict[str, Callable[[Opening, Any], None]] = {
     "folder": open_folder,
     "pipe": open_pipe,
     "http": open_http,
     "display": open_display,
+    "gige": open_gige,
     "indi": open_indi,
     "mcap": open_mcap,
     "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
-SERVERS = ("tcp", "http")
 TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
 
 

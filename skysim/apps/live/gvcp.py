@@ -1,0 +1,231 @@
+"""GVCP, the control protocol of GigE Vision: datagrams that read and write a camera's registers.
+
+A command is key 0x42, flags (1: an answer is wanted), command, length of what follows, number; its answer is status,
+command + 1, length, number. All numbers are big-endian. Source: GigE Vision 1.2, whose registers and codes Aravis
+names in arvgvcpprivate.h.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Container, Mapping
+from enum import IntEnum
+from typing import Any
+
+from skysim.core.errors import InputError
+
+GVCP_PORT = 3956
+HEADER = struct.Struct(">BBHHH")
+ANSWER = struct.Struct(">HHHH")
+KEY = 0x42
+MOST_BYTES = 536  # of the memory in a datagram
+
+DISCOVERY = 0x0002
+FORCEIP = 0x0004
+PACKETRESEND = 0x0040
+READREG = 0x0080
+WRITEREG = 0x0082
+READMEM = 0x0084
+WRITEMEM = 0x0086
+SILENT = (FORCEIP, PACKETRESEND)  # have no answer; the address is that of the machine
+
+# Registers that the protocol itself needs.
+DISCOVERY_BYTES = 0xF8
+HEARTBEAT = 0x0938  # ms
+PRIVILEGE = 0x0A00
+EXCLUSIVE = 1
+CONTROL = 2
+
+Sender = tuple[str, int]
+
+
+class GvcpStatus(IntEnum):
+    """Status of an answer."""
+
+    SUCCESS = 0
+    NOT_IMPLEMENTED = 0x8001
+    INVALID_PARAMETER = 0x8002
+    INVALID_ADDRESS = 0x8003
+    WRITE_PROTECT = 0x8004
+    BAD_ALIGNMENT = 0x8005
+    ACCESS_DENIED = 0x8006
+    BUSY = 0x8007
+    INVALID_HEADER = 0x800E
+
+
+class RefusedError(Exception):
+    """A command that is answered with the status in its argument."""
+
+
+class ControlChannel:
+    """Registers, and the one application that may write them. A camera adds `refresh`, `resend` and `stop`.
+
+    Parameters
+    ----------
+    ranges
+        First addresses and ends of what can be read
+    allowed
+        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which its
+        effect checks
+    effects
+        What the writing of some of them does: effect(value). Raises InputError or RefusedError, and the register
+        keeps its value
+    """
+
+    def __init__(
+        self,
+        ranges: tuple[tuple[int, int], ...],
+        allowed: Mapping[int, Container[int] | None],
+        effects: dict[int, Callable[[Any], None]],
+    ) -> None:
+        self.ranges = ranges
+        self.allowed = allowed
+        self.effects = effects
+        self.memory = bytearray(ranges[-1][1])
+        self.controller: Sender | None = None
+        self.heard_s = 0.0
+        self.newest: tuple[Sender, bytes] | None = None
+        self.newest_answer: bytes | None = None
+
+    def refresh(self) -> None:
+        """Update the registers whose values change, before they are read."""
+
+    def resend(self, block: int, first: int, last: int) -> None:
+        """Send packets of a block again."""
+
+    def stop(self, _: int = 0) -> None:
+        """Send no more frames."""
+
+    # Memory
+
+    def check(self, address: int, size: int) -> None:
+        """Raise RefusedError for bytes that cannot be read."""
+        if not any(first <= address <= end - size for first, end in self.ranges):
+            raise RefusedError(GvcpStatus.INVALID_ADDRESS)
+
+    def put(self, address: int, value: float | bytes) -> None:
+        """Set a register: an int of 4 bytes, a float of 8, or bytes."""
+        if not isinstance(value, bytes):
+            value = struct.pack(">d" if isinstance(value, float) else ">I", value)
+        self.memory[address : address + len(value)] = value
+
+    def value(self, address: int) -> int:
+        """A register of 4 bytes."""
+        return int.from_bytes(self.memory[address : address + 4])
+
+    def read(self, address: int, size: int) -> bytes:
+        """Bytes at an address, up to date. Raises RefusedError."""
+        if address % 4 or size % 4:
+            raise RefusedError(GvcpStatus.BAD_ALIGNMENT)
+        if size > MOST_BYTES:
+            raise RefusedError(GvcpStatus.INVALID_PARAMETER)
+        self.check(address, size)
+        self.refresh()
+        return bytes(self.memory[address : address + size])
+
+    def write_register(self, sender: Sender, address: int, data: bytes) -> None:
+        """Write a register. Raises RefusedError, InputError, and struct.error for a wrong length."""
+        if address != PRIVILEGE and sender != self.controller:
+            raise RefusedError(GvcpStatus.ACCESS_DENIED)
+        self.check(address, len(data))
+        if address not in self.allowed:
+            raise RefusedError(GvcpStatus.WRITE_PROTECT)
+        allowed = self.allowed[address]
+        (value,) = struct.unpack(">d" if allowed is None else ">I", data)
+        if allowed is not None and value not in allowed:
+            raise RefusedError(GvcpStatus.INVALID_PARAMETER)
+        if address == PRIVILEGE:
+            self.set_privilege(sender, value)
+        if address in self.effects:
+            self.effects[address](value)
+        self.put(address, value)
+
+    # Privilege
+
+    def set_privilege(self, sender: Sender, value: int) -> None:
+        """Give the control to an application, or take it back from it."""
+        if self.controller not in (None, sender):
+            raise RefusedError(GvcpStatus.ACCESS_DENIED)
+        self.controller = sender
+        if not value:
+            self.release()
+
+    def release(self) -> None:
+        """Take the control from its application, and stop."""
+        self.controller = None
+        self.put(PRIVILEGE, 0)
+        self.stop()
+
+    def check_heartbeat(self, now_s: float) -> None:
+        """Take the control from an application that was not heard for the heartbeat's timeout."""
+        if self.controller and now_s - self.heard_s > 1e-3 * self.value(HEARTBEAT):
+            self.release()
+
+    # Datagrams
+
+    def answer(self, datagram: bytes, sender: Sender, now_s: float) -> bytes | None:
+        """Carry out a command; return the answer, or None for a datagram that has none.
+
+        A datagram that comes twice in succession is a client's second try: it gets the first answer once more, and a
+        trigger in it is not taken twice.
+
+        Parameters
+        ----------
+        sender
+            Address and port of the client
+        now_s
+            Monotonic time
+        """
+        if (sender, datagram) != self.newest:
+            self.newest_answer = self.first_answer(datagram, sender)
+            self.newest = (sender, datagram)
+        if sender == self.controller:
+            self.heard_s = now_s
+        return self.newest_answer
+
+    def first_answer(self, datagram: bytes, sender: Sender) -> bytes | None:
+        """Carry out a command that is no second try; return as `answer` does."""
+        if len(datagram) < HEADER.size or datagram[0] != KEY:
+            return None
+        _, flags, command, length, number = HEADER.unpack_from(datagram)
+        status = GvcpStatus.SUCCESS
+        data = b""
+        try:
+            data = self.execute(command, datagram[HEADER.size :], length, sender)
+        except RefusedError as error:
+            status = error.args[0]
+        except InputError:
+            status = GvcpStatus.INVALID_PARAMETER
+        except struct.error:
+            status = GvcpStatus.INVALID_HEADER
+        if not flags & 1 or command in SILENT:
+            return None
+        return ANSWER.pack(status, (command + 1) & 0xFFFF, len(data), number) + data
+
+    def execute(self, command: int, payload: bytes, length: int, sender: Sender) -> bytes:
+        """Carry out a command; return the answer's data. Raises as `write_register` does."""
+        if len(payload) != length:
+            raise RefusedError(GvcpStatus.INVALID_HEADER)
+        if command == DISCOVERY:
+            return self.read(0, DISCOVERY_BYTES)
+        if command == PACKETRESEND:
+            _, block, first, last = struct.unpack(">HHII", payload)
+            self.resend(block, first & 0xFFFFFF, last & 0xFFFFFF)
+            return b""
+        if self.controller != sender and self.value(PRIVILEGE) & EXCLUSIVE:
+            raise RefusedError(GvcpStatus.ACCESS_DENIED)
+        if command == READREG:
+            addresses = struct.iter_unpack(">I", payload[:MOST_BYTES])
+            return b"".join(self.read(address, 4) for (address,) in addresses)
+        if command == READMEM:
+            address, size = struct.unpack(">II", payload)
+            return payload[:4] + self.read(address, size)
+        if command == WRITEREG:
+            for address, data in struct.iter_unpack(">I4s", payload):
+                self.write_register(sender, address, data)
+            return struct.pack(">I", len(payload) // 8)
+        if command == WRITEMEM:
+            (address,) = struct.unpack_from(">I", payload)
+            self.write_register(sender, address, payload[4:])
+            return struct.pack(">I", len(payload) - 4)
+        raise RefusedError(GvcpStatus.NOT_IMPLEMENTED)
