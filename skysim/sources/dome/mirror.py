@@ -27,7 +27,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 from scipy.spatial.distance import cdist
 
 from skysim.core.types import Bools, Floats, Ints, Sources, normalized
@@ -151,15 +150,17 @@ def nearest_rays(
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
     between = np.sum(grid[1:] * grid[:-1], axis=2)
     spacing_rad = float(np.arccos(np.clip(between, -1, 1)).max())
-    # (N, K) cosine of each LED's angle from each reflected ray; NaN, a ray without a wall, is no maximum.
+    # (N, h, w) cosine of each LED's angle from each reflected ray; NaN, a ray without a wall, is no maximum.
     along_m = led_m @ rays.along.T - np.sum(rays.wall_m * rays.along, axis=1)
-    distance_m = cdist(led_m, rays.wall_m)
-    cosine = np.nan_to_num(along_m / np.maximum(distance_m, 1e-300), nan=-1.0)
+    distance_m = np.maximum(cdist(led_m, rays.wall_m), 1e-300)
+    cosine = np.nan_to_num(along_m / distance_m, nan=-1.0).reshape(-1, *grid.shape[:2])
     # Maxima among a ray and its eight neighbors.
-    around = maximum_filter(cosine.reshape(-1, *grid.shape[:2]), size=(1, 3, 3))
-    largest = cosine == around.reshape(cosine.shape)
-    led, ray = np.nonzero(largest & (cosine >= np.cos(min(REACH * spacing_rad, np.pi))))
-    return led, ray
+    around = np.pad(cosine, ((0, 0), (1, 1), (1, 1)), constant_values=-1.0)
+    around = np.maximum.reduce([around[:, :-2], around[:, 1:-1], around[:, 2:]])
+    around = np.maximum.reduce([around[..., :-2], around[..., 1:-1], around[..., 2:]])
+    limit = np.cos(min(REACH * spacing_rad, np.pi))
+    led, row, column = np.nonzero((cosine >= around) & (cosine >= limit))
+    return led, row * grid.shape[1] + column
 
 
 def linearized(
