@@ -74,27 +74,16 @@ def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     axis
         (n,) evenly spaced coordinates of the lattice in both directions, in units of the disc's radius
     """
-    sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
-    _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
+    step = axis[1] - axis[0]
+    slope = sin(surface.phase_rad), cos(surface.phase_rad)
+    sunlit, earthlit = np.vectorize(cell_light)(
+        surface.law, *slope, axis, axis[:, None], step, inner_radius2(step)
+    )
     light = sunlit / max(float(sunlit.sum()), 1e-300)
     if surface.earthshine:
         light += earthlit * (surface.earthshine / float(earthlit.sum()))
         light /= 1 + surface.earthshine
     return light
-
-
-@jit
-def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
-    """Write the light of each point's cell, lit from the Sun and from the observer."""
-    sine = sin(phase_rad)
-    cosine = cos(phase_rad)
-    step = axis[1] - axis[0]
-    inner = inner_radius2(step)
-    for j in range(len(axis)):
-        for i in range(len(axis)):
-            sunlit[j, i], earthlit[j, i] = cell_light(
-                law, sine, cosine, axis[i], axis[j], step, inner
-            )
 
 
 @jit

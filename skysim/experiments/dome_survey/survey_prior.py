@@ -227,8 +227,8 @@ def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
     focal_sigma_m = scene.camera.focal_length_m * uncertainty.focal_error
-    return with_onboard_model(
-        scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_m, None
+    return with_map(
+        scene, None, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_m
     )
 
 
@@ -237,19 +237,14 @@ def as_listed(scene: Scene) -> Scene:
     return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
 
 
-def with_map(scene: Scene, path: str) -> Scene:
-    """The scene whose tracker uses the map file of a surveyed dome, and no other onboard errors."""
-    return with_onboard_model(scene, 0.0, 0.0, 0.0, path)
-
-
-def with_onboard_model(
+def with_map(
     scene: Scene,
-    led_sigma_m: float,
-    lever_sigma_m: float,
-    focal_sigma_m: float,
     path: str | None,
+    led_sigma_m: float = 0.0,
+    lever_sigma_m: float = 0.0,
+    focal_sigma_m: float = 0.0,
 ) -> Scene:
-    """The scene whose tracker has survey errors of this size, or this map file."""
+    """The scene whose tracker uses the map file of a surveyed dome, if any, and has these onboard errors alone."""
     scene = with_config(
         scene,
         "tracker.survey",
