@@ -60,7 +60,10 @@ FIT = (
     "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
     " {led_sigma_mm_median:.2g} mm, worst {led_sigma_mm_worst:.2g} mm."
 )
-SEEN = "{measured} of {leds} LEDs measured, {seen_once} seen once, {unseen} not seen; hold these {stops} attitudes next:"
+SEEN = (
+    "{measured} of {leds} LEDs measured, {seen_once} seen once, {unseen} not seen; hold these {stops} attitudes"
+    " next:"
+)
 TRUE_ERROR = (
     "True error of the LEDs: {led_mm_before:.2g} mm rms before, {led_mm_after:.2g} mm after (predicted {predicted} mm);"
     " {renamed} with another identity."
