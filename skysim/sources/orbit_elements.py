@@ -23,12 +23,11 @@ from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_
 from skysim.core.errors import InputError, Where
 from skysim.core.text import (
     TextSegment,
-    check_version,
     excerpt,
-    keyword_value,
     one_of,
     read_lines,
     seconds_since,
+    split_segments,
     to_numbers,
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
@@ -245,7 +244,9 @@ FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
 # Adjoining segments may share a sample; its positions then differ by less than this
 SAME_M = 1.0
-KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
+# Lines that begin or end a part, which may come after each other in any order from the first META_START on.
+PARTS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
+AFTER = {**dict.fromkeys(PARTS, PARTS), "META_START": ("", *PARTS)}
 
 
 class OemOrbit(NamedTuple):
@@ -292,7 +293,8 @@ def read_oem(path: str, start: datetime.datetime) -> OemOrbit:
         For a file that is not an OEM, or whose epochs are not in order.
     """
     # 1.
-    segments = split_segments(path)
+    lines = read_lines(Path(path))
+    _, segments = split_segments(path, lines, VERSION, VERSIONS, AFTER, "META_STOP")
     if not segments:
         raise InputError(
             path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers"
@@ -327,34 +329,6 @@ def gravity_m_s2(position_m: Floats) -> Floats:
     polar = 5 * (position_m[:, 2:] / r) ** 2
     factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
     return -EARTH_MU_M3_S2 / r**3 * position_m * factors
-
-
-def split_segments(path: str) -> list[TextSegment]:
-    """The segments of an OEM file. Raises InputError for a line out of place."""
-    version = ""
-    segments = []
-    section = ""
-    for n, line in read_lines(Path(path)):
-        word = line.split(maxsplit=1)[0]
-        if word == "COMMENT":
-            continue
-        if word in KEYWORDS:
-            section = word
-            if word == "META_START":
-                segments.append(TextSegment({}, []))
-            elif not segments:
-                raise Where(path, n).error(f"{word} before META_START")
-        # Keywords stand in the header and in the metadata; data follow META_STOP.
-        elif section in ("", "META_START"):
-            key, value = keyword_value(path, n, line)
-            if section:
-                segments[-1].metadata[key] = (n, value)
-            elif key == VERSION:
-                version = value
-        elif section == "META_STOP":
-            segments[-1].data.append((n, line.split()))
-    check_version(path, VERSION, version, VERSIONS)
-    return segments
 
 
 def segment_samples(
