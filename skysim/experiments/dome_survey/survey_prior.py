@@ -1,6 +1,5 @@
 """The model that is assumed before a survey of the dome, and its uncertainty."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -168,7 +167,7 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     """The prior with these LEDs, their nominal brightness and code, and the tracker's assumed lever."""
     scene = lab.scene
     design = design_of(lab)
-    levels = design.strength[rows_of(leds.id, design.id)]
+    levels = design.strength[onboard_model.rows_of(leds.id, design.id)]
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = (
@@ -181,12 +180,6 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     return CalibrationPrior(
         camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
     )
-
-
-def rows_of(numbers: Sequence[int] | Ints, ids: Ints) -> Ints:
-    """Rows of LEDs by their numbers."""
-    order = np.argsort(ids)
-    return order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))]
 
 
 def design_of(lab: Lab) -> Sources:

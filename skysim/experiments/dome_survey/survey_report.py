@@ -6,9 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -28,7 +26,7 @@ from skysim.experiments.dome_survey.survey_findings import (
     residuals_px,
 )
 from skysim.experiments.dome_survey.survey_images import SOLVED
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -47,6 +45,7 @@ from skysim.results.report_blocks import (
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
+from skysim.tracking.onboard_model import rows_of
 
 CELLS = 8  # number of cells across the chip in which residuals are averaged
 BINS = 60
@@ -347,8 +346,8 @@ def survey_figure(
     further: Rotation,
     errors: LedErrors | None,
     run: SurveyRun,
-) -> NDArray[np.uint8]:
-    """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
+) -> bytes:
+    """PNG image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
     row = np.flatnonzero(run.survey.surveyed)
     found_m = run.survey.leds.position_m[row]
     panels = [("found minus list", found_m, found_m - run.listed.position_m[row])]
@@ -364,8 +363,7 @@ def survey_figure(
         for axes, panel in zip(rest, panels, strict=True):
             draw_errors(axes, *panel)
 
-    drawn = np.frombuffer(png(draw, (7 * (1 + len(panels)), 6.5)), np.uint8)
-    return np.asarray(cv2.imdecode(drawn, cv2.IMREAD_COLOR), np.uint8)
+    return png(draw, (7 * (1 + len(panels)), 6.5))
 
 
 def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
