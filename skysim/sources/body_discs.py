@@ -179,7 +179,7 @@ def lattice_light(
     """Map a disc's light on a square lattice of points, [y, x]; the disc must not reach the lattice's edge.
 
     1. Sample the brightness at `subsamples` places per point in both directions (`cell_light`).
-    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_light_columns`).
+    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_add_columns`).
     3. Scale to unit sum of what the disc emits, hidden or not: sunlight 1 / (1 + e) and earthshine e / (1 + e).
 
     Parameters
@@ -203,14 +203,11 @@ def lattice_light(
         abs(float(np.linalg.det(radius_from_px)))
     )
     matrix = np.ascontiguousarray(radius_from_px)
-    has_earthshine = surface.earthshine > 0
-    sunlit = np.empty((fine, count))
-    earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
+    rows = np.empty((2 if surface.earthshine else 1, fine, count))
     totals = np.empty((fine, 2))
     # 1. and 2. Sunlight and earthshine apart: each is scaled by its own sum.
     _light_rows(
-        sunlit,
-        earthlit,
+        rows,
         totals,
         surface.law,
         surface.phase_rad,
@@ -220,15 +217,12 @@ def lattice_light(
         weights,
         shown,
     )
-    of_sun, of_earth = totals.sum(axis=0)
     # 3. The sum may be 0 for a vanishing crescent.
-    light = np.empty((count, count))
-    of_all = 1 + surface.earthshine
-    _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
-    if has_earthshine:
-        _light_columns(
-            light, earthlit, weights, surface.earthshine / (of_all * of_earth), True
-        )
+    light = np.zeros((count, count))
+    of_all = (1 + surface.earthshine) * np.maximum(totals.sum(axis=0), 1e-300)
+    scales = np.array([1.0, surface.earthshine]) / of_all
+    for one, scale in zip(rows, scales, strict=False):
+        _add_columns(light, one, weights, scale)
     return light
 
 
@@ -254,8 +248,7 @@ def sharing_weights(subsamples: int) -> Floats:
 
 @jit(parallel=True)
 def _light_rows(
-    sunlit: Any,
-    earthlit: Any,
+    rows: Any,
     totals: Any,
     law: int,
     phase_rad: float,
@@ -269,17 +262,16 @@ def _light_rows(
 
     Parameters
     ----------
-    sunlit, earthlit
-        (fine, count) receive the light from the Sun and from the observer's side (earthshine); `earthlit` may be empty
+    rows
+        (1 or 2, fine, count) receive the light from the Sun and, if two, from the observer's side (earthshine)
     totals
         (fine, 2) receive the sums of each row, hidden light included
     """
-    count = sunlit.shape[1]
+    count = rows.shape[2]
     subsamples = len(weights)
     sine = sin(phase_rad)
     cosine = cos(phase_rad)
     inner = inner_radius2(step)
-    with_earth = len(earthlit) > 0
     masked = len(shown) > 0
     for j in numba.prange(len(axis_px)):
         # The margin spares tests for the ends of the row.
@@ -299,9 +291,8 @@ def _light_rows(
                 own[1, m, k + REACH] = part * from_earth
         totals[j, 0] = of_sun
         totals[j, 1] = of_earth
-        _share(sunlit[j], own[0], weights)
-        if with_earth:
-            _share(earthlit[j], own[1], weights)
+        for n in range(len(rows)):
+            _share(rows[n, j], own[n], weights)
 
 
 @jit
@@ -317,16 +308,11 @@ def _share(points: Any, samples: Floats, weights: Floats) -> None:
 
 
 @jit(parallel=True)
-def _light_columns(
-    light: Any, rows: Floats, weights: Floats, scale: float, add: bool
-) -> None:
-    """Share rows of samples among the lattice's rows, scaled; replaces `light` or adds to it."""
+def _add_columns(light: Any, rows: Floats, weights: Floats, scale: float) -> None:
+    """Share rows of samples among the lattice's rows, scaled, and add them to `light`."""
     count = light.shape[1]
     subsamples = len(weights)
     for k in numba.prange(count):
-        if not add:
-            for i in range(count):
-                light[k, i] = 0.0
         # Only rows of the lattice that exist: no margin here.
         for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
             for m in range(subsamples):
