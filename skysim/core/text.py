@@ -6,7 +6,7 @@ Errors name the line of the fault.
 import datetime
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -205,12 +205,58 @@ def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
     return key, value
 
 
-def check_version(
-    path: str | Path, keyword: str, version: str, allowed: Sequence[str]
-) -> None:
-    """Raise InputError for a version of the message that is not supported."""
-    if version not in allowed:
-        raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(allowed))
+def split_segments(
+    path: str | Path,
+    lines: Iterable[Line],
+    keyword: str,
+    versions: Sequence[str],
+    after: Mapping[str, Sequence[str]],
+    data: str,
+) -> tuple[str, list[TextSegment]]:
+    """The version and the segments of a CCSDS message; lines of covariances are not used.
+
+    Parameters
+    ----------
+    keyword, versions
+        Keyword of the version, and the versions that are supported
+    after
+        Lines that begin or end a part, and those after which each may come; the header has none
+    data
+        The line after which data follow
+
+    Raises
+    ------
+    InputError
+        For a line out of place, and another version.
+    """
+    version = section = ""
+    segments = []
+    for n, line in lines:
+        if line.split(maxsplit=1)[0] == "COMMENT":
+            continue
+        # A line that begins or ends a part, a data line, or KEYWORD = value of the header or the metadata.
+        if line in after:
+            if section not in after[line]:
+                place = f"after {section}" if section else "before META_START"
+                raise Where(path, n).error(f"{line} {place}")
+            section = line
+            if line == "META_START":
+                segments.append(TextSegment({}, []))
+        elif section == data:
+            segments[-1].data.append((n, line.split()))
+        elif section in ("", "META_START"):
+            key, value = keyword_value(path, n, line)
+            if section:
+                segments[-1].metadata[key] = (n, value)
+            elif key == keyword:
+                version = value
+        elif not section.startswith("COVARIANCE"):
+            raise Where(path, n).error(
+                f"{excerpt(line)} after {section}", "DATA_START or META_START"
+            )
+    if version not in versions:
+        raise InputError(path, f"{keyword} is {excerpt(version)}", ", ".join(versions))
+    return version, segments
 
 
 def one_of(path: str | Path, metadata: Metadata, key: str, allowed: Iterable[str]) -> str:

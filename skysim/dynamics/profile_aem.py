@@ -32,11 +32,10 @@ from skysim.core.text import (
     Line,
     Metadata,
     TextSegment,
-    check_version,
     excerpt,
-    keyword_value,
     one_of,
     seconds_since,
+    split_segments,
     to_numbers,
 )
 from skysim.core.time import SCALES
@@ -88,7 +87,10 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
     """The samples of all segments. Raises InputError for a file that is not an AEM."""
     if lines[0][1].startswith("<"):
         lines = from_xml(path, lines)
-    version, segments = split_segments(path, lines)
+    version, segments = split_segments(path, lines, VERSION, VERSIONS, AFTER, "DATA_START")
+    last = next((line for _, line in reversed(lines) if line in AFTER), "DATA_STOP")
+    if last != "DATA_STOP":
+        raise InputError(path, f"ends within a segment, after {last}: the file is cut off")
     if not segments:
         raise InputError(
             path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP"
@@ -140,39 +142,6 @@ def from_xml(path: Path, lines: list[Line]) -> list[Line]:
             elif section == "META":
                 out.append((n, f"{tag} = {(element.text or '').strip()}"))
     return out
-
-
-def split_segments(path: Path, lines: list[Line]) -> tuple[str, list[TextSegment]]:
-    """The version and the segments of the message. Raises InputError for a line out of place."""
-    version = ""
-    segments = []
-    section = ""
-    for n, line in lines:
-        if line.split(maxsplit=1)[0] == "COMMENT":
-            continue
-        # A keyword that begins or ends a part, a data line, or KEYWORD = value of the header or the metadata.
-        if line in AFTER:
-            if section not in AFTER[line]:
-                raise Where(path, n).error(f"{line} after {section or 'the header'}")
-            section = line
-            if line == "META_START":
-                segments.append(TextSegment({}, []))
-        elif section == "DATA_START":
-            segments[-1].data.append((n, line.split()))
-        elif section in ("", "META_START"):
-            key, value = keyword_value(path, n, line)
-            if section:
-                segments[-1].metadata[key] = (n, value)
-            elif key == VERSION:
-                version = value
-        else:
-            raise Where(path, n).error(
-                f"{excerpt(line)} after {section}", "DATA_START or META_START"
-            )
-    check_version(path, VERSION, version, VERSIONS)
-    if section not in ("", "DATA_STOP"):
-        raise InputError(path, f"ends within a segment, after {section}: the file is cut off")
-    return version, segments
 
 
 def segment_samples(

@@ -74,27 +74,16 @@ def light_map(surface: DiscSurface, axis: Floats) -> Floats:
     axis
         (n,) evenly spaced coordinates of the lattice in both directions, in units of the disc's radius
     """
-    sunlit, earthlit = np.zeros((2, len(axis), len(axis)))
-    _fill(sunlit, earthlit, surface.law, surface.phase_rad, axis)
+    step = axis[1] - axis[0]
+    slope = sin(surface.phase_rad), cos(surface.phase_rad)
+    sunlit, earthlit = np.vectorize(cell_light)(
+        surface.law, *slope, axis, axis[:, None], step, inner_radius2(step)
+    )
     light = sunlit / max(float(sunlit.sum()), 1e-300)
     if surface.earthshine:
         light += earthlit * (surface.earthshine / float(earthlit.sum()))
         light /= 1 + surface.earthshine
     return light
-
-
-@jit
-def _fill(sunlit: Any, earthlit: Any, law: int, phase_rad: float, axis: Floats) -> None:
-    """Write the light of each point's cell, lit from the Sun and from the observer."""
-    sine = sin(phase_rad)
-    cosine = cos(phase_rad)
-    step = axis[1] - axis[0]
-    inner = inner_radius2(step)
-    for j in range(len(axis)):
-        for i in range(len(axis)):
-            sunlit[j, i], earthlit[j, i] = cell_light(
-                law, sine, cosine, axis[i], axis[j], step, inner
-            )
 
 
 @jit
@@ -190,7 +179,7 @@ def lattice_light(
     """Map a disc's light on a square lattice of points, [y, x]; the disc must not reach the lattice's edge.
 
     1. Sample the brightness at `subsamples` places per point in both directions (`cell_light`).
-    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_light_columns`).
+    2. Share each sample's light among the columns (`_light_rows`), then among the rows (`_add_columns`).
     3. Scale to unit sum of what the disc emits, hidden or not: sunlight 1 / (1 + e) and earthshine e / (1 + e).
 
     Parameters
@@ -214,14 +203,11 @@ def lattice_light(
         abs(float(np.linalg.det(radius_from_px)))
     )
     matrix = np.ascontiguousarray(radius_from_px)
-    has_earthshine = surface.earthshine > 0
-    sunlit = np.empty((fine, count))
-    earthlit = np.empty((fine, count) if has_earthshine else (0, 0))
+    rows = np.empty((2 if surface.earthshine else 1, fine, count))
     totals = np.empty((fine, 2))
     # 1. and 2. Sunlight and earthshine apart: each is scaled by its own sum.
     _light_rows(
-        sunlit,
-        earthlit,
+        rows,
         totals,
         surface.law,
         surface.phase_rad,
@@ -231,15 +217,12 @@ def lattice_light(
         weights,
         shown,
     )
-    of_sun, of_earth = totals.sum(axis=0)
     # 3. The sum may be 0 for a vanishing crescent.
-    light = np.empty((count, count))
-    of_all = 1 + surface.earthshine
-    _light_columns(light, sunlit, weights, 1 / (of_all * max(of_sun, 1e-300)), False)
-    if has_earthshine:
-        _light_columns(
-            light, earthlit, weights, surface.earthshine / (of_all * of_earth), True
-        )
+    light = np.zeros((count, count))
+    of_all = (1 + surface.earthshine) * np.maximum(totals.sum(axis=0), 1e-300)
+    scales = np.array([1.0, surface.earthshine]) / of_all
+    for one, scale in zip(rows, scales, strict=False):
+        _add_columns(light, one, weights, scale)
     return light
 
 
@@ -265,8 +248,7 @@ def sharing_weights(subsamples: int) -> Floats:
 
 @jit(parallel=True)
 def _light_rows(
-    sunlit: Any,
-    earthlit: Any,
+    rows: Any,
     totals: Any,
     law: int,
     phase_rad: float,
@@ -280,17 +262,16 @@ def _light_rows(
 
     Parameters
     ----------
-    sunlit, earthlit
-        (fine, count) receive the light from the Sun and from the observer's side (earthshine); `earthlit` may be empty
+    rows
+        (1 or 2, fine, count) receive the light from the Sun and, if two, from the observer's side (earthshine)
     totals
         (fine, 2) receive the sums of each row, hidden light included
     """
-    count = sunlit.shape[1]
+    count = rows.shape[2]
     subsamples = len(weights)
     sine = sin(phase_rad)
     cosine = cos(phase_rad)
     inner = inner_radius2(step)
-    with_earth = len(earthlit) > 0
     masked = len(shown) > 0
     for j in numba.prange(len(axis_px)):
         # The margin spares tests for the ends of the row.
@@ -310,9 +291,8 @@ def _light_rows(
                 own[1, m, k + REACH] = part * from_earth
         totals[j, 0] = of_sun
         totals[j, 1] = of_earth
-        _share(sunlit[j], own[0], weights)
-        if with_earth:
-            _share(earthlit[j], own[1], weights)
+        for n in range(len(rows)):
+            _share(rows[n, j], own[n], weights)
 
 
 @jit
@@ -328,16 +308,11 @@ def _share(points: Any, samples: Floats, weights: Floats) -> None:
 
 
 @jit(parallel=True)
-def _light_columns(
-    light: Any, rows: Floats, weights: Floats, scale: float, add: bool
-) -> None:
-    """Share rows of samples among the lattice's rows, scaled; replaces `light` or adds to it."""
+def _add_columns(light: Any, rows: Floats, weights: Floats, scale: float) -> None:
+    """Share rows of samples among the lattice's rows, scaled, and add them to `light`."""
     count = light.shape[1]
     subsamples = len(weights)
     for k in numba.prange(count):
-        if not add:
-            for i in range(count):
-                light[k, i] = 0.0
         # Only rows of the lattice that exist: no margin here.
         for d in range(max(k + REACH - count + 1, 0), min(2 * REACH, k + REACH) + 1):
             for m in range(subsamples):

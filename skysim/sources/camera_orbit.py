@@ -99,9 +99,9 @@ class CircularOrbit:
 
 @dataclass(frozen=True, slots=True)
 class TleOrbit:
-    """An orbit by SGP4."""
+    """The orbit of a satellite by SGP4."""
 
-    elements: MeanElements
+    satellite: MeanElements
     start: datetime.datetime
 
     def states(self, after_s: Floats) -> GcrsState:
@@ -114,7 +114,7 @@ class TleOrbit:
             middle_s = float(after_s[rows].mean())
             time = self.start + datetime.timedelta(seconds=middle_s)
             place, velocity, errors = gcrs_states(
-                self.elements, time, after_s[rows] - middle_s
+                [self.satellite], time, after_s[rows] - middle_s
             )
             if errors.any():
                 raise InputError(
@@ -136,19 +136,16 @@ def tle(config: TleOrbitConfig, start: datetime.datetime) -> TleOrbit:
         For a file without the satellite, or with several if no number is given.
     """
     elements = read_elements(config.file)
-    rows = [n for n, number in enumerate(elements.numbers) if config.number in (None, number)]
-    if len(rows) != 1:
-        listed = ", ".join(map(str, elements.numbers[:5])) + ", ..." * (
-            len(elements.numbers) > 5
-        )
+    chosen = [one for one in elements if config.number in (None, one.number)]
+    if len(chosen) != 1:
+        listed = ", ".join(f"{one.number}" for one in elements[:5])
         raise InputError(
             "orbit.number",
-            f"{config.number}: {len(rows)} satellites of {config.file}",
-            f"one of {listed}",
+            f"{config.number}: {len(chosen)} satellites of {config.file}",
+            f"one of {listed}{', ...' * (len(elements) > 5)}",
         )
-    chosen = elements.take(rows)
     check_epochs(config.file, chosen, start)
-    return TleOrbit(chosen, start)
+    return TleOrbit(chosen[0], start)
 
 
 ORBITS: dict[str, Callable[[Any, datetime.datetime], CameraOrbit]] = {

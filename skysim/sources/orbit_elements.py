@@ -10,7 +10,7 @@ import datetime
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,12 +23,11 @@ from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_
 from skysim.core.errors import InputError, Where
 from skysim.core.text import (
     TextSegment,
-    check_version,
     excerpt,
-    keyword_value,
     one_of,
     read_lines,
     seconds_since,
+    split_segments,
     to_numbers,
 )
 from skysim.core.time import J2000_JD, SCALES, tt_jd, ut1_jd, utc_days
@@ -64,21 +63,19 @@ TLE_LENGTHS = 68, 69  # without and with the checksum
 
 
 class MeanElements(NamedTuple):
-    """Mean elements of N satellites: their catalog numbers, names, and SGP4's records."""
+    """Mean elements of a satellite: its catalog number, its name, and SGP4's record."""
 
-    numbers: tuple[int, ...]
-    names: tuple[str, ...]
-    records: tuple[Any, ...]
-
-    def take(self, which: Iterable[int]) -> "MeanElements":
-        """The elements of the chosen satellites."""
-        rows = list(which)
-        return MeanElements(*(tuple(column[n] for n in rows) for column in self))  # type: ignore[arg-type]
+    number: int
+    name: str
+    record: Any
 
 
-def check_epochs(path: str, elements: MeanElements, time: datetime.datetime) -> None:
+def check_epochs(
+    path: str, elements: Sequence[MeanElements], time: datetime.datetime
+) -> None:
     """Raise InputError if all elements are of an epoch too far from a time for places by SGP4."""
-    epoch_days = [one.jdsatepoch - J2000_JD + one.jdsatepochF for one in elements.records]
+    records = [one.record for one in elements]
+    epoch_days = [one.jdsatepoch - J2000_JD + one.jdsatepochF for one in records]
     nearest = min((utc_days(time) - one for one in epoch_days), key=abs)
     if abs(nearest) > MAX_AGE_DAYS:
         raise InputError(
@@ -88,7 +85,7 @@ def check_epochs(path: str, elements: MeanElements, time: datetime.datetime) -> 
         )
 
 
-def read_elements(path: str) -> MeanElements:
+def read_elements(path: str) -> list[MeanElements]:
     """The satellites of a file: TLE, or OMM as CSV, XML or JSON, recognized by its content.
 
     Raises
@@ -108,11 +105,11 @@ def read_elements(path: str) -> MeanElements:
         satellites = list(read_tle(path, lines))
     if not 0 < len(satellites) <= MAX_SATELLITES:
         raise InputError(path, f"{len(satellites)} satellites", f"1 to {MAX_SATELLITES}")
-    return MeanElements(*map(tuple, zip(*satellites, strict=True)))
+    return satellites
 
 
-def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[tuple[int, str, Any]]:
-    """Yield number, name and record of each pair of lines; a line with the name may precede it. Raises InputError."""
+def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[MeanElements]:
+    """Yield the elements of each pair of lines; a line with the name may precede it. Raises InputError."""
     # sgp4 is imported where it is used: few scenes have satellites.
     from sgp4.api import Satrec
 
@@ -165,8 +162,8 @@ def messages(path: str, text: str) -> Iterator[Mapping[str, Any]]:
         raise InputError(path, f"not an OMM: {excerpt(error)}") from None
 
 
-def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, Any]:
-    """Number, name and record of the n-th message of an OMM file. Raises InputError."""
+def satellite(path: str, n: int, fields: Mapping[str, Any]) -> MeanElements:
+    """The elements of the n-th message of an OMM file. Raises InputError."""
     from sgp4 import omm
     from sgp4.api import Satrec
 
@@ -189,19 +186,19 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> tuple[int, str, A
     return usable(path, n, texts.get("OBJECT_NAME", ""), record)
 
 
-def usable(path: str, n: int, name: str, record: Any) -> tuple[int, str, Any]:
-    """Number, name and record of a satellite. Raises InputError for elements that SGP4 refuses at their own epoch."""
+def usable(path: str, n: int, name: str, record: Any) -> MeanElements:
+    """The elements of a satellite. Raises InputError for elements that SGP4 refuses at their own epoch."""
     from sgp4.api import SGP4_ERRORS
 
     error, place_km, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
     if error or not np.isfinite(place_km).all():
         what = SGP4_ERRORS.get(error, "elements that are not numbers")
         raise Where(path, n, "satellite").error(f"SGP4 refuses these elements: {what}")
-    return int(record.satnum), name or str(record.satnum), record
+    return MeanElements(int(record.satnum), name or str(record.satnum), record)
 
 
 def gcrs_states(
-    elements: MeanElements, time: datetime.datetime, after_s: Floats
+    elements: Sequence[MeanElements], time: datetime.datetime, after_s: Floats
 ) -> tuple[Floats, Floats, Ints]:
     """States of N satellites at K times after a time, by SGP4.
 
@@ -216,7 +213,7 @@ def gcrs_states(
 
     # Dates are in two numbers: in one with the Julian date a satellite would be off by 0.3 m.
     days = utc_days(time) + np.asarray(after_s, float) / DAY_S
-    errors, place_km, velocity_km_s = SatrecArray(list(elements.records)).sgp4(
+    errors, place_km, velocity_km_s = SatrecArray([one.record for one in elements]).sgp4(
         np.full(len(days), J2000_JD), days
     )
     matrix = gcrs_from_teme(time)
@@ -247,7 +244,9 @@ FRAMES = ("ICRF", "GCRF", "EME2000", "J2000")
 OEM_REQUIRED = ("CENTER_NAME", "REF_FRAME", "TIME_SYSTEM")
 # Adjoining segments may share a sample; its positions then differ by less than this
 SAME_M = 1.0
-KEYWORDS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
+# Lines that begin or end a part, which may come after each other in any order from the first META_START on.
+PARTS = ("META_START", "META_STOP", "COVARIANCE_START", "COVARIANCE_STOP")
+AFTER = {**dict.fromkeys(PARTS, PARTS), "META_START": ("", *PARTS)}
 
 
 class OemOrbit(NamedTuple):
@@ -294,7 +293,8 @@ def read_oem(path: str, start: datetime.datetime) -> OemOrbit:
         For a file that is not an OEM, or whose epochs are not in order.
     """
     # 1.
-    segments = split_segments(path)
+    lines = read_lines(Path(path))
+    _, segments = split_segments(path, lines, VERSION, VERSIONS, AFTER, "META_STOP")
     if not segments:
         raise InputError(
             path, "no segment", "META_START ... META_STOP, then lines of an epoch and numbers"
@@ -329,34 +329,6 @@ def gravity_m_s2(position_m: Floats) -> Floats:
     polar = 5 * (position_m[:, 2:] / r) ** 2
     factors = 1 + flattened * (np.array([1.0, 1.0, 3.0]) - polar)
     return -EARTH_MU_M3_S2 / r**3 * position_m * factors
-
-
-def split_segments(path: str) -> list[TextSegment]:
-    """The segments of an OEM file. Raises InputError for a line out of place."""
-    version = ""
-    segments = []
-    section = ""
-    for n, line in read_lines(Path(path)):
-        word = line.split(maxsplit=1)[0]
-        if word == "COMMENT":
-            continue
-        if word in KEYWORDS:
-            section = word
-            if word == "META_START":
-                segments.append(TextSegment({}, []))
-            elif not segments:
-                raise Where(path, n).error(f"{word} before META_START")
-        # Keywords stand in the header and in the metadata; data follow META_STOP.
-        elif section in ("", "META_START"):
-            key, value = keyword_value(path, n, line)
-            if section:
-                segments[-1].metadata[key] = (n, value)
-            elif key == VERSION:
-                version = value
-        elif section == "META_STOP":
-            segments[-1].data.append((n, line.split()))
-    check_version(path, VERSION, version, VERSIONS)
-    return segments
 
 
 def segment_samples(

@@ -87,7 +87,7 @@ def magnitude(standard_mag: float, range_m: float, phase_rad: float, sunlit: flo
 
 
 def known_satellites(
-    elements: MeanElements,
+    elements: Sequence[MeanElements],
     standard_mag: float,
     view: ExposureView,
     time: datetime.datetime,
@@ -122,14 +122,14 @@ def known_satellites(
     hidden = hidden_by_earth(here.position_m, to_m / range_m[:, None], range_m)
     # 2. and 3. Path and magnitude of each.
     for n in np.flatnonzero(near & (sunlit > 0) & ~hidden):
-        one = elements.take([int(others[n])])
+        one = elements[others[n]]
         seen = path(one, time, view.duration_s, observer_at)
         to_sun = sun - place_m[n]
         to_camera = -to_m[n]
         phase_rad = float(erfa.sepp(to_sun, to_camera))
         v_mag = magnitude(standard_mag, range_m[n], phase_rad, sunlit[n])
         about = (float(range_m[n] / 1e3), float(np.degrees(phase_rad)), float(sunlit[n]))
-        yield moving_light(ID_BASE + one.numbers[0], one.names[0], v_mag, seen, about)
+        yield moving_light(ID_BASE + one.number, one.name, v_mag, seen, about)
 
 
 def path(
@@ -154,7 +154,7 @@ def path(
     # 2. Light time.
     delay_s = np.zeros(3)
     for _ in range(3):
-        to_m = gcrs_states(one, time, after_s - delay_s)[0][0] - from_m
+        to_m = gcrs_states([one], time, after_s - delay_s)[0][0] - from_m
         delay_s = np.linalg.norm(to_m, axis=1) / SPEED_OF_LIGHT_M_S
     range_m = np.linalg.norm(to_m, axis=1, keepdims=True)
     # 3. Aberration; lengths keep the ratios of the ranges, so that the path is that of a place in space.

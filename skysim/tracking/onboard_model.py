@@ -3,6 +3,7 @@
 Functions `assumed_...` return the model of a scene. `OrbitStarTracker` is the tracker in an orbit.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     return replace(leds, flux_s=flux_s, flux_sigma=scene.tracker.brightness_sigma)
 
 
-def rows_of(wanted: Ints, ids: Ints) -> Ints:
+def rows_of(wanted: Sequence[int] | Ints, ids: Ints) -> Ints:
     """Row of each wanted number among the numbers ids; any row for one that is not among them."""
     order = np.argsort(ids)
     return order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(order) - 1)]

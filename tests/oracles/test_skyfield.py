@@ -107,13 +107,13 @@ def test_satellites_match_skyfield(skyfield: Skyfield, tmp_path: Path) -> None:
             then = time + datetime.timedelta(seconds=after_s)
             return ephemeris.site_in_gcrs(then, tt_jd(then), site)
 
-        for n in range(len(ours.numbers)):
+        for n in range(len(ours)):
             satellite = EarthSatellite(lines[2 * n], lines[2 * n + 1], ts=skyfield.time)
             there = satellite.at(their_time)
             assert np.linalg.norm(there.xyz.m - place_m[n]) < 0.01
             assert 0 < lit[n] < 1 or there.is_sunlit(skyfield.bodies) == (lit[n] == 1)
             wanted = seen.observe(skyfield.bodies["earth"] + satellite).apparent().xyz.m
-            direction, _ = satellites.path(ours.take([n]), time, 1.0, site_at)
+            direction, _ = satellites.path(ours[n], time, 1.0, site_at)
             off = np.linalg.norm(np.cross(wanted / np.linalg.norm(wanted), direction))
             assert np.degrees(off) * 3600 < 0.01
 

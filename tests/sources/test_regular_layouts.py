@@ -122,7 +122,7 @@ def test_geodesic_leds_are_the_vertices_seen_from_the_bearing(on: dict[str, Any]
     place_m = leds.place[:, :3]
     made = inside(on)
     own_m = (place_m - made.center_m) @ made.lab_from_own.as_matrix()
-    np.testing.assert_allclose(made.level(own_m), 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(made.level_and_gradient(own_m)[0], 0, rtol=0, atol=1e-12)
     vertices = geodesic_vertices(8, "I")
     within = vertices[vertices[:, 2] >= np.cos(np.radians(40))]
     assert len(leds) == len(within)

@@ -232,7 +232,7 @@ def test_newton_converges_in_few_steps_from_anywhere_inside(
         for origin in rng.uniform(-0.4, 0.4, (10, 3)):
             met = shape.meet(origin, rng.standard_normal((500, 3)))
             far = met[np.isfinite(met[:, 0])]
-            assert np.abs(shape.level(far - shape.center_m)).max() < 1e-14
+            assert np.abs(shape.level_and_gradient(far - shape.center_m)[0]).max() < 1e-14
             assert len(far) > 20
 
 
@@ -546,7 +546,7 @@ def test_the_drawn_mesh_is_on_the_surface(name: str) -> None:
     shape = made(DRAWN[name])
     sheet = mjcf_export.shell_m(shape, 0.3)
     own = (sheet.reshape(-1, 3) - shape.center_m) @ shape.lab_from_own.as_matrix()
-    assert np.abs(shape.level(own)).max() < 1e-12
+    assert np.abs(shape.level_and_gradient(own)[0]).max() < 1e-12
     assert shape.within(own).all()
 
 

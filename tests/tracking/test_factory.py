@@ -415,7 +415,7 @@ def test_conditions_beyond_every_tracker_are_warned_of(
 ) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
-    lines = dome_warnings.warnings(lab.scene, lab.camera.sources, lab.camera.mount)
+    lines = dome_warnings.warnings(lab)
     assert len(lines) == 1
     assert lines[0].startswith(message)
     assert lines[0] in check(lab).findings

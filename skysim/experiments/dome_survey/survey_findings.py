@@ -349,17 +349,36 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     )
 
 
-def fault_lines(faults: Record) -> Iterator[str]:
-    """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
+def fault_rows(faults: Record) -> Iterator[tuple[str, str, str, str]]:
+    """LED, fault and details of each fault of a `DomeFaults` as a record, and a sentence on it."""
+    at = {led: f"at {coordinates(place_m)} mm" for led, place_m in faults["found_m"].items()}
     for led in faults["dark"]:
-        yield f"LED {led} is dark"
-    for led, distance_m in faults["displaced"].items():
-        yield f"LED {led} is {1e3 * distance_m:.1f} mm from its place in the list"
+        yield f"{led}", "dark", "no frame shows it", f"LED {led} is dark"
+    for led, off_m in faults["displaced"].items():
+        far = f"{1e3 * off_m:.1f} mm from its place in the list"
+        yield f"{led}", "displaced", f"{far}, {at[led]}", f"LED {led} is {far}"
     for led, shows, others in faults["exchanged"]:
         alike = f" (or {', '.join(map(str, others))})" if others else ""
-        yield f"LED {shows}{alike} shines at the place of LED {led}: wires or numbers exchanged"
+        shines = f"LED {shows}{alike} shines at"
+        line = f"{shines} the place of LED {led}: wires or numbers exchanged"
+        yield f"{led}", "exchanged", f"{shines} its place, {at[led]}", line
     for place_m in faults["unlisted"]:
-        yield f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m"
+        line = f"a light that is not in the list shines at {', '.join(f'{one:.3f}' for one in place_m)} m"
+        yield "", "not in the list", f"a light at {coordinates(place_m)} mm", line
+
+
+def coordinates(place_m: list[float]) -> str:
+    """A place in millimeters."""
+    return f"({', '.join(f'{1e3 * one:.1f}' for one in place_m)})"
+
+
+def fault_lines(faults: Record) -> list[str]:
+    """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
+    return [*(line for *_, line in fault_rows(faults)), fault_summary(faults)]
+
+
+def fault_summary(faults: Record) -> str:
+    """The numbers of faults, the error of the other places, and the exchanges that can be found."""
     share = faults["exchange_share"]
     observable = "exchanged LEDs cannot be found: all shine alike; codes or brightness levels would tell them apart"
     if share is None:
@@ -378,7 +397,7 @@ def fault_lines(faults: Record) -> Iterator[str]:
         if list_m > EXACT_M
         else "agree with the frames exactly"
     )
-    yield (
+    return (
         f"{len(faults['dark'])} dark, {len(faults['displaced'])} displaced{tested}, {len(faults['exchanged'])}"
         f" exchanged; the other places of the list {others}; {observable}"
     )

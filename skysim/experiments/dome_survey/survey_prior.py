@@ -1,6 +1,5 @@
 """The model that is assumed before a survey of the dome, and its uncertainty."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -168,7 +167,7 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     """The prior with these LEDs, their nominal brightness and code, and the tracker's assumed lever."""
     scene = lab.scene
     design = design_of(lab)
-    levels = design.strength[rows_of(leds.id, design.id)]
+    levels = design.strength[onboard_model.rows_of(leds.id, design.id)]
     lever = onboard_model.assumed_lever(scene, lab.camera.mount)
     light = require_dome(scene)
     code = (
@@ -181,12 +180,6 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
     return CalibrationPrior(
         camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
     )
-
-
-def rows_of(numbers: Sequence[int] | Ints, ids: Ints) -> Ints:
-    """Rows of LEDs by their numbers."""
-    order = np.argsort(ids)
-    return order[np.searchsorted(ids[order], np.array(numbers, dtype=np.int64))]
 
 
 def design_of(lab: Lab) -> Sources:
@@ -227,8 +220,8 @@ def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
     focal_sigma_m = scene.camera.focal_length_m * uncertainty.focal_error
-    return with_onboard_model(
-        scene, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_m, None
+    return with_map(
+        scene, None, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_m
     )
 
 
@@ -237,19 +230,14 @@ def as_listed(scene: Scene) -> Scene:
     return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
 
 
-def with_map(scene: Scene, path: str) -> Scene:
-    """The scene whose tracker uses the map file of a surveyed dome, and no other onboard errors."""
-    return with_onboard_model(scene, 0.0, 0.0, 0.0, path)
-
-
-def with_onboard_model(
+def with_map(
     scene: Scene,
-    led_sigma_m: float,
-    lever_sigma_m: float,
-    focal_sigma_m: float,
     path: str | None,
+    led_sigma_m: float = 0.0,
+    lever_sigma_m: float = 0.0,
+    focal_sigma_m: float = 0.0,
 ) -> Scene:
-    """The scene whose tracker has survey errors of this size, or this map file."""
+    """The scene whose tracker uses the map file of a surveyed dome, if any, and has these onboard errors alone."""
     scene = with_config(
         scene,
         "tracker.survey",

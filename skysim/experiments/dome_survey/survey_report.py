@@ -6,9 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -23,11 +21,12 @@ from skysim.experiments.dome_survey.survey_findings import (
     DomeFaults,
     SurveyRun,
     accuracy_statistics,
-    fault_lines,
+    fault_rows,
+    fault_summary,
     residuals_px,
 )
 from skysim.experiments.dome_survey.survey_images import SOLVED
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, rows_of
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
@@ -46,14 +45,27 @@ from skysim.results.report_blocks import (
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
+from skysim.tracking.onboard_model import rows_of
 
 CELLS = 8  # number of cells across the chip in which residuals are averaged
 BINS = 60
 TAIL = 0.005  # fraction of the residuals beyond each end of the histogram
 REACHED = {"led_mm": "LED place, mm", "lever_mm": "lever, mm", "focal_px": "focal length, px"}
+MEASURED = (
+    "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames, to {led_mm:.2g} mm rms about each axis (1σ);"
+    " {faults} faults."
+)
 FIT = (
     "{status}: {outliers} outliers, {rms_px:.2g} px rms residual; 1σ of an LED's place: median"
     " {led_sigma_mm_median:.2g} mm, worst {led_sigma_mm_worst:.2g} mm."
+)
+SEEN = (
+    "{measured} of {leds} LEDs measured, {seen_once} seen once, {unseen} not seen; hold these {stops} attitudes"
+    " next:"
+)
+TRUE_ERROR = (
+    "True error of the LEDs: {led_mm_before:.2g} mm rms before, {led_mm_after:.2g} mm after (predicted {predicted} mm);"
+    " {renamed} with another identity."
 )
 FILES = (
     ("map, for tracker.map", "leds.ecsv"),
@@ -67,8 +79,7 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     reached = accuracy_statistics(run.accuracy)
     faults = statistics["faults"]
     columns = [Column("LED"), text_column("fault"), text_column("details")]
-    # Their number, the error of the other places, and the exchanges that can be found.
-    *_, counts = fault_lines(faults)
+    rows = [row[:3] for row in fault_rows(faults)]
     dome = Figure(
         Path(statistics["picture"]).read_bytes(),
         "The dome from above: LED errors, faults, next attitudes.",
@@ -78,7 +89,7 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
         "Residuals: their distribution, and their means over the chip.",
     )
     blocks = [
-        verdict(statistics, 1e3 * run.accuracy.led_rms_m),
+        verdict(statistics, 1e3 * run.accuracy.led_rms_m, len(rows)),
         Text(FIT.format(**statistics)),
         Facts([(name, [Cell(file, link=file)]) for name, file in FILES], on_terminal=False),
         Section("The dome", [dome]),
@@ -87,18 +98,14 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
         Section("Truth and survey", truth_blocks(statistics)),
         Section("Predicted and reached", [accuracy_table(statistics, reached)]),
         Section("Coverage and next attitudes", coverage_blocks(statistics)),
-        Section("Faults", [Table(columns, fault_rows(faults)), Text(counts)]),
+        Section("Faults", [Table(columns, rows), Text(fault_summary(faults))]),
     ]
     return Report(f"Survey of {statistics['scene']}", blocks, command)
 
 
-def verdict(statistics: Record, led_mm: float) -> Verdict:
+def verdict(statistics: Record, led_mm: float, faults: int) -> Verdict:
     """Number of measured LEDs, their error, and number of faults."""
-    faults = len(fault_rows(statistics["faults"]))
-    text = "{surveyed} of {leds} LEDs measured in {tied} of {frames} frames".format(
-        **statistics
-    )
-    text += f", to {led_mm:.2g} mm rms about each axis (1σ); {faults} faults."
+    text = MEASURED.format(**statistics | {"led_mm": led_mm, "faults": faults})
     return Verdict(text, "warning" if faults else "good")
 
 
@@ -122,10 +129,7 @@ def truth_blocks(statistics: Record) -> list[Block]:
     if not statistics.get("truth"):
         return []
     predicted = Column("", format=".2g").cell(statistics["predicted"]["led_mm"]).text
-    text = (
-        f"True error of the LEDs: {statistics['led_mm_before']:.2g} mm rms before, {statistics['led_mm_after']:.2g} mm"
-        f" after (predicted {predicted} mm); {statistics['renamed']} with another identity."
-    )
+    text = TRUE_ERROR.format(**statistics | {"predicted": predicted})
     rows = []
     for when in ("before", "after"):
         one = statistics[when]
@@ -163,10 +167,7 @@ def coverage_blocks(statistics: Record) -> list[Block]:
     counts = statistics["coverage"]
     reaches = statistics["next_reaches"]
     stops = statistics["next"]
-    seen = (
-        f"{counts['measured']} of {counts['leds']} LEDs measured, {counts['seen_once']} seen once, {counts['unseen']}"
-        f" not seen; hold these {len(stops)} attitudes next:"
-    )
+    seen = SEEN.format(**counts, stops=len(stops))
     with_them = f"With them: {reaches['measured']} measured"
     if reaches["led_mm"] is not None:
         with_them += f", to {reaches['led_mm']:.2g} mm rms about each axis"
@@ -183,28 +184,6 @@ def stop_table(stops: list[Record]) -> Table:
     return Table(
         [Column(""), *(Column(name, "°", ".1f") for name in names), Column("LEDs")], rows
     )
-
-
-def fault_rows(faults: Record) -> list[tuple[str, str, str]]:
-    """LED, fault and details, one row per fault."""
-    found = {led: f"at {coordinates(place_m)}" for led, place_m in faults["found_m"].items()}
-    rows = [(str(led), "dark", "no frame shows it") for led in faults["dark"]]
-    for led, off_m in faults["displaced"].items():
-        details = f"{1e3 * off_m:.1f} mm from its place in the list, {found[led]}"
-        rows.append((str(led), "displaced", details))
-    for led, shows, others in faults["exchanged"]:
-        alike = f" (or {', '.join(map(str, others))})" if others else ""
-        details = f"LED {shows}{alike} shines at its place, {found[led]}"
-        rows.append((str(led), "exchanged", details))
-    rows += [
-        ("", "not in the list", f"a light at {coordinates(at)}") for at in faults["unlisted"]
-    ]
-    return rows
-
-
-def coordinates(place_m: list[float]) -> str:
-    """A place in millimeters."""
-    return f"({', '.join(f'{1e3 * one:.1f}' for one in place_m)}) mm"
 
 
 def draw_residuals(run: SurveyRun, fig: Any) -> None:
@@ -367,8 +346,8 @@ def survey_figure(
     further: Rotation,
     errors: LedErrors | None,
     run: SurveyRun,
-) -> NDArray[np.uint8]:
-    """BGR image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
+) -> bytes:
+    """PNG image: the coverage, and the LED errors before and after the survey, or else their shifts from the list."""
     row = np.flatnonzero(run.survey.surveyed)
     found_m = run.survey.leds.position_m[row]
     panels = [("found minus list", found_m, found_m - run.listed.position_m[row])]
@@ -384,8 +363,7 @@ def survey_figure(
         for axes, panel in zip(rest, panels, strict=True):
             draw_errors(axes, *panel)
 
-    drawn = np.frombuffer(png(draw, (7 * (1 + len(panels)), 6.5)), np.uint8)
-    return np.asarray(cv2.imdecode(drawn, cv2.IMREAD_COLOR), np.uint8)
+    return png(draw, (7 * (1 + len(panels)), 6.5))
 
 
 def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:

@@ -31,6 +31,7 @@ from skysim.simulation.checks import beliefs
 from skysim.simulation.checks.beliefs import Beliefs
 from skysim.simulation.checks.views import CameraModel, View, peak_share
 from skysim.simulation.lab import Lab
+from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.dome.surface import Surface, build_surface
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import rows_of
@@ -51,8 +52,8 @@ MAX_END_SIGMA_PX = 1.1
 ACROSS_PX = 3.0
 MERGED_PX = 3.0
 PHASES = 64  # number of phases of the pulses relative to the exposure
-# Number of pulses in an exposure from which the mean time of the light does not vary
-MAX_PULSES = 500
+# Number of periods in an exposure from which the mean time of the light does not vary
+MAX_PERIODS = 499
 
 
 @dataclass(frozen=True)
@@ -380,16 +381,10 @@ def timing_sigma_s(period_s: Floats, on_s: Floats, exposure_s: float) -> Floats:
     pairs, index = np.unique(np.column_stack([period_s, on_s]), axis=0, return_inverse=True)
     sigma = np.zeros(len(pairs))
     for k, (period, on) in enumerate(pairs):
-        count = int(exposure_s / period) + 2
-        if on >= period or count > MAX_PULSES:
+        if on >= period or exposure_s / period >= MAX_PERIODS:
             continue
-        # (PHASES, count) beginnings of the pulses, one before the exposure included.
-        phase_s = (np.arange(PHASES) + 0.5)[:, None] / PHASES * period
-        begin = phase_s + (np.arange(count) - 1) * period
-        first = np.clip(begin, 0, exposure_s)
-        last = np.clip(begin + on, 0, exposure_s)
-        lit = last - first
-        total = lit.sum(axis=1)
-        mean = (lit * (first + last) / 2).sum(axis=1)[total > 0] / total[total > 0]
-        sigma[k] = np.std(mean) if len(mean) else 0.0
+        begins_s = (np.arange(PHASES) + 0.5) / PHASES * period
+        found = [lit_moments_s(0.0, exposure_s, period, begin_s, on) for begin_s in begins_s]
+        means_s = [mean_s for lit_s, mean_s, _ in found if lit_s > 0]
+        sigma[k] = np.std(means_s) if means_s else 0.0
     return sigma[index.ravel()]

@@ -11,16 +11,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from skysim.core.types import Mount, Sources
-from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import threshold_e
 from skysim.simulation.checks.expected_error import believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.sampling import Plan
+from skysim.simulation.lab import Lab
 from skysim.simulation.lights.lab_room import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import surface
@@ -36,10 +34,13 @@ MAX_ELLIPSOID_RMS_M = 1e-3
 MAX_IMAGE_PX = 32.0
 
 
-def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
-    """The warnings about assumptions of the tracker, one line each, for a camera inside the dome."""
+def warnings(lab: Lab) -> list[str]:
+    """The warnings about assumptions of the tracker, one line each, for a camera inside a dome; none without one."""
+    scene = lab.scene
+    sources = lab.camera.sources
     light = scene.dome
-    assert light is not None
+    if light is None:
+        return []
     config = light.surface
     inside = surface.build_surface(config)
     lines = []
@@ -62,7 +63,9 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     if scene.tracker.detector == "local":
         camera = scene.camera
         distance_m = np.linalg.norm(sources.place[:, :3], axis=1)
-        typical_m = float(np.median(distance_m - np.linalg.norm(mount.camera_body_m)))
+        typical_m = float(
+            np.median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
+        )
         blur = camera.pupil_m * abs(1 / typical_m - 1 / camera.focus_m)
         width = 2 * float(np.median(sources.radius_m)) / typical_m + blur
         if (width_px := camera.focal_px * width) > MAX_IMAGE_PX:
@@ -81,14 +84,14 @@ def warnings(scene: Scene, sources: Sources, mount: Mount) -> list[str]:
     return lines
 
 
-def camera_outside_warning(scene: Scene, mount: Mount, start: Rotation) -> str:
-    """Warn if the camera is outside of the dome at the start (lab_from_body), where its frames may be black."""
-    camera_m = start.apply(mount.camera_body_m)
-    light = scene.dome
-    if light is None or surface.build_surface(light.surface).inside(camera_m):
+def camera_outside_warning(lab: Lab) -> str:
+    """Warn if the camera is outside of the dome at the start, where its frames may be black."""
+    lever_m = lab.camera.mount.camera_body_m
+    light = lab.scene.dome
+    if light is None or surface.build_surface(light.surface).inside(lab.start.apply(lever_m)):
         return ""
     return (
-        f"vehicle.camera: {np.linalg.norm(mount.camera_body_m):.3g} m from the bearing, outside of light.surface at the"
+        f"vehicle.camera: {np.linalg.norm(lever_m):.3g} m from the bearing, outside of light.surface at the"
         " start: a frame may show no LED; allowed: inside"
     )
 

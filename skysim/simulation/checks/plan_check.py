@@ -86,7 +86,7 @@ def check(
     """
     scene = lab.scene
     # The rest assumes that the camera is inside the dome.
-    outside = dome_warnings.camera_outside_warning(scene, lab.camera.mount, lab.start)
+    outside = dome_warnings.camera_outside_warning(lab)
     if outside:
         return Check([], [outside])
     # 1. Attitudes.
@@ -161,13 +161,10 @@ def plan_of(lab: Lab, frames: CheckedAttitudes, tilt_deg: float | None = None) -
 
 def broken_assumptions(lab: Lab) -> list[str]:
     """Warnings that the scene breaks an assumption of its tracker, or of the WCS of its frames."""
-    scene = lab.scene
-    if scene.stars:
-        warning = wcs.accuracy_warning(scene.camera.calibration())
+    if lab.scene.stars:
+        warning = wcs.accuracy_warning(lab.scene.camera.calibration())
         return [warning] if warning else []
-    if not scene.dome:
-        return []
-    return dome_warnings.warnings(scene, lab.camera.sources, lab.camera.mount)
+    return dome_warnings.warnings(lab)
 
 
 def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:

@@ -58,7 +58,7 @@ def build_lights(plan: LightPlan) -> tuple[Light, ...]:
     if scene.orbit:
         found.append(Earth(scene.orbit.earth))
     if sky and sky.satellites:
-        elements = None
+        elements = []
         if file := sky.satellites.file:
             elements = read_elements(file)
             check_epochs(file, elements, scene.start_time)

@@ -1,5 +1,6 @@
 """The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
@@ -68,11 +69,11 @@ class Satellites(AddedLight):
     config
         The scene's section `light.satellites`
     elements
-        Orbital elements of the file; None without a file
+        Orbital elements of the file; empty without a file
     """
 
     config: SatellitesConfig
-    elements: MeanElements | None
+    elements: Sequence[MeanElements]
 
     def during(self, exposure: Exposure) -> Lit:
         """The satellites in the exposure; in the expectation, without seeds, there are no random ones."""

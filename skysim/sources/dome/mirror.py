@@ -24,11 +24,11 @@ image along one of two directions, at equal area; that is neglected.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from skysim.core.jit import jit
 from skysim.core.types import Bools, Floats, Ints, Sources, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
@@ -148,52 +148,19 @@ def nearest_rays(
 ) -> tuple[Ints, Ints]:
     """LEDs (K,) and rays (K,), as flat indices of the grid, at which an LED's angle from the reflected ray is least."""
     rays = reflect(wall, camera_m, grid.reshape(-1, 3))
-    cosine = np.sum(grid[1:] * grid[:-1], axis=2)
-    spacing_rad = float(np.arccos(np.clip(cosine, -1, 1)).max())
+    between = np.sum(grid[1:] * grid[:-1], axis=2)
+    spacing_rad = float(np.arccos(np.clip(between, -1, 1)).max())
+    # (N, h, w) cosine of each LED's angle from each reflected ray; NaN, a ray without a wall, is no maximum.
+    along_m = led_m @ rays.along.T - np.sum(rays.wall_m * rays.along, axis=1)
+    distance_m = np.maximum(cdist(led_m, rays.wall_m), 1e-300)
+    cosine = np.nan_to_num(along_m / distance_m, nan=-1.0).reshape(-1, *grid.shape[:2])
+    # Maxima among a ray and its eight neighbors.
+    around = np.pad(cosine, ((0, 0), (1, 1), (1, 1)), constant_values=-1.0)
+    around = np.maximum.reduce([around[:, :-2], around[:, 1:-1], around[:, 2:]])
+    around = np.maximum.reduce([around[..., :-2], around[..., 1:-1], around[..., 2:]])
     limit = np.cos(min(REACH * spacing_rad, np.pi))
-    shape = (*grid.shape[:2], 3)
-    found = _minima(
-        np.ascontiguousarray(led_m),
-        rays.wall_m.reshape(shape),
-        rays.along.reshape(shape),
-        limit,
-    )
-    return found[:, 0], found[:, 1]
-
-
-@jit
-def _minima(led_m: Floats, wall_m: Floats, along: Floats, limit: float) -> Any:
-    """(K, 2) LED and ray of each local maximum of the cosine on the grid that is above `limit`."""
-    rows, columns = wall_m.shape[:2]
-    cosine = np.empty((rows, columns))
-    found = []
-    for n in range(len(led_m)):
-        # Cosine of the LED's angle from each reflected ray.
-        for i in range(rows):
-            for j in range(columns):
-                square = 0.0
-                dot = 0.0
-                for k in range(3):
-                    offset = led_m[n, k] - wall_m[i, j, k]
-                    square += offset * offset
-                    dot += offset * along[i, j, k]
-                # NaN, a ray without a wall, is no maximum.
-                cosine[i, j] = dot / np.sqrt(square) if square > 0 and dot == dot else -1.0
-        # Maxima among a ray and its eight neighbors.
-        for i in range(rows):
-            for j in range(columns):
-                if cosine[i, j] < limit:
-                    continue
-                largest = True
-                for y in range(max(i - 1, 0), min(i + 2, rows)):
-                    for x in range(max(j - 1, 0), min(j + 2, columns)):
-                        largest = largest and cosine[y, x] <= cosine[i, j]
-                if largest:
-                    found.append((n, i * columns + j))
-    out = np.empty((len(found), 2), np.int64)
-    for k in range(len(found)):
-        out[k, 0], out[k, 1] = found[k]
-    return out
+    led, row, column = np.nonzero((cosine >= around) & (cosine >= limit))
+    return led, row * grid.shape[1] + column
 
 
 def linearized(

@@ -83,12 +83,11 @@ class Surface(ABC):
     survey_sigma_m: float = field(default=0.0, kw_only=True)
 
     @abstractmethod
-    def level(self, own_m: Floats) -> Floats:
-        """(N,) level f at (N, 3) points in the surface's own frame: negative inside, zero on the surface."""
+    def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
+        """(N,) level f at (N, 3) points in the surface's own frame, and (N, 3) a positive multiple of its gradient.
 
-    @abstractmethod
-    def gradient(self, own_m: Floats) -> Floats:
-        """(N, 3) gradient of the level at points of the surface, or a positive multiple of it."""
+        The level is negative inside and zero on the surface.
+        """
 
     @abstractmethod
     def distance(self, start_m: Floats, along: Floats) -> Floats:
@@ -118,15 +117,13 @@ class Surface(ABC):
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
         R_lab_from_own = self.lab_from_own.as_matrix()
-        gradient = (
-            self.gradient((points_m - self.center_m) @ R_lab_from_own) @ R_lab_from_own.T
-        )
-        return -normalized(gradient)
+        _, gradient = self.level_and_gradient((points_m - self.center_m) @ R_lab_from_own)
+        return -normalized(gradient @ R_lab_from_own.T)
 
     def inside(self, point_m: Floats) -> bool:
         """Whether a point (3,) of the lab is inside; the rim is ignored."""
         own = (point_m - self.center_m) @ self.lab_from_own.as_matrix()
-        return bool(self.level(own[None])[0] < 0)
+        return bool(self.level_and_gradient(own[None])[0] < 0)
 
     def samples_m(self) -> Floats:
         """(N, 3) points of the surface within its rim, on rings of equal solid angle as seen from the bearing."""
@@ -192,11 +189,9 @@ class Ellipsoid(Surface):
 
     semi_axes_m: Floats
 
-    def level(self, own_m: Floats) -> Floats:
-        return np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1
-
-    def gradient(self, own_m: Floats) -> Floats:
-        return own_m / self.semi_axes_m**2
+    def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
+        level = np.sum((own_m / self.semi_axes_m) ** 2, axis=1) - 1
+        return level, own_m / self.semi_axes_m**2
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         return exit_distance(start_m / self.semi_axes_m, along / self.semi_axes_m)
@@ -228,11 +223,8 @@ class Plane(Surface):
         """Height of its center above the bearing."""
         return float(self.center_m[2])
 
-    def level(self, own_m: Floats) -> Floats:
-        return own_m[:, 2]
-
-    def gradient(self, own_m: Floats) -> Floats:
-        return np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
+    def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
+        return own_m[:, 2], np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """As `Surface.distance`; NaN for rays that point down."""
@@ -328,12 +320,6 @@ class Radial(Surface):
     radius: Shell | point_cloud.Zernike
     fit: point_cloud.SurfaceFit | None = None
 
-    def level(self, own_m: Floats) -> Floats:
-        return self.level_and_gradient(own_m)[0]
-
-    def gradient(self, own_m: Floats) -> Floats:
-        return self.level_and_gradient(own_m)[1]
-
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
         """(N,) level f = |x| - r and (N, 3) its gradient x/|x| - (grad r less its part along x) / |x|."""
         distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
@@ -369,7 +355,7 @@ class Radial(Surface):
         # 1.
         low = np.zeros(len(along))
         high = exit_distance(start_m / self.radius.max_m, along / self.radius.max_m)
-        if self.level(start_m[None])[0] >= 0:
+        if self.level_and_gradient(start_m[None])[0] >= 0:
             return np.full(len(along), np.nan)
         distance = high.copy()
         before = np.full(len(along), np.inf)

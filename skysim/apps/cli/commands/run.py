@@ -143,9 +143,7 @@ def render(
     loaded = load(scene, frames, seed, set_)
     folder = output_folder(out, loaded.name)
     with open_flight(loaded) as flight:
-        if warning := dome_warnings.camera_outside_warning(
-            loaded, flight.lab.camera.mount, flight.lab.start
-        ):
+        if warning := dome_warnings.camera_outside_warning(flight.lab):
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:

@@ -314,7 +314,7 @@ def write_results(
     survey_images.write_solved(folder / survey_images.SOLVED, statistics["attitudes"])
     further = survey_frames.from_rows(statistics["next"])
     errors = survey_report.led_errors(run.survey, before, lab) if lab else None
-    files.write_image(
+    files.write_bytes(
         picture, survey_report.survey_figure(so_far, faults, further, errors, run)
     )
     return statistics

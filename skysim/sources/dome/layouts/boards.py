@@ -191,8 +191,4 @@ def tilt_boards(boards: Boards, max_rad: float, rng: Generator) -> Boards:
     azimuth = rng.uniform(0, 2 * np.pi, count)[:, None]
     axis = boards.u * np.cos(azimuth) + boards.v * np.sin(azimuth)
     rotation = Rotation.from_rotvec(angle[:, None] * axis)
-    return boards._replace(
-        normal=rotation.apply(boards.normal),
-        u=rotation.apply(boards.u),
-        v=rotation.apply(boards.v),
-    )
+    return Boards(boards.center_m, *map(rotation.apply, boards[1:]))
