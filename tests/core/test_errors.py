@@ -194,7 +194,7 @@ def test_only_errors_of_the_command_line_mention_it() -> None:
     found = [
         f"{path}:{node.lineno}"
         for path, tree, text in modules("skysim")
-        if path.parts[1:3] not in (("apps", "cli"), ("apps", "stream"))
+        if path.parts[1:3] not in (("apps", "cli"), ("apps", "live"))
         for node in [
             *made_errors(tree),
             *(one for one in ast.walk(tree) if isinstance(one, ast.Raise)),
