@@ -82,7 +82,6 @@ FIRST_VALUES: Record = {
     "inclination_deg": 51.6,
 }
 ONE_KIND = ("light",)
-Opened = tuple[str, OverrideTexts]  # a scene and its overrides
 
 
 class FormField(NamedTuple):
