@@ -20,9 +20,7 @@ class Head:
         Folder in which scenes are saved
     """
 
-    def __init__(
-        self, page: context.PageContext, contents: live.Contents, folder: Path
-    ) -> None:
+    def __init__(self, page: context.PageContext, folder: Path) -> None:
         self.page = page
         self.folder = folder
         with widgets.div("lab-head"):
@@ -34,7 +32,9 @@ class Head:
                 on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
-            self.banner = live.LiveText(contents, "live").classes("lab-banner").mark("banner")
+            self.banner = (
+                live.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
+            )
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
@@ -44,7 +44,9 @@ class Head:
             page.busy = (
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
-            page.latency = live.LiveText(contents).classes("lab-rate mono quiet").mark("rate")
+            page.latency = (
+                live.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
+            )
             page.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
                 "dense size=xs"

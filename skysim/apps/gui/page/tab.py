@@ -60,8 +60,6 @@ class Tab(context.PageContext):
         Live cameras that it may watch
     user
         Its browser, by `server.user_of`
-    contents
-        Contents of the fields that change with every frame
     filling
         Lock that is held while a form of the scene's keys is filled
     """
@@ -123,13 +121,13 @@ class Tab(context.PageContext):
             dark_page=style.DARK["ground"],
         )
         with widgets.div("lab"):
-            self.head = head.Head(self, self.contents, self.folder)
+            self.head = head.Head(self, self.folder)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with widgets.div("lab-side"):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")
-                self.attitude = readouts.AttitudeCard(self, self.contents)
+                self.attitude = readouts.AttitudeCard(self)
                 await self.build_panels()
             with widgets.div("lab-keys").mark("keys"):
                 for key in keys.KEYS:
@@ -145,9 +143,7 @@ class Tab(context.PageContext):
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
         )
-        self.actions = Actions(
-            self, self.sensor, self.run_panel.step, self.performers(), self.commands()
-        )
+        self.actions = Actions(self, self.run_panel.step, self.performers(), self.commands())
         # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
@@ -155,7 +151,7 @@ class Tab(context.PageContext):
     async def build_panels(self) -> None:
         with widgets.div("lab-panes"):
             with widgets.div("lab-space-pane"):
-                self.scene_3d = space.Scene3D(self, self.sensor)
+                self.scene_3d = space.Scene3D(self)
             head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
                 "dense align=left no-caps indicator-color=primary"
@@ -168,14 +164,14 @@ class Tab(context.PageContext):
                 self.tabs, value=PANELS[0], animated=False, keep_alive=True
             ).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
-                    self.lights = readouts.LightsPanel(self.sensor)
+                    self.lights = readouts.LightsPanel(self)
                 with ui.tab_panel("Scene"):
                     scene_panel = settings_panel.ScenePanel(
                         self, self.folder, self.head.update_scenes
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.run_panel = run_panel.RunPanel(self, self.contents, self.sensor)
+                    self.run_panel = run_panel.RunPanel(self)
                 with ui.tab_panel("Plan"):
                     self.plan_panel = plan_panel.PlanPanel(
                         self, self.scene_3d, self.run_panel

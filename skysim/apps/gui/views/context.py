@@ -12,6 +12,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views import live
+from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session, WorkerLost
@@ -43,8 +44,10 @@ class PageContext:
     message, busy, latency, identifying
         Elements of the page header: the message, the mark of a long task, the time of the last frame, and the switch
         whether every frame is solved
-    tabs
-        Tabs of the panels
+    sensor, tabs
+        Sensor view, and tabs of the panels
+    contents
+        Contents of the fields that change with every frame
     log
         Function that adds a line to the log
     """
@@ -61,7 +64,9 @@ class PageContext:
     busy: ui.icon
     latency: live.LiveText
     identifying: ui.switch
+    sensor: SensorView
     tabs: ui.tabs
+    contents: live.Contents
     log: Callable[[str], None]
 
     @property
