@@ -23,10 +23,11 @@ from estimator.centroiding.centroid import CENTROIDERS
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
-from skysim.apps.gui.views.forms import file_value, yaml_line
+from skysim.apps.gui.views.forms import yaml_line
 from skysim.core.tolerance import ErrorSchema
 from skysim.core.units import ConfigModel, si_unit
 from skysim.experiments.study.plan import Study
+from skysim.scene.provenance import plain
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.camera import CURVE_FOLDER
 
@@ -172,7 +173,7 @@ def table(
         default = (
             "required"
             if field.is_required()
-            else f"`{yaml_line(file_value(default_in_file(field), unit))}`"
+            else f"`{yaml_line(plain(default_in_file(field), name))}`"
         )
         described = describe(schema["properties"][key], unit, links)
         texts = [

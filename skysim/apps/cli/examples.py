@@ -1,4 +1,8 @@
-"""Examples of every command, at the end of its `--help` and in docs/reference/command_line.md."""
+"""The help of every command: its options, from its docstring, and examples, also in docs/reference/command_line.md."""
+
+import inspect
+import re
+from typing import Annotated, Any
 
 import typer
 
@@ -17,13 +21,32 @@ def epilog(name: str) -> str:
     return "\n".join(["Examples:", *(f"  {line}" for line in EXAMPLES[name])])
 
 
-def add_examples(app: typer.Typer, name: str = "") -> None:
-    """Add the examples to a group of commands and to all commands in it. Raises KeyError where there are none."""
+PARAMETERS = "\n\nParameters\n----------\n"
+
+
+def documented(command: Any) -> None:
+    """Give a command's parameters the help in its docstring; one that is not annotated is an option."""
+    text, _, section = (inspect.getdoc(command) or "").partition(PARAMETERS)
+    signature = inspect.signature(command, eval_str=True)
+    options = dict(signature.parameters)
+    for name, explained in re.findall(r"^(\w+)\n((?: +.+\n?)+)", section, re.MULTILINE):
+        kind = options[name].annotation
+        if not hasattr(kind, "__metadata__"):
+            kind = Annotated[kind, typer.Option()]
+        kind.__metadata__[0].help = " ".join(explained.split())
+        options[name] = options[name].replace(annotation=kind)
+    command.__doc__ = text
+    command.__signature__ = signature.replace(parameters=list(options.values()))
+
+
+def add_help(app: typer.Typer, name: str = "") -> None:
+    """Add the help to a group of commands and to all commands in it. Raises KeyError where there are no examples."""
     app.info.epilog = epilog(name)
     for command in app.registered_commands:
         function = command.callback
+        documented(function)
         own = command.name or (function.__name__ if function else "")
         command.epilog = epilog(f"{name} {own}".strip())
     for group in app.registered_groups:
         if group.typer_instance:
-            add_examples(group.typer_instance, f"{name} {group.name}".strip())
+            add_help(group.typer_instance, f"{name} {group.name}".strip())

@@ -23,7 +23,7 @@ from skysim.apps.cli.commands import (
     survey,
     validate,
 )
-from skysim.apps.cli.examples import add_examples
+from skysim.apps.cli.examples import add_help
 from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
@@ -60,7 +60,7 @@ app.add_typer(resources.scenes_app, name="scenes", rich_help_panel="Simulate")
 app.add_typer(study.app, name="study", rich_help_panel="Plan")
 app.add_typer(camera.app, name="camera", rich_help_panel="Measure")
 app.add_typer(star_catalogs.app, name="catalog", rich_help_panel="Exchange")
-add_examples(app)
+add_help(app)
 
 
 def version(requested: bool) -> None:

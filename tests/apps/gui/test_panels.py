@@ -281,19 +281,19 @@ def test_a_key_that_is_sought_before_the_form_is_filled_is_shown(tmp_path: Path)
         with client:
             tab = Tab("shefex2", tmp_path, tmp_path)
             await tab.build()
-            panel = tab.scene_panel
+            panel = tab.forms["Scene"]
             panel.find.value = "exposure.frames"
             for scene in ("shefex2", "afit_simsat"):
                 tab.set_state(scene=scene)
-                panel.form.hide_others(scene)
-                assert not panel.form.parts.visible
+                panel.hide_others(scene)
+                assert not panel.parts.visible
                 panel.set_scene(forms.fields(scene, {}))
-                assert panel.form.parts.visible
-                sections = panel.form.expansions.items()
+                assert panel.parts.visible
+                sections = panel.expansions.items()
                 assert [name for name, one in sections if one.value] == ["exposure"]
                 assert [name for name, one in sections if one.visible] == ["exposure"]
-            panel.form.hide_others(scene)  # it was opened again, with another value
-            assert panel.form.parts.visible
+            panel.hide_others(scene)  # it was opened again, with another value
+            assert panel.parts.visible
         client.delete()
 
     asyncio.run(story())

@@ -26,29 +26,32 @@ SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 
 def availability(
     scene: SceneArg,
-    law: Annotated[
-        Literal["inertial", "zenith"],
-        Option(help="inertial: toward motion.start; zenith: at --off-deg from it."),
-    ] = "inertial",
-    off_deg: Annotated[
-        float, Option(help="Angle of the boresight from the zenith, 180 is nadir.")
-    ] = 0.0,
-    around_deg: Annotated[
-        float, Option(help="Its azimuth from the flight direction, left positive.")
-    ] = 0.0,
-    span: Annotated[
-        Literal["orbit", "day", "year"], Option(help="From the scene's start_time.")
-    ] = "orbit",
-    samples: Annotated[
-        int, Option(min=10, max=10_000_000, help="Times that are computed.")
-    ] = 20_000,
+    law: Literal["inertial", "zenith"] = "inertial",
+    off_deg: float = 0.0,
+    around_deg: float = 0.0,
+    span: Literal["orbit", "day", "year"] = "orbit",
+    samples: Annotated[int, Option(min=10, max=10_000_000)] = 20_000,
     overrides: Overrides = None,
-    picture: Annotated[
-        Path | None, Option(help="Also write a picture (.png) of the angles over time.")
-    ] = None,
+    picture: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars."""
+    """Fraction of an orbit or a year in which the tracker is outside its exclusion angles and sees enough stars.
+
+    Parameters
+    ----------
+    law
+        inertial: toward motion.start; zenith: at --off-deg from it.
+    off_deg
+        Angle of the boresight from the zenith, 180 is nadir.
+    around_deg
+        Its azimuth from the flight direction, left positive.
+    span
+        From the scene's start_time.
+    samples
+        Times that are computed.
+    picture
+        Also write a picture (.png) of the angles over time.
+    """
     import numpy as np
 
     config = load(scene, None, None, overrides)

@@ -102,24 +102,21 @@ def preset_entry(path: Path) -> dict[str, str]:
 
 @app.command("show")
 def camera_show(
-    file: Annotated[
-        str,
-        Argument(
-            metavar="FILE",
-            help="Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.",
-            autocompletion=complete_camera,
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        Option(help="Also write the calibration to this file, in OpenCV's YAML format."),
-    ] = None,
+    file: Annotated[str, Argument(metavar="FILE", autocompletion=complete_camera)],
+    out: Path | None = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
     """Show a camera: field of view, arcseconds a pixel, focal length, distortion. Optionally write it for OpenCV.
 
     `skysim camera FILE` does the same.
+
+    Parameters
+    ----------
+    file
+        Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.
+    out
+        Also write the calibration to this file, in OpenCV's YAML format.
     """
     import dataclasses
 
@@ -219,18 +216,21 @@ def asking(command: Callable[..., None]) -> Callable[..., None]:
 @asking
 def camera_new(
     *,
-    name: Annotated[
-        str, Option(help="Name of camera, lens and data sheets, for the file's first line.")
-    ] = "",
-    out: Annotated[Path, Option(help="The file to write, for the key camera.preset.")] = Path(
-        "camera.yaml"
-    ),
+    name: str = "",
+    out: Path = Path("camera.yaml"),
     json: Json = False,
     **answers: str | None,
 ) -> None:
     """Write a camera file from the numbers of a data sheet: asks for each; with options, only those are used.
 
     Numbers that the data sheet does not state are assumed; the file and the output name them.
+
+    Parameters
+    ----------
+    name
+        Name of camera, lens and data sheets, for the file's first line.
+    out
+        The file to write, for the key camera.preset.
     """
     if out.suffix not in (".yaml", ".yml") or out.exists():
         raise InputError(

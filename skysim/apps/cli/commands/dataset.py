@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Option
@@ -17,33 +17,18 @@ from skysim.apps.cli.commands.study import (
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
-OutputUrl = Annotated[
-    str, Option(metavar="URL", help="Output folder, or a URL such as s3://bucket/folder.")
-]
-Variations = Annotated[
-    Path | None,
-    Option(
-        metavar="FILE",
-        help="Variations: YAML with the study's keys set, trial, factors, hardware.",
-    ),
-]
-Formats = Annotated[
-    list[str] | None,
-    Option(help="Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco."),
-]
+OutputUrl = Annotated[str, Option(metavar="URL")]
+Variations = Annotated[Path | None, Option(metavar="FILE")]
 
 
 def dataset(
     scene: SceneArg,
-    frames: Annotated[int, Option(help="Number of frames.")],
+    frames: int,
     out: OutputUrl,
     vary: Variations = None,
-    to: Formats = None,
-    shard_frames: Annotated[int, Option(help="Frames of a shard.")] = 64,
-    compress: Annotated[
-        bool,
-        Option("--compress", help="Compress the images of the tars: .npz in place of .npy."),
-    ] = False,
+    to: list[str] | None = None,
+    shard_frames: int = 64,
+    compress: Annotated[bool, Option("--compress")] = False,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Workers = None,
@@ -54,6 +39,21 @@ def dataset(
     """Write labelled frames at random attitudes, for those who train and test detectors.
 
     Stopped or killed, it goes on where it was when it is called again.
+
+    Parameters
+    ----------
+    frames
+        Number of frames.
+    out
+        Output folder, or a URL such as s3://bucket/folder.
+    vary
+        Variations: YAML with the study's keys set, trial, factors, hardware.
+    to
+        Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.
+    shard_frames
+        Frames of a shard.
+    compress
+        Compress the images of the tars: .npz in place of .npy.
     """
     start_workers(engine)
     from skysim.core.yaml_reader import parse_overrides
@@ -61,7 +61,6 @@ def dataset(
     from skysim.experiments.dataset_shards import Storage
 
     Storage(out)  # raises for a wrong URL before the scene is read
-    formats = tuple(to or ("webdataset", "coco"))
     made = dataset_run.load(
         scene,
         vary,
@@ -69,7 +68,7 @@ def dataset(
         seed=seed,
         overrides=parse_overrides(set_),
         frames_per_shard=shard_frames,
-        formats=formats,
+        formats=tuple(to or ("webdataset", "coco")),
         compress=compress,
     )
     with (
@@ -77,13 +76,18 @@ def dataset(
         trial_progress(f"dataset of {scene}", frames, "frames") as update,
     ):
         progress = dataset_run.run(made, out, chosen, update)
+    result = {"out": out, "frames": progress.done, "shards": made.shards}
+    print_result(result | {"failed": progress.failed, "rate_hz": progress.rate}, frames, json)
+
+
+def print_result(result: dict[str, Any], frames: int, json: bool) -> None:
+    """Print what was written of so many frames; end with exit code 2 if some are missing."""
     if json:
-        result = {"out": out, "frames": progress.done, "shards": made.shards}
-        print_json(result | {"failed": progress.failed, "rate_hz": progress.rate})
+        print_json(result)
     else:
-        print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
-    if progress.failed:
+        print("{frames} of {0} frames in {shards} shards: {out}".format(frames, **result))
+    if result["failed"]:
         print_error(
-            f"{progress.failed} frames are missing: their workers died; the same command tries them again"
+            f"{result['failed']} frames are missing: their workers died; the same command tries them again"
         )
         raise typer.Exit(2)

@@ -21,49 +21,21 @@ if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames
 
 
-Quick = Annotated[
-    bool, Option("--quick", help="Smaller experiments; the intervals are wider.")
-]
-FieldCount = Annotated[
-    int | None,
-    Option(
-        help="Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more."
-    ),
-]
-Folder = Annotated[Path | None, Option(help="Output folder; default: out/NAME_datasheet.")]
-Rates = Annotated[
-    str | None,
-    Option(
-        help="Rates to measure, such as 0,1,2,5, deg/s; by default doubled until fewer than half of the fields"
-        " are solved."
-    ),
-]
-ModelFolder = Annotated[
-    Path | None,
-    Option(
-        help="Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON."
-    ),
-]
-AsFmu = Annotated[
-    bool,
-    Option(
-        "--fmu",
-        help="With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).",
-    ),
-]
+Quick = Annotated[bool, Option("--quick")]
+AsFmu = Annotated[bool, Option("--fmu")]
 
 
 def datasheet(
     scene: SceneArg,
     quick: Quick = False,
-    fields: FieldCount = None,
-    rates: Rates = None,
+    fields: int | None = None,
+    rates: str | None = None,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Workers = None,
-    out: Folder = None,
-    markdown: Annotated[Path | None, Option(help="Also write a Markdown page.")] = None,
-    model: ModelFolder = None,
+    out: Path | None = None,
+    markdown: Path | None = None,
+    model: Path | None = None,
     fmu: AsFmu = False,
     open_: OpenReport = False,
     json: Json = False,
@@ -71,6 +43,24 @@ def datasheet(
     """State the performance of a scene's star tracker: error terms, probabilities, limits, robustness.
 
     Stopped or killed, it goes on where it was when it is called again.
+
+    Parameters
+    ----------
+    quick
+        Smaller experiments; the intervals are wider.
+    fields
+        Number of fields (attitudes) of each experiment; more narrow the intervals. With --model 20 or more.
+    rates
+        Rates to measure, such as 0,1,2,5, deg/s; by default doubled until fewer than half of the fields are
+        solved.
+    out
+        Output folder; default: out/NAME_datasheet.
+    markdown
+        Also write a Markdown page.
+    model
+        Also write a fast model of the errors to a folder: a module for NumPy, its constants in JSON.
+    fmu
+        With --model: also as a co-simulation unit of FMI 3 (needs pythonfmu3).
     """
     from skysim.core import files
     from skysim.experiments.datasheet import cells, datasheet_report

@@ -30,64 +30,31 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 
-ExcitedBy = Annotated[
-    Literal["wheels", "swing"],
-    Option(help="Tilt by the wheels at three yaw angles, or let go and swing freely."),
-]
-EstimateOnly = Annotated[
-    bool, Option("--estimate-only", help="Estimate from one flight; move nothing.")
-]
-Tilt = Annotated[float, Option(min=0.1, max=60, help="Tilt of the excitation, degrees.")]
-Longer = Annotated[
-    float, Option(min=0.1, max=100, help="Length of a flight, times the usual one.")
-]
-Torque = Annotated[
-    str, Option(help="Residual gravity torque at which the vehicle is balanced.")
-]
-Flights = Annotated[int | None, Option(min=1, max=50, help="Flights at most; default: 6.")]
-InertiaBar = Annotated[
-    float,
-    Option(min=0.01, help="Standard deviation that moments of inertia must reach, percent."),
-]
-OffsetBar = Annotated[
-    str | None,
-    Option(
-        help="Standard deviation that the offset must reach; default: half of the torque over weight."
-    ),
-]
-InFlight = Annotated[
-    bool, Option("--in-flight", help="Also run the filter in flight over the last flight.")
-]
-# The errors of the onboard model before the first flight.
-InertiaSigma = Annotated[str, Option(help="Standard error of the assumed inertia, a share.")]
-OffsetSigma = Annotated[
-    str, Option(help="Standard error of the assumed balance, along each axis.")
-]
-WheelSigma = Annotated[
-    str, Option(help="Standard error of a wheel's assumed inertia, a share.")
-]
-MountSigma = Annotated[str, Option(help="Standard error of the tracker's axes in the body.")]
-TachoSigma = Annotated[
-    float, Option(help="Standard error of a reading of a wheel's speed, rpm.")
-]
+EstimateOnly = Annotated[bool, Option("--estimate-only")]
+Tilt = Annotated[float, Option(min=0.1, max=60)]
+Longer = Annotated[float, Option(min=0.1, max=100)]
+Flights = Annotated[int | None, Option(min=1, max=50)]
+InertiaBar = Annotated[float, Option(min=0.01)]
+InFlight = Annotated[bool, Option("--in-flight")]
 
 
 def balance(
     scene: SceneArg,
-    excite: ExcitedBy = "wheels",
+    excite: Literal["wheels", "swing"] = "wheels",
     estimate_only: EstimateOnly = False,
     tilt: Tilt = 8.0,
     longer: Longer = 1.0,
-    torque: Torque = "5e-5 N m",
+    torque: str = "5e-5 N m",
     flights: Flights = None,
     inertia_bar: InertiaBar = 1.0,
-    offset_bar: OffsetBar = None,
+    offset_bar: str | None = None,
     in_flight: InFlight = False,
-    inertia_sigma: InertiaSigma = "10%",
-    offset_sigma: OffsetSigma = "500 um",
-    wheel_sigma: WheelSigma = "0.1%",
-    mount_sigma: MountSigma = "0.03 deg",
-    tacho_sigma: TachoSigma = 1.0,
+    # The errors of the onboard model before the first flight.
+    inertia_sigma: str = "10%",
+    offset_sigma: str = "500 um",
+    wheel_sigma: str = "0.1%",
+    mount_sigma: str = "0.03 deg",
+    tacho_sigma: float = 1.0,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
@@ -96,6 +63,37 @@ def balance(
     """Balance a vehicle on its air bearing: estimate inertia and center of mass, move trim masses, repeat.
 
     The star tracker is the instrument. Every flight is simulated, its frames are rendered and solved.
+
+    Parameters
+    ----------
+    excite
+        Tilt by the wheels at three yaw angles, or let go and swing freely.
+    estimate_only
+        Estimate from one flight; move nothing.
+    tilt
+        Tilt of the excitation, degrees.
+    longer
+        Length of a flight, times the usual one.
+    torque
+        Residual gravity torque at which the vehicle is balanced.
+    flights
+        Flights at most; default: 6.
+    inertia_bar
+        Standard deviation that moments of inertia must reach, percent.
+    offset_bar
+        Standard deviation that the offset must reach; default: half of the torque over weight.
+    in_flight
+        Also run the filter in flight over the last flight.
+    inertia_sigma
+        Standard error of the assumed inertia, a share.
+    offset_sigma
+        Standard error of the assumed balance, along each axis.
+    wheel_sigma
+        Standard error of a wheel's assumed inertia, a share.
+    mount_sigma
+        Standard error of the tracker's axes in the body.
+    tacho_sigma
+        Standard error of a reading of a wheel's speed, rpm.
     """
     from skysim.experiments import balance_flight, balance_procedure, balance_report
 
@@ -167,23 +165,22 @@ def print_report(statistics: Record, report: Report, json: bool) -> None:
 
 def calibrate(
     scene: SceneArg,
-    images: Annotated[
-        Path | None,
-        Option(help="Folder of images with attitudes.csv of the IMU, in place of a flight."),
-    ] = None,
-    clicks: Annotated[
-        int,
-        Option(
-            min=0,
-            help="LED spacings that set the scale in the first frame; 0 keeps the focal length.",
-        ),
-    ] = 4,
+    images: Path | None = None,
+    clicks: Annotated[int, Option(min=0)] = 4,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Measure LEDs from the vehicle's stops as the AFIT thesis does: magnitudes, angles, epsilons, on-board catalog."""
+    """Measure LEDs from the vehicle's stops as the AFIT thesis does: magnitudes, angles, epsilons, on-board catalog.
+
+    Parameters
+    ----------
+    images
+        Folder of images with attitudes.csv of the IMU, in place of a flight.
+    clicks
+        LED spacings that set the scale in the first frame; 0 keeps the focal length.
+    """
     from skysim.experiments import home_calibration
 
     loaded = load(scene, None, seed, set_)
@@ -203,39 +200,33 @@ def calibrate(
 
 
 def characterize(
-    camera: Annotated[
-        str,
-        Option(
-            help="Preset, camera file or scene: what frames do not tell, such as size, pixel pitch and bits.",
-            autocompletion=complete_camera,
-        ),
-    ],
-    darks: Annotated[
-        Path | None,
-        Option(
-            help="Folder of darks, of two exposures or more; required without --frames-to."
-        ),
-    ] = None,
-    flats: Annotated[
-        Path | None,
-        Option(
-            help="Folder of flats: pairs at exposures up to saturation; required without --frames-to."
-        ),
-    ] = None,
-    night: Annotated[
-        Path | None, Option(help="Folder of frames of the night sky, stars at rest.")
-    ] = None,
-    frames_to: Annotated[
-        Path | None,
-        Option(help="Measure nothing: write the darks and flats of --camera, simulated."),
-    ] = None,
-    seed: Annotated[int, Option(min=0, help="Seed of the frames of --frames-to.")] = 1,
+    camera: Annotated[str, Option(autocompletion=complete_camera)],
+    darks: Path | None = None,
+    flats: Path | None = None,
+    night: Path | None = None,
+    frames_to: Path | None = None,
+    seed: Annotated[int, Option(min=0)] = 1,
     out: Out = None,
     json: Json = False,
 ) -> None:
     """Measure a camera from its own frames: sensor from darks and flats, lens from the night sky, to a preset.
 
     The method is photon transfer, in the terms of EMVA 1288. Every value has its 95 % interval.
+
+    Parameters
+    ----------
+    camera
+        Preset, camera file or scene: what frames do not tell, such as size, pixel pitch and bits.
+    darks
+        Folder of darks, of two exposures or more; required without --frames-to.
+    flats
+        Folder of flats: pairs at exposures up to saturation; required without --frames-to.
+    night
+        Folder of frames of the night sky, stars at rest.
+    frames_to
+        Measure nothing: write the darks and flats of --camera, simulated.
+    seed
+        Seed of the frames of --frames-to.
     """
     from skysim.experiments.characterize import characterize_camera
 

@@ -13,35 +13,36 @@ from skysim.results.report import page_path, print_blocks
 
 
 def reproduce(
-    ids: Annotated[
-        list[str] | None,
-        Argument(metavar="ID|all", help="Experiments, or all; default: list them."),
-    ] = None,
-    quick: Annotated[
-        bool, Option("--quick", help="Run fewer trials; the intervals are wider.")
-    ] = False,
-    seed: Annotated[int, Option(help="Seed of all random streams.")] = 1,
-    report: Annotated[
-        bool, Option("--report", help="Also write an HTML page with the papers' figures.")
-    ] = False,
-    out: Annotated[Path, Option(help="Folder for the report.")] = Path("out/reproduce"),
-    markdown: Annotated[
-        Path | None, Option(help="Also write a Markdown page with its images beside it.")
-    ] = None,
+    ids: Annotated[list[str] | None, Argument(metavar="ID|all")] = None,
+    quick: Annotated[bool, Option("--quick")] = False,
+    seed: int = 1,
+    report: Annotated[bool, Option("--report")] = False,
+    out: Path = Path("out/reproduce"),
+    markdown: Path | None = None,
     open_: OpenReport = False,
     json: Json = False,
 ) -> None:
-    """Repeat the experiments of papers and compare the published numbers with ours."""
+    """Repeat the experiments of papers and compare the published numbers with ours.
+
+    Parameters
+    ----------
+    ids
+        Experiments, or all; default: list them.
+    quick
+        Run fewer trials; the intervals are wider.
+    seed
+        Seed of all random streams.
+    report
+        Also write an HTML page with the papers' figures.
+    out
+        Folder for the report.
+    markdown
+        Also write a Markdown page with its images beside it.
+    """
     if open_ and not report:
         raise InputError("--open", "has no effect without --report", "--report --open")
     if not ids:
-        from skysim.experiments.papers.published import experiments
-
-        listed = [
-            {"id": id, "title": published.title, "source": published.source}
-            for id, published in experiments().items()
-        ]
-        print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
+        list_experiments(json)
         return
     page = out / "report.html"
     paths = [page_path(path) for path in (page if report else None, markdown) if path]
@@ -69,3 +70,14 @@ def reproduce(
     print_blocks([verdict(reproductions)])
     for path in paths:
         print(path)
+
+
+def list_experiments(json: bool) -> None:
+    """Print the experiments that can be repeated."""
+    from skysim.experiments.papers.published import experiments
+
+    listed = [
+        {"id": id, "title": published.title, "source": published.source}
+        for id, published in experiments().items()
+    ]
+    print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")

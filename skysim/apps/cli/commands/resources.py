@@ -48,18 +48,8 @@ def scenes_show(scene: SceneArg, set_: Overrides = None, json: Json = False) -> 
 @scenes_app.command("export")
 def scenes_export(
     scene: SceneArg,
-    out: Annotated[
-        Path | None,
-        Option(
-            help="Output file: .xml, .fmu; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj. Else out/SCENE.xml."
-        ),
-    ] = None,
-    paper: Annotated[
-        str,
-        Option(
-            help="Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page)."
-        ),
-    ] = "a4",
+    out: Path | None = None,
+    paper: str = "a4",
     seed: Seed = None,
     set_: Overrides = None,
 ) -> None:
@@ -68,6 +58,13 @@ def scenes_export(
     The unit is of FMI 3, for Simulink and other tools; it needs pythonfmu3 and a C compiler.
     The builder gets a list of the LEDs (.csv), a pattern of gores at full scale on pages (.pdf), in one drawing to
     print (.svg) or to cut (.dxf), or the shell with a mark at each LED as a mesh (.obj).
+
+    Parameters
+    ----------
+    out
+        Output file: .xml, .fmu; of a dome .csv (LEDs), .pdf, .svg, .dxf (gores), .obj. Else out/SCENE.xml.
+    paper
+        Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page).
     """
     from skysim.core import files
     from skysim.results.files import fmu, gore_pages, templates
@@ -105,19 +102,21 @@ def scenes_export(
 @scenes_app.command("parts")
 def scenes_parts(
     scene: SceneArg,
-    prices: Annotated[
-        str,
-        Option(
-            metavar="FILE",
-            help="Table of prices (.csv); `assumed` is the one that comes along.",
-        ),
-    ] = "assumed",
-    out: Annotated[Path | None, Option(help="Also write the list as CSV.")] = None,
+    prices: Annotated[str, Option(metavar="FILE")] = "assumed",
+    out: Path | None = None,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
-    """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey."""
+    """List the parts of a scene's dome with their prices: LEDs, tape or boards, drivers, wire, shell, survey.
+
+    Parameters
+    ----------
+    prices
+        Table of prices (.csv); `assumed` is the one that comes along.
+    out
+        Also write the list as CSV.
+    """
     from skysim.results.files import parts
 
     loaded = load(scene, None, seed, set_)
@@ -153,14 +152,19 @@ def new(
             autocompletion=lambda: list(KINDS),
         ),
     ],
-    name: Annotated[
-        str, Argument(metavar="NAME", help="Name of the new file, without its ending.")
-    ],
-    out: Annotated[Path, Option(help="Folder of the new file.")] = Path(),
+    name: Annotated[str, Argument(metavar="NAME")],
+    out: Path = Path(),
 ) -> None:
     """Begin a scene, vehicle, camera, study, controller or tracker: write a commented file that runs as it is.
 
     Its first lines say which commands use it. A vehicle is two files: its model, and a scene that flies it.
+
+    Parameters
+    ----------
+    name
+        Name of the new file, without its ending.
+    out
+        Folder of the new file.
     """
     if kind not in KINDS:
         raise InputError("", *unknown_name("kind", kind, KINDS))
@@ -185,17 +189,22 @@ def new(
 
 
 def export(
-    folder: Annotated[
-        Path, Argument(metavar="FOLDER", help="Output folder of `skysim run` or `render`.")
-    ],
-    to: Annotated[
-        list[str],
-        Option(metavar="FORMAT", help="aem, ecsv, parquet, tiff, zarr or video; repeatable."),
-    ],
-    out: Annotated[Path | None, Option(help="Output folder; default: FOLDER.")] = None,
+    folder: Annotated[Path, Argument(metavar="FOLDER")],
+    to: Annotated[list[str], Option(metavar="FORMAT")],
+    out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video."""
+    """Write a finished run for other tools: attitudes as CCSDS AEM, tables as Parquet, frames as TIFF, Zarr, video.
+
+    Parameters
+    ----------
+    folder
+        Output folder of `skysim run` or `render`.
+    to
+        aem, ecsv, parquet, tiff, zarr or video; repeatable.
+    out
+        Output folder; default: FOLDER.
+    """
     from skysim.results.files import recording
     from skysim.results.files import run_export as export_files
 

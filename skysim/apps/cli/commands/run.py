@@ -127,15 +127,16 @@ def render(
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
-    preview: Annotated[
-        bool,
-        typer.Option(
-            "--preview", help="Write an 8-bit image of each frame with the truth marked."
-        ),
-    ] = False,
+    preview: Annotated[bool, typer.Option("--preview")] = False,
     json: Json = False,
 ) -> None:
-    """Simulate a scene and write its frames with their truth, without solving them."""
+    """Simulate a scene and write its frames with their truth, without solving them.
+
+    Parameters
+    ----------
+    preview
+        Write an 8-bit image of each frame with the truth marked.
+    """
     from skysim.results.run import FlightRecorder
     from skysim.simulation.checks import dome_warnings
     from skysim.simulation.flight import open_flight

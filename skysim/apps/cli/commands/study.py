@@ -111,7 +111,7 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, Option("--failed", help="Repeat failed trials too.")] = False,
+    failed: Annotated[bool, Option("--failed")] = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
@@ -120,6 +120,11 @@ def resume(
     """Continue a study or a search that was stopped or killed, or that used up its budget.
 
     `--set replicates=N` adds replicates to a study; its trials are kept.
+
+    Parameters
+    ----------
+    failed
+        Repeat failed trials too.
     """
     start_workers(engine)
     place, plan, overrides = load_stored_plan(study, out, program or [], set_, grows=True)
@@ -158,16 +163,16 @@ def report(
 @app.command()
 def export(
     study: StudyArg,
-    to: Annotated[
-        list[Path],
-        Argument(
-            metavar="FILES",
-            help="Output files: .csv or .parquet (a row per trial), .zarr (the responses).",
-        ),
-    ],
+    to: Annotated[list[Path], Argument(metavar="FILES")],
     out: Out = None,
 ) -> None:
-    """Write a study's results for other tools."""
+    """Write a study's results for other tools.
+
+    Parameters
+    ----------
+    to
+        Output files: .csv or .parquet (a row per trial), .zarr (the responses).
+    """
     from skysim.experiments.study.report import study_export
 
     place, plan, _ = load_stored_plan(study, out)
@@ -180,19 +185,22 @@ def export(
 @app.command()
 def replay(
     study: StudyArg,
-    trial: Annotated[
-        int,
-        Argument(
-            metavar="TRIAL", help="Number of the trial, as in the report and in `status`."
-        ),
-    ],
+    trial: Annotated[int, Argument(metavar="TRIAL")],
     out: Out = None,
-    show: Annotated[bool, Option("--open/--no-open", help="Open the first image.")] = False,
+    show: Annotated[bool, Option("--open/--no-open")] = False,
     scene_3d: Scene3d = False,
     program: Programs = None,
     json: Json = False,
 ) -> None:
-    """Repeat one trial and write its frames; of a flight also telemetry and report, and what went wrong in it."""
+    """Repeat one trial and write its frames; of a flight also telemetry and report, and what went wrong in it.
+
+    Parameters
+    ----------
+    trial
+        Number of the trial, as in the report and in `status`.
+    show
+        Open the first image.
+    """
     from skysim.experiments.study.execution import runner
 
     place, plan, _ = load_stored_plan(study, out, program or [])
@@ -224,24 +232,23 @@ def replay(
 @app.command()
 def worst(
     study: StudyArg,
-    response: Annotated[
-        str,
-        Option(
-            help="Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response."
-        ),
-    ] = "",
-    where: Annotated[
-        list[str] | None,
-        Option(
-            metavar="FACTOR=LEVEL",
-            help="Only points at this level; may be given several times.",
-        ),
-    ] = None,
-    count: Annotated[int, Option(min=1, max=100, help="Number of attitudes.")] = 3,
+    response: str = "",
+    where: Annotated[list[str] | None, Option(metavar="FACTOR=LEVEL")] = None,
+    count: Annotated[int, Option(min=1, max=100)] = 3,
     out: Out = None,
     json: Json = False,
 ) -> None:
-    """Name the attitudes of the worst trials, and the commands that repeat them."""
+    """Name the attitudes of the worst trials, and the commands that repeat them.
+
+    Parameters
+    ----------
+    response
+        Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response.
+    where
+        Only points at this level; may be given several times.
+    count
+        Number of attitudes.
+    """
     from skysim.core.yaml_reader import parse_overrides, parse_yaml
     from skysim.experiments.study import worst as analysis
     from skysim.results import metrics

@@ -21,63 +21,14 @@ FrameCount = Annotated[
         help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
-PlanOnly = Annotated[
-    bool,
-    Option(
-        "--plan",
-        help="Print the attitudes to hold and the predicted errors; simulate nothing.",
-    ),
-]
-Images = Annotated[
-    Path | None,
-    Option(
-        help="Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any."
-    ),
-]
-CameraFile = Annotated[
-    Path | None,
-    Option(
-        help="Camera of the images: a scene (file or name), camera file or OpenCV calibration."
-    ),
-]
-Watch = Annotated[
-    bool,
-    Option(
-        "--watch",
-        help="With --images: follow the folder while the images are taken, and print which LEDs are measured and which"
-        " attitudes to hold next; after the last one, or Ctrl-C, survey.",
-    ),
-]
-Repeat = Annotated[
-    int | None,
-    Option(
-        min=2, help="Simulate so many surveys, and compare their errors with the prediction."
-    ),
-]
-AttitudesBy = Annotated[
-    Literal["plan", "random"] | None,
-    Option(help="Attitudes: by the plan (default), or random."),
-]
+PlanOnly = Annotated[bool, Option("--plan")]
+Watch = Annotated[bool, Option("--watch")]
+Repeat = Annotated[int | None, Option(min=2)]
 Next = Annotated[
     int | None,
     Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
 ]
-FramesTo = Annotated[
-    Path | None,
-    Option(help="Write the simulated frames and attitudes to a folder, for --images."),
-]
-Tilt = Annotated[float, Option(help="Maximum tilt of the attitudes, degrees.")]
-ImuSigma = Annotated[
-    str, Option(help="Standard error of the IMU's attitude about each axis.")
-]
-LedSigma = Annotated[
-    str, Option(help="Standard error of an LED's assumed position along each axis.")
-]
-LeverSigma = Annotated[str, Option(help="Standard error of the camera's assumed position.")]
-FocalError = Annotated[str, Option(help="Standard error of the assumed focal length.")]
-Distortion = Annotated[
-    bool, Option("--distortion", help="Also fit the distortion k1, k2, p1, p2.")
-]
+Distortion = Annotated[bool, Option("--distortion")]
 Checks = Annotated[
     int | None,
     Option(
@@ -91,21 +42,21 @@ def survey(
     scene: SceneArg,
     frames: FrameCount = None,
     plan: PlanOnly = False,
-    images: Images = None,
-    camera: CameraFile = None,
+    images: Path | None = None,
+    camera: Path | None = None,
     watch: Watch = False,
     repeat: Repeat = None,
-    attitudes: AttitudesBy = None,
+    attitudes: Literal["plan", "random"] | None = None,
     next_: Next = None,
-    frames_to: FramesTo = None,
+    frames_to: Path | None = None,
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
-    tilt: Tilt = 25.0,
-    imu_sigma: ImuSigma = "0.5 deg",
-    led_sigma: LedSigma = "2 mm",
-    lever_sigma: LeverSigma = "5 mm",
-    focal_error: FocalError = "1%",
+    tilt: float = 25.0,
+    imu_sigma: str = "0.5 deg",
+    led_sigma: str = "2 mm",
+    lever_sigma: str = "5 mm",
+    focal_error: str = "1%",
     distortion: Distortion = False,
     checks: Checks = None,
     json: Json = False,
@@ -114,6 +65,36 @@ def survey(
 
     It says which attitudes to hold, what they will reach, which LEDs are measured, and which are dark, displaced or
     exchanged.
+
+    Parameters
+    ----------
+    plan
+        Print the attitudes to hold and the predicted errors; simulate nothing.
+    images
+        Survey from the images of a folder, with the IMU's attitudes in its attitudes.csv if any.
+    camera
+        Camera of the images: a scene (file or name), camera file or OpenCV calibration.
+    watch
+        With --images: follow the folder while the images are taken, and print which LEDs are measured and which
+        attitudes to hold next; after the last one, or Ctrl-C, survey.
+    repeat
+        Simulate so many surveys, and compare their errors with the prediction.
+    attitudes
+        Attitudes: by the plan (default), or random.
+    frames_to
+        Write the simulated frames and attitudes to a folder, for --images.
+    tilt
+        Maximum tilt of the attitudes, degrees.
+    imu_sigma
+        Standard error of the IMU's attitude about each axis.
+    led_sigma
+        Standard error of an LED's assumed position along each axis.
+    lever_sigma
+        Standard error of the camera's assumed position.
+    focal_error
+        Standard error of the assumed focal length.
+    distortion
+        Also fit the distortion k1, k2, p1, p2.
     """
     from skysim.apps.cli.commands import survey_modes
     from skysim.experiments.dome_survey.survey_prior import survey_uncertainty

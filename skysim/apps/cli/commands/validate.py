@@ -36,22 +36,21 @@ class FileVerdict(NamedTuple):
 
 
 def validate(
-    files: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="FILES",
-            help="Scenes, studies and cameras (YAML files or names), calibrations of OpenCV (YAML), vehicles (MJCF),"
-            " catalogs and LED maps (ECSV).",
-        ),
-    ] = None,
+    files: Annotated[list[Path] | None, typer.Argument(metavar="FILES")] = None,
     program: Programs = None,
-    schema: Annotated[
-        str | None,
-        typer.Option(help="Print the JSON Schema of a kind of file: scene or study."),
-    ] = None,
+    schema: str | None = None,
     json: Json = False,
 ) -> None:
-    """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid."""
+    """Check files: keys, units, consistency, and whether a scene can be set up. Exit code 2 if one is invalid.
+
+    Parameters
+    ----------
+    files
+        Scenes, studies and cameras (YAML files or names), calibrations of OpenCV (YAML), vehicles (MJCF),
+        catalogs and LED maps (ECSV).
+    schema
+        Print the JSON Schema of a kind of file: scene or study.
+    """
     if schema is not None:
         from skysim.apps.cli import json_schema
 

@@ -9,7 +9,6 @@ from nicegui import ui
 from nicegui.events import KeyEventArguments
 
 from skysim.apps.gui.views import context, keys, widgets
-from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import geometry
 
 Action = Callable[[], Awaitable[None] | None]
@@ -135,13 +134,11 @@ class Actions:
     def __init__(
         self,
         page: context.PageContext,
-        sensor: SensorView,
         step: Callable[[int], Awaitable[None]],
         performers: Mapping[str, Action],
         others: Sequence[Command],
     ) -> None:
         self.page = page
-        self.sensor = sensor
         self.step = step
         self.palette = Palette(self.commands)
         self.performers = {**performers, "help": self.palette.open}
@@ -197,7 +194,7 @@ class Actions:
                 steps = self.steps.tolist()
                 self.steps = np.zeros(3)
                 await self.page.show_live("move", *steps, self.page.solving)
-                await self.sensor.wait_drawn()
+                await self.page.sensor.wait_drawn()
         finally:
             self.moving = False
 

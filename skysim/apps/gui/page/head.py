@@ -20,9 +20,7 @@ class Head:
         Folder in which scenes are saved
     """
 
-    def __init__(
-        self, page: context.PageContext, contents: live.Contents, folder: Path
-    ) -> None:
+    def __init__(self, page: context.PageContext, folder: Path) -> None:
         self.page = page
         self.folder = folder
         with widgets.div("lab-head"):
@@ -34,22 +32,26 @@ class Head:
                 on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
-            self.banner = live.LiveText(contents, "live").classes("lab-banner").mark("banner")
+            self.banner = (
+                live.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
+            )
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
             self.title = ui.label().classes("lab-title quiet ellipsis")
-            self.message = (
+            page.message = (
                 ui.label().classes("lab-said").props('role="status"').mark("message")
             )
-            self.busy = (
+            page.busy = (
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
-            self.latency = live.LiveText(contents).classes("lab-rate mono quiet").mark("rate")
-            self.latency.props('title="latency: from the request for a frame to its arrival"')
+            page.latency = (
+                live.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
+            )
+            page.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
                 "dense size=xs"
             )
-            self.identify = ui.switch("identify", value=True).props("dense size=xs")
+            page.identifying = ui.switch("identify", value=True).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
                 for name in image_export.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))

@@ -143,10 +143,9 @@ class MonteCarloPanel:
 
     async def set_field_of_view(self) -> None:
         """Change the scene's field of view by the focal length."""
-        state = self.page.state
         field_deg = float(self.field.value or 0)
         change = await self.page.run_here(
-            forms.field_override, state.scene, state.overrides, field_deg
+            forms.field_override, *self.page.state.opened, field_deg
         )
         if change is not None:
             await self.page.apply_overrides(change)

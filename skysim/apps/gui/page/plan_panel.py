@@ -264,7 +264,7 @@ class PlanPanel:
         scene = self.page.state.scene
         with self.working():
             overrides = await self.page.run_here(
-                survey_flight, scene, self.page.state.overrides, self.plan.angles_deg
+                survey_flight, *self.page.state.opened, self.plan.angles_deg
             )
             if overrides and self.page.is_open and await self.page.open(scene, overrides):
                 self.page.show_panel("Run")

@@ -17,8 +17,7 @@ from skysim.apps.gui.messages import (
     places_px,
 )
 from skysim.apps.gui.views import context, overlay, widgets
-from skysim.apps.gui.views.live import Contents, LiveInput, LiveText, format_number
-from skysim.apps.gui.views.sensor import SensorView
+from skysim.apps.gui.views.live import LiveInput, LiveText, format_number
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Record
 
@@ -28,17 +27,10 @@ ANGLES_JS = (
 
 
 class AttitudeCard:
-    """True and estimated angles with the error, and the algorithms of the tracker's four stages.
+    """True and estimated angles with the error, and the algorithms of the tracker's four stages."""
 
-    Attributes
-    ----------
-    contents
-        Contents of the tab's live fields
-    """
-
-    def __init__(self, page: context.PageContext, contents: Contents) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.contents = contents
         with widgets.div("lab-card"):
             with widgets.div("lab-grid"):
                 widgets.quiet("attitude")
@@ -47,17 +39,19 @@ class AttitudeCard:
                 self.inputs = [self.angle_input(n) for n in range(3)]
                 widgets.quiet("tracker")
                 self.estimates = [
-                    LiveText(contents, "–").classes("mono num") for _ in range(3)
+                    LiveText(page.contents, "–").classes("mono num") for _ in range(3)
                 ]
                 widgets.quiet("error")
-                self.errors = [LiveText(contents, "–").classes("mono num") for _ in range(3)]
+                self.errors = [
+                    LiveText(page.contents, "–").classes("mono num") for _ in range(3)
+                ]
             self.status = (
-                LiveText(contents).classes("mono ellipsis lab-status").mark("status")
+                LiveText(page.contents).classes("mono ellipsis lab-status").mark("status")
             )
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
-        field = LiveInput(self.contents, "text").props(f'aria-label="angle {n + 1}"')
+        field = LiveInput(self.page.contents, "text").props(f'aria-label="angle {n + 1}"')
         return (
             field.classes("mono lab-angle")
             .mark(f"angle-{n}")
@@ -156,14 +150,14 @@ class LightsPanel:
         Number of the frame in the table
     """
 
-    def __init__(self, sensor: SensorView) -> None:
-        self.sensor = sensor
+    def __init__(self, page: context.PageContext) -> None:
+        self.page = page
         self.sent = 0
         self.table = LightsTable().mark("lights")
 
     def update(self) -> None:
         """Send the table if the sensor shows another frame; called every UPDATE_S while the panel is open."""
-        sensor = self.sensor
+        sensor = self.page.sensor
         if self.sent == sensor.sent_number:
             return
         self.sent = sensor.sent_number

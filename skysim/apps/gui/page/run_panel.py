@@ -14,7 +14,6 @@ from nicegui import ui
 from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import context, forms, live, widgets
-from skysim.apps.gui.views.sensor import SensorView
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 TIME_S = attrgetter("t_s")  # time of a row
@@ -30,10 +29,6 @@ class RunPanel:
 
     Attributes
     ----------
-    sensor
-        Sensor view, which shows the frames
-    contents
-        Contents of the tab's live fields
     feedback
         Feedback of the scene's controller; empty without a controller
     rows, log
@@ -66,12 +61,8 @@ class RunPanel:
     started_s = 0.0
     drawn_s = 0.0
 
-    def __init__(
-        self, page: context.PageContext, contents: live.Contents, sensor: SensorView
-    ) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.contents = contents
-        self.sensor = sensor
         self.when_shown: Callable[[], None] | None = None
         self.factor = SPEEDS["real time"]
         self.slot = ui.context.slot
@@ -98,17 +89,19 @@ class RunPanel:
             "instant-feedback"
         )
         with widgets.row(3):
-            self.seek = live.LiveInput(self.contents, "range").props(
+            self.seek = live.LiveInput(self.page.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
             )
             self.seek.classes("lab-seek").on(
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
-            self.clock = live.LiveText(self.contents).classes("mono flex-none").mark("clock")
+            self.clock = (
+                live.LiveText(self.page.contents).classes("mono flex-none").mark("clock")
+            )
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
-        self.strips = StripChart(self.contents)
+        self.strips = StripChart(self.page.contents)
         self.clear()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
@@ -241,7 +234,7 @@ class RunPanel:
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once
         self.strips.draw(
-            strips(self.rows, self.log, lights), max(ends, default=1.0), self.sensor.name
+            strips(self.rows, self.log, lights), max(ends, default=1.0), self.page.sensor.name
         )
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
@@ -362,7 +355,7 @@ class RunPanel:
         self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
         self.strips.set_moment(view.t_s)
         self.page.show_frame(view, kind="flight", t_s=view.t_s)
-        await self.sensor.wait_drawn()
+        await self.page.sensor.wait_drawn()
 
     def download(self) -> None:
         ui.download(

@@ -9,6 +9,7 @@ from nicegui import run, ui
 
 from skysim.apps.gui.views import context, forms, keys, live, widgets
 from skysim.core.errors import InputError
+from skysim.core.yaml_reader import OverrideTexts
 
 SENSOR = "sensor, F6"
 IDENTIFIER = "identifier, F7"
@@ -65,6 +66,8 @@ class KeyForm:
         Function that returns the label of a field from its key
     opens
         Group that is open at first
+    shown
+        Scene and overrides in the form; None if the scene has been opened since then
     scene
         Scene whose fields are shown
     rows
@@ -72,6 +75,8 @@ class KeyForm:
     expansions
         Expandable parts by group
     """
+
+    shown: tuple[str, OverrideTexts] | None = None
 
     def __init__(
         self,
@@ -87,8 +92,13 @@ class KeyForm:
         self.expansions: dict[str, ui.expansion] = {}
         self.scene = ""
 
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
+        """Show the fields of the current scene."""
+        raise NotImplementedError
+
     def hide_others(self, scene: str) -> None:
         """Hide the fields of another scene until those of this one are shown: what is typed there would be lost."""
+        self.shown = None  # the file of this name may have changed
         self.parts.set_visibility(self.scene == scene)
 
     def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
@@ -205,7 +215,7 @@ class KeyForm:
         entry.update()
 
 
-class ScenePanel:
+class ScenePanel(KeyForm):
     """The form with one part per section of the scene, a search field for keys, and a button to save a new scene file.
 
     Attributes
@@ -214,17 +224,13 @@ class ScenePanel:
         Folder of the saved scenes
     saved
         Function that is called when a scene has been saved
-    shown
-        Scene and overrides in the form
     """
 
     def __init__(
         self, page: context.PageContext, folder: Path, saved: Callable[[], None]
     ) -> None:
-        self.page = page
         self.folder = folder
         self.saved = saved
-        self.shown: forms.Opened | None = None
         with widgets.row().style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=self.search)
             self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
@@ -238,12 +244,12 @@ class ScenePanel:
             )
         self.no_match = ui.label("No key contains this text.").classes("w-full empty")
         self.no_match.set_visibility(False)
-        self.form = KeyForm(page, lambda field: field.key.removeprefix(f"{field.section}."))
+        super().__init__(page, lambda field: field.key.removeprefix(f"{field.section}."))
 
     def set_scene(self, fields: Sequence[forms.FormField]) -> None:
         """Show the fields of the current scene."""
         sections = dict.fromkeys(field.section for field in fields)
-        self.form.show(
+        self.show(
             {name: [field for field in fields if field.section == name] for name in sections}
         )
         self.undo.set_visibility(bool(self.page.state.overrides))
@@ -253,14 +259,14 @@ class ScenePanel:
         """Show only keys that contain the search text, and sections with such keys; open the first if none is open."""
         text = (self.find.value or "").lower()
         visible = set()
-        for key, row in self.form.rows.items():
+        for key, row in self.rows.items():
             row.box.set_visibility(text in key.lower())
             if text in key.lower():
                 visible.add(row.field.section)
-        for section, expansion in self.form.expansions.items():
+        for section, expansion in self.expansions.items():
             expansion.set_visibility(section in visible)
         self.no_match.set_visibility(not visible)
-        expansions = self.form.expansions.values()
+        expansions = self.expansions.values()
         first = next((item for item in expansions if item.visible), None)
         if (
             self.find.value
@@ -274,9 +280,8 @@ class ScenePanel:
         info = self.page.scene_info
         title_before = info.scene.title.removesuffix(", changed") if info else ""
         title = f"{title_before}, changed" if title_before else name
-        state = self.page.state
         path = await self.page.run_here(
-            forms.save, self.folder, name, state.scene, state.overrides, title
+            forms.save, self.folder, name, *self.page.state.opened, title
         )
         if path is None:
             return
@@ -287,30 +292,24 @@ class ScenePanel:
 
     async def revert(self) -> None:
         """Reopen the scene without overrides."""
-        self.form.scene = ""  # forces a rebuild, which also removes refused values
+        self.scene = ""  # forces a rebuild, which also removes refused values
         await self.page.open(self.page.state.scene)
 
 
-class TrackerPanel:
+class TrackerPanel(KeyForm):
     """The settings of F6 and F7 in PTASE: image processing with the sensor's noise, and identification.
 
-    It has a form of two parts, without keys that have no effect.
-
-    Attributes
-    ----------
-    shown
-        Scene and overrides in the form
+    It is a form of two parts, without keys that have no effect.
     """
 
     def __init__(self, page: context.PageContext) -> None:
-        self.shown: forms.Opened | None = None
         names = {key: name for group in NAMES.values() for key, name in group.items()}
-        self.form = KeyForm(page, lambda field: names[field.key], opens=SENSOR)
+        super().__init__(page, lambda field: names[field.key], opens=SENSOR)
 
     def set_scene(self, fields: Sequence[forms.FormField]) -> None:
         """Show the fields of the current scene."""
         offered = {field.key: field for field in fields if not field.no_effect}
-        self.form.show(
+        self.show(
             {
                 group: [offered[key] for key in NAMES[group] if key in offered]
                 for group in NAMES
@@ -320,7 +319,7 @@ class TrackerPanel:
     def open(self, action: str) -> None:
         """Show the part of an action (sensor or identifier) and focus its first field."""
         group = SENSOR if action == "sensor" else IDENTIFIER
-        if group in self.form.expansions:
-            self.form.expansions[group].open()
-            if row := self.form.rows.get(next(iter(NAMES[group]))):
+        if group in self.expansions:
+            self.expansions[group].open()
+            if row := self.rows.get(next(iter(NAMES[group]))):
                 ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)

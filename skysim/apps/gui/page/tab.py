@@ -2,8 +2,7 @@
 
 import asyncio
 import secrets
-import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,11 +23,21 @@ from skysim.apps.gui.page import (
     settings_panel,
 )
 from skysim.apps.gui.page.actions import Action, Actions, Command
-from skysim.apps.gui.views import forms, keys, live, overlay, sensor, space, style, widgets
+from skysim.apps.gui.views import (
+    context,
+    forms,
+    keys,
+    live,
+    overlay,
+    sensor,
+    space,
+    style,
+    widgets,
+)
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker import image_export
 from skysim.apps.gui.worker.photo import Photo
-from skysim.apps.gui.worker.session import Session, WorkerLost
+from skysim.apps.gui.worker.session import Session
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 
@@ -36,13 +45,11 @@ PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of 
 PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
 
 
-class Tab:
-    """One tab: its worker, its scene, and its page elements. It is the `PageContext` of its parts.
+class Tab(context.PageContext):
+    """One tab: its worker, its scene, and its page elements.
 
     Attributes
     ----------
-    session
-        Its worker, once it has one
     new_session
         Function that returns another worker, None if there are too many
     folder
@@ -53,22 +60,11 @@ class Tab:
         Live cameras that it may watch
     user
         Its browser, by `server.user_of`
-    state, scene_info, view, is_open, message_text
-        As in `PageContext`
-    contents
-        Contents of the fields that change with every frame
-    editing, filling
-        Locks that are held while the scene is changed, or a form of its keys is filled
+    filling
+        Lock that is held while a form of the scene's keys is filled
     """
 
-    session: Session
     new_session: Callable[[], Session | None]
-
-    scene_info: SceneInfo | None = None
-    view: FrameView | None = None
-    is_open = True
-    message_text = ""
-    restarting = False
 
     def __init__(
         self, scene: str, folder: Path, out: Path, cameras: Sequence[str] = (), user: str = ""
@@ -125,13 +121,13 @@ class Tab:
             dark_page=style.DARK["ground"],
         )
         with widgets.div("lab"):
-            self.head = head.Head(self, self.contents, self.folder)
+            self.head = head.Head(self, self.folder)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
             with widgets.div("lab-side"):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")
-                self.attitude = readouts.AttitudeCard(self, self.contents)
+                self.attitude = readouts.AttitudeCard(self)
                 await self.build_panels()
             with widgets.div("lab-keys").mark("keys"):
                 for key in keys.KEYS:
@@ -147,9 +143,7 @@ class Tab:
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
         )
-        self.actions = Actions(
-            self, self.sensor, self.run_panel.step, self.performers(), self.commands()
-        )
+        self.actions = Actions(self, self.run_panel.step, self.performers(), self.commands())
         # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
@@ -157,7 +151,7 @@ class Tab:
     async def build_panels(self) -> None:
         with widgets.div("lab-panes"):
             with widgets.div("lab-space-pane"):
-                self.scene_3d = space.Scene3D(self, self.sensor)
+                self.scene_3d = space.Scene3D(self)
             head.Arrangement.splitter("space", "horizontal", "Height of the 3-D view")
             with ui.tabs().props(
                 "dense align=left no-caps indicator-color=primary"
@@ -170,14 +164,14 @@ class Tab:
                 self.tabs, value=PANELS[0], animated=False, keep_alive=True
             ).classes("lab-panels"):
                 with ui.tab_panel("Lights"):
-                    self.lights = readouts.LightsPanel(self.sensor)
+                    self.lights = readouts.LightsPanel(self)
                 with ui.tab_panel("Scene"):
-                    self.scene_panel = settings_panel.ScenePanel(
+                    scene_panel = settings_panel.ScenePanel(
                         self, self.folder, self.head.update_scenes
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.run_panel = run_panel.RunPanel(self, self.contents, self.sensor)
+                    self.run_panel = run_panel.RunPanel(self)
                 with ui.tab_panel("Plan"):
                     self.plan_panel = plan_panel.PlanPanel(
                         self, self.scene_3d, self.run_panel
@@ -194,6 +188,8 @@ class Tab:
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
                     self.log_panel = log_panel.LogPanel(self)
+                    self.log = self.log_panel.add
+        self.forms = {"Scene": scene_panel, "Tracker": self.tracker_panel}
         self.tabs.on_value_change(self.fill_form)
 
     def update_lights(self) -> None:
@@ -281,7 +277,7 @@ class Tab:
         try:
             wanted = PageView.from_query(query, self.head.scenes())
             if wanted:
-                await asyncio.to_thread(forms.validated_scene, wanted.scene, wanted.overrides)
+                await asyncio.to_thread(forms.validated_scene, *wanted.opened)
         except InputError as error:
             self.show_message(live.for_page(error))
             return
@@ -291,12 +287,9 @@ class Tab:
     async def restore(self, wanted: PageView) -> None:
         """Restore a view: open its scene if it is another one, point the camera, then fly or replay."""
         now = self.state
-        is_shown = self.view is not None and (now.scene, now.overrides) == (
-            wanted.scene,
-            wanted.overrides,
-        )
+        is_shown = self.view is not None and now.opened == wanted.opened
         if not is_shown or wanted.angles_deg is None:
-            if not await self.open(wanted.scene, wanted.overrides, wanted.angles_deg):
+            if not await self.open(*wanted.opened, wanted.angles_deg):
                 return
         elif wanted.kind == "live" and (
             now.kind != "live" or now.angles_deg != wanted.angles_deg
@@ -346,11 +339,8 @@ class Tab:
         self.scene_info, view = result
         self.set_state(scene=scene, overrides=overrides)
         self.set_scene(self.scene_info)
-        self.show_live_view(view)
-        self.scene_panel.shown = self.tracker_panel.shown = (
-            None  # the file of this name may have changed
-        )
-        for form in (self.scene_panel.form, self.tracker_panel.form):
+        self.show_frame(view, kind="live", angles_deg=view.angles_deg)
+        for form in self.forms.values():
             form.hide_others(scene)
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
@@ -366,42 +356,18 @@ class Tab:
         self.plan_panel.set_scene()
         self.study_panel.set_scene()
 
-    async def apply_overrides(
-        self, overrides: OverrideTexts, dropped: Collection[str] = ()
-    ) -> None:
-        """Reopen the scene with further overrides and without some; concurrent edits are done one after another."""
-        async with self.editing:
-            kept = {
-                key: text for key, text in self.state.overrides.items() if key not in dropped
-            }
-            await self.open(self.state.scene, {**kept, **overrides})
-
     async def fill_form(self) -> None:
         """Show the keys of the current scene in the panel of keys that is open; not in others, as it takes a while."""
-        panels: dict[str, settings_panel.ScenePanel | settings_panel.TrackerPanel] = {
-            "Scene": self.scene_panel,
-            "Tracker": self.tracker_panel,
-        }
-        panel = panels.get(str(self.tabs.value))
+        form = self.forms.get(str(self.tabs.value))
         async with self.filling:
-            while panel and self.view and self.is_open and panel.shown != self.opened:
-                current = self.opened
+            while form and self.view and self.is_open and form.shown != self.state.opened:
+                current = self.state.opened
                 fields = await run.io_bound(forms.fields, *current)
-                if self.is_open and self.opened == current:
-                    panel.set_scene(fields)
-                    panel.shown = current
-
-    @property
-    def opened(self) -> forms.Opened:
-        """The open scene and its overrides."""
-        return self.state.scene, self.state.overrides
+                if self.is_open and self.state.opened == current:
+                    form.set_scene(fields)
+                    form.shown = current
 
     # Contents of the page.
-
-    @property
-    def solving(self) -> bool:
-        """Whether every frame is solved."""
-        return bool(self.head.identify.value)
 
     def set_state(self, **changes: Any) -> None:
         """Change fields of the page's view, and the banner."""
@@ -423,9 +389,6 @@ class Tab:
         self.scene_3d.show(view)
         self.sensor.show(view, self.scene_info)
 
-    def show_live_view(self, view: FrameView) -> None:
-        self.show_frame(view, kind="live", angles_deg=view.angles_deg)
-
     def show_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the current scene: a photograph, or a replayed trial.
 
@@ -438,84 +401,8 @@ class Tab:
         self.attitude.show(photo, photo)
         self.sensor.show(photo, photo)
 
-    def show_panel(self, name: str) -> None:
-        """Open one of PANELS."""
-        self.tabs.set_value(name)
-
     def stop_playback(self) -> None:
         """Stop playback, a pushed vehicle and the live camera before the sensor view shows something else."""
         self.run_panel.pause()
         self.scene_3d.push.stop()
         self.photo.stop()
-
-    def show_message(self, text: str, color: str = "warn") -> None:
-        """Show a message in the page header until the next action; warnings are also logged."""
-        if text == self.message_text:
-            return
-        self.message_text = text
-        label = self.head.message
-        label.props["title"] = text  # tooltip with the full text
-        label.set_text(text)
-        label.classes(remove="good warn quiet", add=color)
-        if text and color == "warn":
-            self.log(text)
-
-    def log(self, text: str) -> None:
-        """Add a line to the log."""
-        self.log_panel.add(text)
-
-    # Tasks of the worker.
-
-    async def ask(self, task: str, *arguments: Any) -> Any:
-        """Result of a task of the worker; None after an error, which is shown, or if the tab has been closed."""
-        try:
-            result = await self.session.run(task, *arguments)
-        except InputError as error:
-            if self.is_open:
-                self.show_message(live.for_page(error))
-            return None
-        except WorkerLost as error:
-            if self.is_open and not self.restarting:
-                self.restarting = True
-                self.show_message(f"{error}; a new one shows the view again")
-                try:
-                    await self.restart()
-                finally:
-                    self.restarting = False
-            return None
-        return result if self.is_open else None
-
-    async def run_here(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Result of a function that runs in a thread of the server; None after an error, which is shown."""
-        try:
-            return await run.io_bound(function, *arguments)
-        except InputError as error:
-            self.show_message(live.for_page(error))
-            return None
-
-    async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
-        """Run a task as `ask` does, while the page is marked as busy.
-
-        Parameters
-        ----------
-        activity
-            Message until the task ends; it replaces an older one
-        """
-        self.show_message(activity, "quiet")
-        self.head.busy.set_visibility(True)
-        try:
-            return await self.ask(task, *arguments)
-        finally:
-            if self.is_open:
-                self.head.busy.set_visibility(False)
-                if activity and self.message_text == activity:
-                    self.show_message("")
-
-    async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
-        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab."""
-        begin = time.perf_counter()
-        view = await self.ask(task, *arguments)
-        if view is not None:
-            self.head.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
-            self.show_live_view(view)
-        return view

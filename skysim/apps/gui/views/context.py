@@ -1,21 +1,36 @@
-"""The interface of the page for its parts. The page implements it; no part imports the page."""
+"""The page for its parts: its state, the requests to its worker, and what its parts ask of it.
 
+`page.tab.Tab` adds the elements and the rest of the actions; no part imports it.
+"""
+
+import asyncio
+import time
 from collections.abc import Callable, Collection
-from typing import Any, Protocol
+from typing import Any
+
+from nicegui import run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.views import live
+from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.views.state import PageView
 from skysim.apps.gui.worker.photo import Photo
+from skysim.apps.gui.worker.session import Session, WorkerLost
+from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 
 
-class PageContext(Protocol):
+class PageContext:
     """The page for its parts: its contents, requests to its worker, and notifications.
 
     If a request fails, the error is shown in the page header, and the result is None or False.
 
     Attributes
     ----------
+    session
+        Its worker, once it has one
+    editing
+        Lock that is held while the scene is changed
     state
         View of the page, which its address contains
     scene_info
@@ -24,28 +39,69 @@ class PageContext(Protocol):
         Newest frame of the scene; None before the first
     message_text
         Message in the page header
-    solving
-        Whether every frame is solved
     is_open
         Whether the browser still has the page
+    message, busy, latency, identifying
+        Elements of the page header: the message, the mark of a long task, the time of the last frame, and the switch
+        whether every frame is solved
+    sensor, tabs
+        Sensor view, and tabs of the panels
+    contents
+        Contents of the fields that change with every frame
+    log
+        Function that adds a line to the log
     """
 
+    session: Session
+    editing: asyncio.Lock
     state: PageView
-    scene_info: SceneInfo | None
-    view: FrameView | None
-    is_open: bool
-    message_text: str
+    scene_info: SceneInfo | None = None
+    view: FrameView | None = None
+    is_open = True
+    restarting = False
+    message_text = ""
+    message: ui.label
+    busy: ui.icon
+    latency: live.LiveText
+    identifying: ui.switch
+    sensor: SensorView
+    tabs: ui.tabs
+    contents: live.Contents
+    log: Callable[[str], None]
 
     @property
-    def solving(self) -> bool: ...
+    def solving(self) -> bool:
+        """Whether every frame is solved."""
+        return bool(self.identifying.value)
 
     # Requests to the worker.
 
     async def ask(self, task: str, *arguments: Any) -> Any:
-        """Return the result of a task."""
+        """Result of a task of the worker; None after an error, which is shown, or if the tab has been closed."""
+        try:
+            result = await self.session.run(task, *arguments)
+        except InputError as error:
+            if self.is_open:
+                self.show_message(live.for_page(error))
+            return None
+        except WorkerLost as error:
+            if self.is_open and not self.restarting:
+                self.restarting = True
+                self.show_message(f"{error}; a new one shows the view again")
+                try:
+                    await self.restart()
+                finally:
+                    self.restarting = False
+            return None
+        return result if self.is_open else None
 
     async def run_here(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Return the result of a function that runs in a thread of the server."""
+        """Result of a function that runs in a thread of the server; None after an error, which is shown."""
+        try:
+            return await run.io_bound(function, *arguments)
+        except InputError as error:
+            self.show_message(live.for_page(error))
+            return None
 
     async def run_task(self, task: str, *arguments: Any, activity: str = "") -> Any:
         """Run a task as `ask` does, while the page is marked as busy.
@@ -55,9 +111,27 @@ class PageContext(Protocol):
         activity
             Message until the task ends; it replaces an older one
         """
+        self.show_message(activity, "quiet")
+        self.busy.set_visibility(True)
+        try:
+            return await self.ask(task, *arguments)
+        finally:
+            if self.is_open:
+                self.busy.set_visibility(False)
+                if activity and self.message_text == activity:
+                    self.show_message("")
 
     async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
-        """Show the frame of the live scene that a task renders."""
+        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab."""
+        begin = time.perf_counter()
+        view = await self.ask(task, *arguments)
+        if view is not None:
+            self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
+            self.show_frame(view, kind="live", angles_deg=view.angles_deg)
+        return view
+
+    async def restart(self) -> None:
+        """Show the view again with a new worker after the old one has ended."""
 
     async def open(
         self,
@@ -66,19 +140,34 @@ class PageContext(Protocol):
         angles_deg: Triple | None = None,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
+        raise NotImplementedError
 
     async def apply_overrides(
         self, overrides: OverrideTexts, dropped: Collection[str] = ()
     ) -> None:
-        """Reopen the scene with further overrides and without some."""
+        """Reopen the scene with further overrides and without some; concurrent edits are done one after another."""
+        async with self.editing:
+            kept = {
+                key: text for key, text in self.state.overrides.items() if key not in dropped
+            }
+            await self.open(self.state.scene, {**kept, **overrides})
 
     # Notifications.
 
     def show_message(self, text: str, color: str = "warn") -> None:
-        """Show a message in the page header until the next action."""
+        """Show a message in the page header until the next action; warnings are also logged."""
+        if text == self.message_text:
+            return
+        self.message_text = text
+        self.message.props["title"] = text  # tooltip with the full text
+        self.message.set_text(text)
+        self.message.classes(remove="good warn quiet", add=color)
+        if text and color == "warn":
+            self.log(text)
 
-    def log(self, text: str) -> None:
-        """Add a line to the log."""
+    def show_panel(self, name: str) -> None:
+        """Open a panel by its name."""
+        self.tabs.set_value(name)
 
     def set_state(self, **changes: Any) -> None:
         """Change fields of `state`."""
@@ -92,7 +181,7 @@ class PageContext(Protocol):
             Changes of `state` that belong to the frame
         """
 
-    def show_photo(self, image: Photo, /, **state: Any) -> None:
+    def show_photo(self, photo: Photo, /, **state: Any) -> None:
         """Show an image that is not of the current scene: a photograph, or a replayed trial.
 
         Parameters
@@ -103,6 +192,3 @@ class PageContext(Protocol):
 
     def stop_playback(self) -> None:
         """Stop playback, a pushed vehicle and the live camera before something else is shown."""
-
-    def show_panel(self, name: str) -> None:
-        """Open a panel by its name."""

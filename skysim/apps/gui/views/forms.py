@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping
 from functools import cache
-from math import isfinite, radians, tan
+from math import radians, tan
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -14,10 +14,10 @@ from pydantic import BaseModel, ValidationError
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Record
-from skysim.core.units import si_unit
 from skysim.core.yaml_reader import OverrideTexts, read_yaml
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
+from skysim.scene.provenance import plain
 from skysim.scene.scene import NAME_ALIAS, Scene
 from skysim.scene.sections.motion import expand_control
 from skysim.tracking import factory as tracker_settings
@@ -82,7 +82,6 @@ FIRST_VALUES: Record = {
     "inclination_deg": 51.6,
 }
 ONE_KIND = ("light",)
-Opened = tuple[str, OverrideTexts]  # a scene and its overrides
 
 
 class FormField(NamedTuple):
@@ -175,7 +174,7 @@ def section_fields(
             # The path of a shipped file is shortened to its name in scenes/.
             if isinstance(subtree, str) and subtree.startswith(str(SCENES)):
                 subtree = str(Path(subtree).relative_to(SCENES))
-            text = yaml_line(subtree if is_set else file_value(value, si_unit(name)))
+            text = yaml_line(subtree if is_set else plain(value, name))
             match = UNIT_SUFFIX.search(file_key)
             unit = DISPLAY_UNITS[match[1]] if match else ""
             yield FormField(key, text, unit, allowed_values(annotation), is_set)
@@ -279,7 +278,7 @@ def with_kind(name: str, overrides: OverrideTexts, section: str, kind: str) -> d
     model = models(info.annotation)[kind]
     now = section_at(load(name, overrides), section)[1]
     kept = {
-        info.alias or field: file_value(getattr(now, field), si_unit(field))
+        info.alias or field: plain(getattr(now, field), field)
         for field, info in model.model_fields.items()
         if field in getattr(now, "model_fields_set", ())
         and field != "kind"
@@ -299,17 +298,6 @@ def section_at(scene: Scene, key: str) -> tuple[Any, Any]:
         info = model.model_fields[name]
         value = getattr(value, name)
     return info, value
-
-
-def file_value(value: Any, unit: str) -> Any:
-    """Convert a validated value to what a file would contain: plain types, with the unit."""
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json", by_alias=True)
-    if isinstance(value, tuple | list):
-        return [file_value(item, unit) for item in value]
-    if unit and isinstance(value, float):
-        return f"{value:.6g} {unit}" if isfinite(value) else "infinity"
-    return value
 
 
 def yaml_line(value: Any) -> str:

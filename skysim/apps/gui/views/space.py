@@ -13,7 +13,6 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.views import context, style, widgets
-from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats, Ints
 
@@ -42,9 +41,8 @@ class Scene3D:
         Whether `update` will be called
     """
 
-    def __init__(self, page: context.PageContext, sensor: SensorView) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.sensor = sensor
         self.newest_view: FrameView | None = None
         self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
@@ -60,7 +58,7 @@ class Scene3D:
             "drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom"
         )
         hint.classes("lab-turn")
-        self.push = PushControl(page, sensor, self.canvas, self.update)
+        self.push = PushControl(page, self.canvas, self.update)
 
     def look(self, name: str) -> None:
         """Look from a preset place, also to reset a view that the user has turned."""
@@ -92,7 +90,9 @@ class Scene3D:
         if view is None or not self.page.is_open:
             return
         found = view.result.detections if view.result else ()
-        identified = {spot.id: self.sensor.name(spot.id) for spot in found if spot.id >= 0}
+        identified = {
+            spot.id: self.page.sensor.name(spot.id) for spot in found if spot.id >= 0
+        }
         fields = {"wxyz": view.body_wxyz, "seen": view.lights.id.tolist()}
         self.canvas.run_method("show", fields | {"identified": list(identified.items())})
 
@@ -122,12 +122,10 @@ class PushControl:
     def __init__(
         self,
         page: context.PageContext,
-        sensor: SensorView,
         canvas: ui.element,
         moved: Callable[[], None],
     ) -> None:
         self.page = page
-        self.sensor = sensor
         self.moved = moved
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
@@ -172,7 +170,7 @@ class PushControl:
             self.moved()
             self.label.set_text(f"{pushed.torque_nm:.3g} N m   {pushed.rate_deg_s:.3g} °/s")
             self.bar.set_visibility(True)
-            await self.sensor.wait_drawn()
+            await page.sensor.wait_drawn()
         if page.is_open and self.motion is motion:
             self.stop()
 

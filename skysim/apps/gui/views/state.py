@@ -49,6 +49,11 @@ class PageView:
     trial: int = -1
     photo: str = ""
 
+    @property
+    def opened(self) -> tuple[str, Mapping[str, str]]:
+        """The scene and its overrides."""
+        return self.scene, self.overrides
+
     def query(self) -> str:
         """The view as the query of an address, without default values."""
         pairs = [

@@ -6,17 +6,15 @@ pixels arrive.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numba
+import cv2
 import numpy as np
 from astropy.visualization import ZScaleInterval
-from numba import float32, int32, uint32, uint64
 from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import Display, Pixels
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.jit import jit
 from skysim.core.types import Record
 from skysim.results import plots
 
@@ -125,77 +123,15 @@ def shades(
         (np.arange(int(integers.max()) + 1) - low) / max(high - low, 1e-9), 0, 1
     )
     table = np.rint((SHADES - 1) * plots.CURVES[curve](fraction)).astype(np.uint8)
-    shaded = np.empty((rows, columns), np.uint8)
-    _shade(integers, table, shaded)
-    if len(table) - 1 >= saturation:
-        _mark(integers, math.ceil(max(saturation, 0.0)), shaded)
+    mean = cv2.resize(integers, (columns, rows), interpolation=cv2.INTER_AREA)
+    shaded = np.take(table, mean)
+    if len(table) > saturation:
+        # A pixel is smaller than an area, so its corners lie in all areas that it overlaps.
+        y, x = np.divmod(np.flatnonzero(integers >= saturation), width)
+        for row in (y * rows // height, ((y + 1) * rows - 1) // height):
+            for column in (x * columns // width, ((x + 1) * columns - 1) // width):
+                shaded[row, column] = SATURATED
     return shaded
-
-
-# Heights are integers: the height of a pixel is the number of rows of areas, the height of an area is the number of
-# rows of pixels. So no rounding assigns a pixel to an area that it does not overlap.
-
-
-@jit(parallel=True)
-def _shade(integers: Any, table: Any, shaded: Any) -> None:
-    """Write the shade of the mean over each area.
-
-    Indices are unsigned, which saves numba's check for negative ones in the inner loops.
-    """
-    height, width = integers.shape
-    rows, columns = shaded.shape
-    first = np.empty(columns, np.uint32)
-    last = np.empty(columns, np.uint32)
-    # shares of the first and last pixel
-    head = np.empty(columns, np.float32)
-    tail = np.empty(columns, np.float32)
-    for column in range(columns):
-        left = column * width
-        right = (column + 1) * width
-        first[column] = left // columns
-        last[column] = (right - 1) // columns
-        head[column] = (min(right, (left // columns + 1) * columns) - left) / width
-        tail[column] = (
-            (right - last[column] * columns) / width if last[column] > first[column] else 0.0
-        )
-    inner = float32(columns / width)
-    last_level = int32(table.size - 1)
-    for row in numba.prange(rows):
-        top = row * height
-        bottom = (row + 1) * height
-        total = np.zeros(width, np.float32)
-        mean = np.empty(columns, np.float32)
-        for y in range(top // rows, (bottom - 1) // rows + 1):
-            share = float32((min(bottom, (y + 1) * rows) - max(top, y * rows)) / height)
-            line = integers[y]
-            for x in range(width):
-                total[x] += share * float32(line[x])
-        for column in range(columns):
-            mean[column] = (
-                head[column] * total[uint64(first[column])]
-                + tail[column] * total[uint64(last[column])]
-            )
-            for x in range(uint64(first[column]) + uint64(1), uint64(last[column])):
-                mean[column] += inner * total[x]
-        for column in range(columns):
-            shaded[row, column] = table[
-                uint64(uint32(min(int32(mean[column] + float32(0.5)), last_level)))
-            ]
-
-
-@jit
-def _mark(integers: Any, saturation: Any, shaded: Any) -> None:
-    """Mark the areas that a saturated pixel overlaps."""
-    height, width = integers.shape
-    rows, columns = shaded.shape
-    for y in range(height):
-        for x in range(width):
-            if integers[y, x] >= saturation:
-                top = y * rows // height
-                bottom = ((y + 1) * rows - 1) // height
-                left = x * columns // width
-                right = ((x + 1) * columns - 1) // width
-                shaded[top : bottom + 1, left : right + 1] = SATURATED
 
 
 def limits_of(levels: PixelLevels, limits: str | tuple[float, float]) -> tuple[float, float]:
