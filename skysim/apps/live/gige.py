@@ -18,7 +18,6 @@ import threading
 import time
 import uuid
 from collections import deque
-from types import MappingProxyType
 from typing import Any
 
 from skysim.apps.live.gvcp import (
@@ -30,6 +29,7 @@ from skysim.apps.live.gvcp import (
     ControlChannel,
     GvcpStatus,
     RefusedError,
+    Sender,
 )
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
@@ -58,6 +58,21 @@ XML = 0x10000
 XML_BYTES = 0x4000  # room for it
 
 PIXEL_BITS = {0x01080001: 8, 0x01100005: 12, 0x01100007: 16}  # of Mono8, Mono12, Mono16
+WRITABLE = {
+    HEARTBEAT: range(500, 600_001),
+    PRIVILEGE: range(4),
+    STREAM_PORT: range(1 << 16),
+    PACKET_SIZE: range(576, 16129),
+    PACKET_DELAY: range(10_000_001),
+    STREAM_ADDRESS: range(1 << 32),
+    PIXEL_FORMAT: PIXEL_BITS,
+    EXPOSURE_US: None,
+    ACQUISITION_MODE: range(2),
+    START: {1},
+    STOP: {1},
+    TRIGGER_MODE: range(2),
+    TRIGGER: {1},
+}
 HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
 LEADER = 1
 TRAILER = 2
@@ -92,23 +107,7 @@ class GigeCamera(Sink, ControlChannel):
         (0xA000, 0xA04C),
         (XML, XML + XML_BYTES),
     )
-    allowed = MappingProxyType(
-        {
-            HEARTBEAT: range(500, 600_001),
-            PRIVILEGE: range(4),
-            STREAM_PORT: range(1 << 16),
-            PACKET_SIZE: range(576, 16129),
-            PACKET_DELAY: range(10_000_001),
-            STREAM_ADDRESS: range(1 << 32),
-            PIXEL_FORMAT: PIXEL_BITS,
-            EXPOSURE_US: None,
-            ACQUISITION_MODE: range(2),
-            START: {1},
-            STOP: {1},
-            TRIGGER_MODE: range(2),
-            TRIGGER: {1},
-        }
-    )
+    allowed = WRITABLE
 
     def __init__(self, live: Live, host: str, port: int = GVCP_PORT) -> None:
         self.live = live
@@ -138,17 +137,6 @@ class GigeCamera(Sink, ControlChannel):
         self.block = 0
         self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
         self.entered = threading.Event()
-        self.effects = {
-            STREAM_PORT: self.open_stream,
-            PIXEL_FORMAT: self.check_stopped,
-            EXPOSURE_US: lambda us: self.command(
-                exposure_s=live.commands.exposure_s(us / 1e6)
-            ),
-            START: self.start,
-            STOP: self.stop,
-            TRIGGER_MODE: lambda mode: self.command(triggered=mode == 1),
-            TRIGGER: self.trigger,
-        }
         ControlChannel.__init__(self)
         self.fill_memory()
         Sink.__init__(self, "gige", self.send_frame, ())
@@ -163,18 +151,21 @@ class GigeCamera(Sink, ControlChannel):
         celsius = detector.temperature_c
         serial = uuid.getnode()
         for address, value in {
-            0x0000: 0x00010002,  # version 1.2
-            0x0004: 0x80000001,  # big-endian, UTF-8
-            0x0008: serial.to_bytes(8),  # address of the hardware
-            0x0010: 4,  # configured by link-local address
-            0x0014: 4,
-            ADDRESS: socket.inet_aton(self.host),
-            0x0048: b"skysim",
-            0x0068: b"star camera",
-            0x0088: __version__.encode(),
-            0x00A8: b"simulated",
-            0x00D8: b"%012x" % serial,
-            0x00E8: self.scene.name.encode()[:15],
+            0x0000: struct.pack(
+                ">IIQII12x4s32x32s32s32s48s16s15s",
+                0x00010002,  # version 1.2
+                0x80000001,  # big-endian, UTF-8
+                serial,  # address of the hardware
+                4,  # configured by link-local address
+                4,
+                socket.inet_aton(self.host),
+                b"skysim",
+                b"star camera",
+                __version__.encode(),
+                b"simulated",
+                b"%012x" % serial,
+                self.scene.name.encode(),
+            ),
             0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
             0x0600: 1,  # network interface
             0x0904: 1,  # stream channel
@@ -211,46 +202,55 @@ class GigeCamera(Sink, ControlChannel):
         if not self.live.inbox.put(command, lambda _: None):
             raise RefusedError(GvcpStatus.BUSY)
 
-    def trigger(self, _: int) -> None:
-        """Expose a frame, where frames are triggered."""
-        if not self.value(TRIGGER_MODE):
+    def effect(self, address: int, value: Any) -> None:
+        """Do what the writing of a register means.
+
+        Raises InputError for an exposure time that is not allowed, and RefusedError for a pixel format while frames
+        are sent, and for a trigger where the schedule exposes the frames.
+        """
+        if (address == PIXEL_FORMAT and self.channels) or (
+            address == TRIGGER and not self.value(TRIGGER_MODE)
+        ):
             raise RefusedError(GvcpStatus.WRITE_PROTECT)
-        self.command(trigger=True)
+        if address == EXPOSURE_US:
+            self.command(exposure_s=self.live.commands.exposure_s(value / 1e6))
+        elif address == TRIGGER_MODE:
+            self.command(triggered=value == 1)
+        elif address == TRIGGER:
+            self.command(trigger=True)
+        elif address == START:
+            # The frames whose exposure begins from now on are sent.
+            self.start_s = self.live.flight.now_s
+            self.channels = ("frame",)
+            self.entered.set()
+        elif address == STOP:
+            self.stop()
+        elif address == STREAM_PORT:
+            # A new receiver's frames are numbered from 1 on.
+            self.block = 0
 
-    def start(self, _: int) -> None:
-        """Send the frames whose exposure begins from now on."""
-        self.start_s = self.live.flight.now_s
-        self.channels = ("frame",)
-        self.entered.set()
-
-    def stop(self, _: int = 0) -> None:
+    def stop(self) -> None:
         """Send no more frames than those that wait."""
         self.channels = ()
-
-    def check_stopped(self, _: int) -> None:
-        """Raise RefusedError while frames are sent: their format must not change."""
-        if self.channels:
-            raise RefusedError(GvcpStatus.WRITE_PROTECT)
-
-    def open_stream(self, _: int) -> None:
-        """Number the frames from 1 on for a new receiver."""
-        self.block = 0
 
     # Network
 
     def serve(self) -> None:
         """Body of the thread that answers datagrams, and notices that the application in control has gone."""
-        while not self.ends:
-            # Closed sockets raise ValueError, an answer to a client that has gone OSError.
-            with contextlib.suppress(OSError, ValueError):
-                sockets = (self.socket, self.broadcasts)
-                for ready in select.select(sockets, (), (), POLL_S)[0]:
-                    self.reply(*ready.recvfrom(MOST_DATAGRAM_BYTES), ready is self.broadcasts)
-                self.check_heartbeat(time.monotonic())
+        sockets = (self.socket, self.broadcasts)
+        with self.socket, self.broadcasts, self.stream:
+            # The sink's thread ends when the frames that wait are sent.
+            while self.thread.is_alive():
+                # An answer to a client that has gone raises OSError.
+                with contextlib.suppress(OSError):
+                    for ready in select.select(sockets, (), (), POLL_S)[0]:
+                        datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
+                        self.reply(datagram, sender, ready is self.broadcasts)
+                    self.check_heartbeat(time.monotonic())
 
-    def reply(self, datagram: bytes, sender: tuple[str, int], is_broadcast: bool) -> None:
+    def reply(self, datagram: bytes, sender: Sender, is_broadcast: bool) -> None:
         """Answer a datagram, if it has an answer."""
-        # A broadcast finds a camera (command 2) and does nothing else; other machines' do not find one on the loopback address.
+        # A broadcast finds a camera (command 2) and does nothing else; on the loopback address only this machine's.
         is_foreign = self.is_local and not sender[0].startswith("127.")
         if is_broadcast and (is_foreign or datagram[2:4] != b"\0\2"):
             return
@@ -258,8 +258,7 @@ class GigeCamera(Sink, ControlChannel):
             with udp_socket() as route:
                 route.connect(sender)  # sends nothing
                 self.put(ADDRESS, socket.inet_aton(route.getsockname()[0]))
-        answer = self.answer(datagram, sender, time.monotonic())
-        if answer:
+        if answer := self.answer(datagram, sender, time.monotonic()):
             self.socket.sendto(answer, sender)
 
     def offer(self, packet: Packet, patient: bool) -> None:
@@ -310,12 +309,6 @@ class GigeCamera(Sink, ControlChannel):
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets again, if their frame is still kept."""
         self.send(dict(tuple(self.blocks)).get(block, [])[first : last + 1])
-
-    def close(self) -> None:
-        """Send the frames that wait, and close the sockets."""
-        super().close()
-        for one in (self.socket, self.broadcasts, self.stream):
-            one.close()
 
 
 def udp_socket() -> socket.socket:

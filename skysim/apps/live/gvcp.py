@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import struct
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from enum import IntEnum
 from typing import Any
 
@@ -61,23 +61,19 @@ class RefusedError(Exception):
 
 
 class ControlChannel:
-    """Registers, and the one application that may write them. A camera adds `refresh`, `resend` and `stop`, and
+    """Registers, and the one application that may write them. A camera adds what the methods without a body do.
 
     Attributes
     ----------
     ranges
         First addresses and ends of what can be read
     allowed
-        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which its
-        effect checks
-    effects
-        What the writing of some of them does: effect(value). Raises InputError or RefusedError, and the register
-        keeps its value
+        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which
+        `effect` checks
     """
 
     ranges: tuple[tuple[int, int], ...]
     allowed: Mapping[int, Container[int] | None]
-    effects: Mapping[int, Callable[[Any], None]]
 
     def __init__(self) -> None:
         self.memory = bytearray(self.ranges[-1][1])
@@ -89,10 +85,13 @@ class ControlChannel:
     def refresh(self) -> None:
         """Update the registers whose values change, before they are read."""
 
+    def effect(self, address: int, value: Any) -> None:
+        """Do what the writing of a register means. Raises InputError or RefusedError, and it keeps its value."""
+
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets of a block again."""
 
-    def stop(self, _: int = 0) -> None:
+    def stop(self) -> None:
         """Send no more frames."""
 
     # Memory
@@ -130,8 +129,7 @@ class ControlChannel:
         (value,) = struct.unpack(">d" if allowed is None else ">I", data)
         if allowed is not None and value not in allowed:
             raise RefusedError(GvcpStatus.INVALID_PARAMETER)
-        if address in self.effects:
-            self.effects[address](value)
+        self.effect(address, value)
         self.put(address, data)
         if address == PRIVILEGE:
             self.controller = sender
