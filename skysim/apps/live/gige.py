@@ -195,7 +195,7 @@ class GigeCamera(Sink, ControlChannel):
         if not self.live.inbox.waiting:
             control = self.live.flight.schedules[0].exposure_control
             self.put(EXPOSURE_US, 1e6 * control.exposure_s)
-            self.put(TRIGGER_MODE, int(self.live.commands.has_triggers))
+            self.put(TRIGGER_MODE, self.live.commands.has_triggers)
 
     def command(self, **command: Any) -> None:
         """Command the flight, whose statistics count a late refusal. Raises RefusedError if too many commands wait."""
@@ -304,7 +304,8 @@ class GigeCamera(Sink, ControlChannel):
         for packet in packets:
             with contextlib.suppress(OSError):
                 self.stream.sendto(packet, (address, self.value(STREAM_PORT)))
-            time.sleep(delay_s)
+            if delay_s:
+                time.sleep(delay_s)
 
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets again, if their frame is still kept."""

@@ -199,8 +199,7 @@ class ControlChannel:
         if sender != self.controller and self.value(PRIVILEGE) & EXCLUSIVE:
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
         if command == READREG:
-            addresses = struct.iter_unpack(">I", payload)
-            return b"".join(self.read(address, 4) for (address,) in addresses)
+            return b"".join(self.read(one, 4) for (one,) in struct.iter_unpack(">I", payload))
         if command == READMEM:
             return payload[:4] + self.read(*struct.unpack(">II", payload))
         if command in (WRITEREG, WRITEMEM):
