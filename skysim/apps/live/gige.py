@@ -11,7 +11,6 @@ bits of a detector with more; the numbers of one with fewer bits are sent as the
 from __future__ import annotations
 
 import contextlib
-import math
 import select
 import socket
 import struct
@@ -22,14 +21,15 @@ from collections import deque
 from typing import Any
 
 from skysim.apps.live.gvcp import (
-    DISCOVERY,
-    DISCOVERY_BYTES,
     GVCP_PORT,
     HEARTBEAT,
+    MOST_DATAGRAM_BYTES,
     PRIVILEGE,
+    STREAM_PORT,
     ControlChannel,
     GvcpStatus,
     RefusedError,
+    Sender,
 )
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
@@ -40,7 +40,6 @@ from skysim.core.paths import DATA
 
 # Registers of GigE Vision that the camera uses.
 ADDRESS = 0x0024
-STREAM_PORT = 0x0D00
 PACKET_SIZE = 0x0D04
 PACKET_DELAY = 0x0D08  # ns
 STREAM_ADDRESS = 0x0D18
@@ -49,23 +48,14 @@ PIXEL_FORMAT = 0xA008
 PAYLOAD_BYTES = 0xA00C
 EXPOSURE_US = 0xA010
 LONGEST_US = 0xA018
-GAIN = 0xA020
 CELSIUS = 0xA028
-RATE_HZ = 0xA030
 ACQUISITION_MODE = 0xA038
 START = 0xA03C
 STOP = 0xA040
 TRIGGER_MODE = 0xA044
 TRIGGER = 0xA048
 XML = 0x10000
-RANGES = (
-    (0, DISCOVERY_BYTES),
-    (0x0200, 0x0604),
-    (0x0900, 0x0944),
-    (PRIVILEGE, PRIVILEGE + 4),
-    (STREAM_PORT, 0x0D20),
-    (0xA000, TRIGGER + 4),
-)
+XML_BYTES = 0x4000  # room for it
 
 PIXEL_BITS = {0x01080001: 8, 0x01100005: 12, 0x01100007: 16}  # of Mono8, Mono12, Mono16
 WRITABLE = {
@@ -78,12 +68,11 @@ WRITABLE = {
     PIXEL_FORMAT: PIXEL_BITS,
     EXPOSURE_US: None,
     ACQUISITION_MODE: range(2),
-    START: (1,),
-    STOP: (1,),
+    START: {1},
+    STOP: {1},
     TRIGGER_MODE: range(2),
-    TRIGGER: (1,),
+    TRIGGER: {1},
 }
-SINGLE_FRAME = 1
 HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
 LEADER = 1
 TRAILER = 2
@@ -109,10 +98,21 @@ class GigeCamera(Sink, ControlChannel):
         For an address that cannot be bound, and a detector whose frames are not whole numbers.
     """
 
+    ranges = (
+        (0, 0x00F8),
+        (0x0200, 0x0604),
+        (0x0900, 0x0944),
+        (0x0A00, 0x0A04),
+        (0x0D00, 0x0D20),
+        (0xA000, 0xA04C),
+        (XML, XML + XML_BYTES),
+    )
+    allowed = WRITABLE
+
     def __init__(self, live: Live, host: str, port: int = GVCP_PORT) -> None:
         self.live = live
-        self.detector = live.flight.lab.scene.camera.detector
-        if not self.detector.noise:
+        self.scene = live.flight.lab.scene
+        if not self.scene.camera.detector.noise:
             raise InputError(
                 "--gige", "a camera without noise has no whole numbers", "noise: true"
             )
@@ -137,47 +137,36 @@ class GigeCamera(Sink, ControlChannel):
         self.block = 0
         self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
         self.entered = threading.Event()
-        xml = (DATA / "gige_camera.xml").read_bytes()
-        xml += b"\n" * (-len(xml) % 4)
-        effects = {
-            STREAM_PORT: self.open_stream,
-            PIXEL_FORMAT: self.check_stopped,
-            EXPOSURE_US: self.set_exposure,
-            START: self.start,
-            STOP: self.stop,
-            TRIGGER_MODE: lambda mode: self.command(triggered=mode == 1),
-            TRIGGER: self.trigger,
-        }
-        ControlChannel.__init__(self, (*RANGES, (XML, XML + len(xml))), WRITABLE, effects)
-        self.fill_memory(xml)
+        ControlChannel.__init__(self)
+        self.fill_memory()
         Sink.__init__(self, "gige", self.send_frame, ())
         threading.Thread(target=self.serve, name="gvcp", daemon=True).start()
 
     # Registers
 
-    def fill_memory(self, xml: bytes) -> None:
+    def fill_memory(self) -> None:
         """Set the registers to their first values."""
-        scene = self.live.flight.lab.scene
-        detector = self.detector
+        camera = self.scene.camera
+        detector = camera.detector
         celsius = detector.temperature_c
         serial = uuid.getnode()
-        # Whole microseconds: the longest exposure must not be refused for its rounding.
-        longest_us = math.floor(1e6 * self.live.commands.longest_exposure_s)
         for address, value in {
-            0x0000: 0x00010002,  # version 1.2
-            0x0004: 0x80000001,  # big-endian, UTF-8
-            0x0008: serial >> 32,  # address of the hardware
-            0x000C: serial & 0xFFFFFFFF,
-            0x0010: 4,  # configured by link-local address
-            0x0014: 4,
-            ADDRESS: socket.inet_aton(self.host),
-            0x0048: b"skysim",
-            0x0068: b"star camera",
-            0x0088: __version__.encode(),
-            0x00A8: b"simulated",
-            0x00D8: b"%012x" % serial,
-            0x00E8: scene.name.encode()[:15],
-            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, len(xml)),
+            0x0000: struct.pack(
+                ">IIQII12x4s32x32s32s32s48s16s15s",
+                0x00010002,  # version 1.2
+                0x80000001,  # big-endian, UTF-8
+                serial,  # address of the hardware
+                4,  # configured by link-local address
+                4,
+                socket.inet_aton(self.host),
+                b"skysim",
+                b"star camera",
+                __version__.encode(),
+                b"simulated",
+                b"%012x" % serial,
+                self.scene.name.encode(),
+            ),
+            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
             0x0600: 1,  # network interface
             0x0904: 1,  # stream channel
             0x0934: 0xC0000007,  # name, serial number; resend, WRITEMEM, several registers in a command
@@ -185,101 +174,101 @@ class GigeCamera(Sink, ControlChannel):
             0x0940: 1_000_000_000,  # ticks of the clock a second
             PACKET_SIZE: 1500,
             0x0D1C: self.stream.getsockname()[1],
-            0xA000: scene.camera.width_px,
-            0xA004: scene.camera.height_px,
+            0xA000: camera.width_px,
+            0xA004: camera.height_px,
             PIXEL_FORMAT: next(code for code, n in PIXEL_BITS.items() if n >= detector.bits),
-            LONGEST_US: float(longest_us),
-            GAIN: 1 / detector.gain_e_dn,
-            CELSIUS: float(detector.dark_temperature_c if celsius is None else celsius),
-            RATE_HZ: float(scene.exposure.rate_hz),
-            XML: xml,
+            # Whole microseconds: the longest exposure must not be refused for its rounding.
+            LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
+            0xA020: 1 / detector.gain_e_dn,
+            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
+            0xA030: self.scene.exposure.rate_hz,
+            XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
         }.items():
             self.put(address, value)
 
     def refresh(self) -> None:
         """Update the registers whose values change."""
-        pixel_bytes = 1 if PIXEL_BITS[self.value(PIXEL_FORMAT)] == 8 else 2
+        # The second byte of a format is the number of bits that a pixel takes.
+        pixel_bytes = self.memory[PIXEL_FORMAT + 1] // 8
         self.put(PAYLOAD_BYTES, self.value(0xA000) * self.value(0xA004) * pixel_bytes)
         # While commands wait for the flight, the registers hold what was commanded.
         if not self.live.inbox.waiting:
             control = self.live.flight.schedules[0].exposure_control
             self.put(EXPOSURE_US, 1e6 * control.exposure_s)
-            self.put(TRIGGER_MODE, int(self.live.commands.has_triggers))
+            self.put(TRIGGER_MODE, self.live.commands.has_triggers)
 
     def command(self, **command: Any) -> None:
         """Command the flight, whose statistics count a late refusal. Raises RefusedError if too many commands wait."""
         if not self.live.inbox.put(command, lambda _: None):
             raise RefusedError(GvcpStatus.BUSY)
 
-    def set_exposure(self, exposure_us: float) -> None:
-        self.command(exposure_s=self.live.commands.exposure_s(exposure_us / 1e6))
+    def effect(self, address: int, value: Any) -> None:
+        """Do what the writing of a register means.
 
-    def trigger(self, _: int) -> None:
-        """Expose a frame, where frames are triggered."""
-        self.refresh()
-        if not self.value(TRIGGER_MODE):
+        Raises InputError for an exposure time that is not allowed, and RefusedError for a pixel format while frames
+        are sent, and for a trigger where the schedule exposes the frames.
+        """
+        if (address == PIXEL_FORMAT and self.channels) or (
+            address == TRIGGER and not self.value(TRIGGER_MODE)
+        ):
             raise RefusedError(GvcpStatus.WRITE_PROTECT)
-        self.command(trigger=True)
+        if address == EXPOSURE_US:
+            self.command(exposure_s=self.live.commands.exposure_s(value / 1e6))
+        elif address == TRIGGER_MODE:
+            self.command(triggered=value == 1)
+        elif address == TRIGGER:
+            self.command(trigger=True)
+        elif address == START:
+            # The frames whose exposure begins from now on are sent.
+            self.start_s = self.live.flight.now_s
+            self.channels = ("frame",)
+            self.entered.set()
+        elif address == STOP:
+            self.stop()
+        elif address == STREAM_PORT:
+            # A new receiver's frames are numbered from 1 on.
+            self.block = 0
 
-    def start(self, _: int) -> None:
-        """Send the frames whose exposure begins from now on."""
-        self.start_s = self.live.flight.now_s
-        self.channels = ("frame",)
-        self.entered.set()
-
-    def stop(self, _: int = 0) -> None:
+    def stop(self) -> None:
         """Send no more frames than those that wait."""
         self.channels = ()
-
-    def check_stopped(self, _: int) -> None:
-        """Raise RefusedError while frames are sent: their format must not change."""
-        if self.channels:
-            raise RefusedError(GvcpStatus.WRITE_PROTECT)
-
-    def open_stream(self, _: int) -> None:
-        """Number the frames from 1 on for a new receiver."""
-        self.block = 0
-        self.blocks.clear()
-
-    def release(self) -> None:
-        """Free the camera, and close the stream."""
-        super().release()
-        self.put(STREAM_PORT, 0)
 
     # Network
 
     def serve(self) -> None:
         """Body of the thread that answers datagrams, and notices that the application in control has gone."""
-        while not self.ends:
-            # Closed sockets raise ValueError, an answer to a client that has gone OSError.
-            with contextlib.suppress(OSError, ValueError):
-                sockets = (self.socket, self.broadcasts)
-                for ready in select.select(sockets, (), (), POLL_S)[0]:
-                    self.reply(*ready.recvfrom(1 << 16), ready is self.broadcasts)
-                self.check_heartbeat(time.monotonic())
+        sockets = (self.socket, self.broadcasts)
+        with self.socket, self.broadcasts, self.stream:
+            # The sink's thread ends when the frames that wait are sent.
+            while self.thread.is_alive():
+                # An answer to a client that has gone raises OSError.
+                with contextlib.suppress(OSError):
+                    for ready in select.select(sockets, (), (), POLL_S)[0]:
+                        datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
+                        self.reply(datagram, sender, ready is self.broadcasts)
+                    self.check_heartbeat(time.monotonic())
 
-    def reply(self, datagram: bytes, sender: tuple[str, int], is_broadcast: bool) -> None:
+    def reply(self, datagram: bytes, sender: Sender, is_broadcast: bool) -> None:
         """Answer a datagram, if it has an answer."""
-        # A broadcast finds a camera and does nothing else; other machines' do not find one on the loopback address.
+        # A broadcast finds a camera (command 2) and does nothing else; on the loopback address only this machine's.
         is_foreign = self.is_local and not sender[0].startswith("127.")
-        if is_broadcast and (is_foreign or datagram[2:4] != bytes((0, DISCOVERY))):
+        if is_broadcast and (is_foreign or datagram[2:4] != b"\0\2"):
             return
         if self.host == "0.0.0.0":
             with udp_socket() as route:
                 route.connect(sender)  # sends nothing
                 self.put(ADDRESS, socket.inet_aton(route.getsockname()[0]))
-        answer = self.answer(datagram, sender, time.monotonic())
-        if answer is not None:
+        if answer := self.answer(datagram, sender, time.monotonic()):
             self.socket.sendto(answer, sender)
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Take a frame that was exposed since the acquisition has begun; stop after a single one."""
         header = packet.header
-        if not self.channels or header["t_s"] - header["exposure_s"] / 2 < self.start_s:
-            return
-        if self.value(ACQUISITION_MODE) == SINGLE_FRAME:
-            self.stop()
-        super().offer(packet, patient)
+        if header["t_s"] - header["exposure_s"] / 2 >= self.start_s:
+            # All modes but the first, Continuous, are of a single frame.
+            if self.value(ACQUISITION_MODE):
+                self.stop()
+            super().offer(packet, patient)
 
     def send_frame(self, packet: Packet) -> None:
         """Send a frame, and keep its packets."""
@@ -293,19 +282,19 @@ class GigeCamera(Sink, ControlChannel):
         """Leader, pixels and trailer of a frame."""
         pixel_format = self.value(PIXEL_FORMAT)
         bits = PIXEL_BITS[pixel_format]
-        pixels = packet.pixels >> max(self.detector.bits - bits, 0)
+        pixels = packet.pixels >> max(self.scene.camera.detector.bits - bits, 0)
         data = pixels.astype("<u1" if bits == 8 else "<u2").tobytes()
         height, width = pixels.shape
         t_ns = round(1e9 * packet.header["t_s"])
         size = self.value(PACKET_SIZE) - HEADER_BYTES
         parts = [
             # No offset and no padding.
-            (LEADER, struct.pack(">HHQIII12x", 0, IMAGE, t_ns, pixel_format, width, height)),
+            (LEADER, struct.pack(">IQIII12x", IMAGE, t_ns, pixel_format, width, height)),
             *((PIXELS, data[at : at + size]) for at in range(0, len(data), size)),
-            (TRAILER, struct.pack(">HHI", 0, IMAGE, height)),
+            (TRAILER, struct.pack(">II", IMAGE, height)),
         ]
         return [
-            struct.pack(">HHI", 0, self.block, kind << 24 | number) + part
+            struct.pack(">II", self.block, kind << 24 | number) + part
             for number, (kind, part) in enumerate(parts)
         ]
 
@@ -321,12 +310,6 @@ class GigeCamera(Sink, ControlChannel):
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets again, if their frame is still kept."""
         self.send(dict(tuple(self.blocks)).get(block, [])[first : last + 1])
-
-    def close(self) -> None:
-        """Send the frames that wait, and close the sockets."""
-        super().close()
-        for one in (self.socket, self.broadcasts, self.stream):
-            one.close()
 
 
 def udp_socket() -> socket.socket:

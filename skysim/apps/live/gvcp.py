@@ -7,8 +7,9 @@ names in arvgvcpprivate.h.
 
 from __future__ import annotations
 
+import functools
 import struct
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Container, Mapping
 from enum import IntEnum
 from typing import Any
 
@@ -19,6 +20,7 @@ HEADER = struct.Struct(">BBHHH")
 ANSWER = struct.Struct(">HHHH")
 KEY = 0x42
 MOST_BYTES = 536  # of the memory in a datagram
+MOST_DATAGRAM_BYTES = 576
 
 DISCOVERY = 0x0002
 FORCEIP = 0x0004
@@ -35,6 +37,7 @@ HEARTBEAT = 0x0938  # ms
 PRIVILEGE = 0x0A00
 EXCLUSIVE = 1
 CONTROL = 2
+STREAM_PORT = 0x0D00
 
 Sender = tuple[str, int]
 
@@ -58,50 +61,40 @@ class RefusedError(Exception):
 
 
 class ControlChannel:
-    """Registers, and the one application that may write them. A camera adds `refresh`, `resend` and `stop`.
+    """Registers, and the one application that may write them. A camera adds what the methods without a body do.
 
-    Parameters
+    Attributes
     ----------
     ranges
         First addresses and ends of what can be read
     allowed
-        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which its
-        effect checks
-    effects
-        What the writing of some of them does: effect(value). Raises InputError or RefusedError, and the register
-        keeps its value
+        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which
+        `effect` checks
     """
 
-    def __init__(
-        self,
-        ranges: tuple[tuple[int, int], ...],
-        allowed: Mapping[int, Container[int] | None],
-        effects: dict[int, Callable[[Any], None]],
-    ) -> None:
-        self.ranges = ranges
-        self.allowed = allowed
-        self.effects = effects
-        self.memory = bytearray(ranges[-1][1])
+    ranges: tuple[tuple[int, int], ...]
+    allowed: Mapping[int, Container[int] | None]
+
+    def __init__(self) -> None:
+        self.memory = bytearray(self.ranges[-1][1])
         self.controller: Sender | None = None
         self.heard_s = 0.0
-        self.newest: tuple[Sender, bytes] | None = None
-        self.newest_answer: bytes | None = None
+        # It remembers its newest answer.
+        self.answer_once = functools.lru_cache(maxsize=1)(self.first_answer)
 
     def refresh(self) -> None:
         """Update the registers whose values change, before they are read."""
 
+    def effect(self, address: int, value: Any) -> None:
+        """Do what the writing of a register means. Raises InputError or RefusedError, and it keeps its value."""
+
     def resend(self, block: int, first: int, last: int) -> None:
         """Send packets of a block again."""
 
-    def stop(self, _: int = 0) -> None:
+    def stop(self) -> None:
         """Send no more frames."""
 
     # Memory
-
-    def check(self, address: int, size: int) -> None:
-        """Raise RefusedError for bytes that cannot be read."""
-        if not any(first <= address <= end - size for first, end in self.ranges):
-            raise RefusedError(GvcpStatus.INVALID_ADDRESS)
 
     def put(self, address: int, value: float | bytes) -> None:
         """Set a register: an int of 4 bytes, a float of 8, or bytes."""
@@ -119,42 +112,36 @@ class ControlChannel:
             raise RefusedError(GvcpStatus.BAD_ALIGNMENT)
         if size > MOST_BYTES:
             raise RefusedError(GvcpStatus.INVALID_PARAMETER)
-        self.check(address, size)
+        if not any(first <= address <= end - size for first, end in self.ranges):
+            raise RefusedError(GvcpStatus.INVALID_ADDRESS)
         self.refresh()
         return bytes(self.memory[address : address + size])
 
     def write_register(self, sender: Sender, address: int, data: bytes) -> None:
         """Write a register. Raises RefusedError, InputError, and struct.error for a wrong length."""
-        if address != PRIVILEGE and sender != self.controller:
+        # Anyone may take the control of a free camera.
+        if sender != self.controller and (self.controller or address != PRIVILEGE):
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
-        self.check(address, len(data))
+        self.read(address, len(data))
         if address not in self.allowed:
             raise RefusedError(GvcpStatus.WRITE_PROTECT)
         allowed = self.allowed[address]
         (value,) = struct.unpack(">d" if allowed is None else ">I", data)
         if allowed is not None and value not in allowed:
             raise RefusedError(GvcpStatus.INVALID_PARAMETER)
+        self.effect(address, value)
+        self.put(address, data)
         if address == PRIVILEGE:
-            self.set_privilege(sender, value)
-        if address in self.effects:
-            self.effects[address](value)
-        self.put(address, value)
-
-    # Privilege
-
-    def set_privilege(self, sender: Sender, value: int) -> None:
-        """Give the control to an application, or take it back from it."""
-        if self.controller not in (None, sender):
-            raise RefusedError(GvcpStatus.ACCESS_DENIED)
-        self.controller = sender
-        if not value:
-            self.release()
+            self.controller = sender
+            if not value:
+                self.release()
 
     def release(self) -> None:
-        """Take the control from its application, and stop."""
+        """Take the control from its application, stop, and close the stream."""
         self.controller = None
         self.put(PRIVILEGE, 0)
         self.stop()
+        self.put(STREAM_PORT, 0)
 
     def check_heartbeat(self, now_s: float) -> None:
         """Take the control from an application that was not heard for the heartbeat's timeout."""
@@ -176,12 +163,10 @@ class ControlChannel:
         now_s
             Monotonic time
         """
-        if (sender, datagram) != self.newest:
-            self.newest_answer = self.first_answer(datagram, sender)
-            self.newest = (sender, datagram)
+        answer = self.answer_once(datagram, sender)
         if sender == self.controller:
             self.heard_s = now_s
-        return self.newest_answer
+        return answer
 
     def first_answer(self, datagram: bytes, sender: Sender) -> bytes | None:
         """Carry out a command that is no second try; return as `answer` does."""
@@ -191,7 +176,8 @@ class ControlChannel:
         status = GvcpStatus.SUCCESS
         data = b""
         try:
-            data = self.execute(command, datagram[HEADER.size :], length, sender)
+            (payload,) = struct.unpack(f"{length}s", datagram[HEADER.size :])
+            data = self.execute(command, payload, sender)
         except RefusedError as error:
             status = error.args[0]
         except InputError:
@@ -202,30 +188,24 @@ class ControlChannel:
             return None
         return ANSWER.pack(status, (command + 1) & 0xFFFF, len(data), number) + data
 
-    def execute(self, command: int, payload: bytes, length: int, sender: Sender) -> bytes:
+    def execute(self, command: int, payload: bytes, sender: Sender) -> bytes:
         """Carry out a command; return the answer's data. Raises as `write_register` does."""
-        if len(payload) != length:
-            raise RefusedError(GvcpStatus.INVALID_HEADER)
         if command == DISCOVERY:
             return self.read(0, DISCOVERY_BYTES)
         if command == PACKETRESEND:
-            _, block, first, last = struct.unpack(">HHII", payload)
+            block, first, last = struct.unpack(">2xHII", payload)
             self.resend(block, first & 0xFFFFFF, last & 0xFFFFFF)
             return b""
-        if self.controller != sender and self.value(PRIVILEGE) & EXCLUSIVE:
+        if sender != self.controller and self.value(PRIVILEGE) & EXCLUSIVE:
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
         if command == READREG:
-            addresses = struct.iter_unpack(">I", payload[:MOST_BYTES])
-            return b"".join(self.read(address, 4) for (address,) in addresses)
+            return b"".join(self.read(one, 4) for (one,) in struct.iter_unpack(">I", payload))
         if command == READMEM:
-            address, size = struct.unpack(">II", payload)
-            return payload[:4] + self.read(address, size)
-        if command == WRITEREG:
-            for address, data in struct.iter_unpack(">I4s", payload):
+            return payload[:4] + self.read(*struct.unpack(">II", payload))
+        if command in (WRITEREG, WRITEMEM):
+            # Several registers, or one of any size; the answer is their number, or this size.
+            size = 4 if command == WRITEREG else len(payload) - 4
+            for address, data in struct.iter_unpack(f">I{size}s", payload):
                 self.write_register(sender, address, data)
-            return struct.pack(">I", len(payload) // 8)
-        if command == WRITEMEM:
-            (address,) = struct.unpack_from(">I", payload)
-            self.write_register(sender, address, payload[4:])
-            return struct.pack(">I", len(payload) - 4)
+            return struct.pack(">I", len(payload) // 8 if command == WRITEREG else size)
         raise RefusedError(GvcpStatus.NOT_IMPLEMENTED)
