@@ -28,7 +28,6 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.paths import DATA
 from skysim.core.types import ROUNDING, Record
-from skysim.dynamics.imu import Increments
 from skysim.scene.loader import keys_of
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Shot
@@ -57,7 +56,7 @@ class UnitVariable(NamedTuple):
     @property
     def code(self) -> str:
         """Type, as `struct` writes it: ? (Boolean), q (Int64) or d (Float64)."""
-        return {bool: "?", int: "q"}.get(type(self.start), "d")
+        return {"b": "?", "i": "q"}.get(np.asarray(self.start).dtype.kind, "d")
 
 
 class LabUnit:
@@ -90,8 +89,7 @@ class LabUnit:
             self.take_shot(camera, NO_SHOT)
             if not camera.scene.tracker.exposure_control:
                 self.inputs[f"{camera.name}.exposure_s"] = camera.scene.exposure.time_s
-        if self.flight.motion.navigation:
-            self.outputs |= NO_INCREMENTS
+        self.outputs |= self.increments(0.0)
         self.take_state()
 
     @property
@@ -119,7 +117,7 @@ class LabUnit:
                 schedule.exposure_control.exposure_s = inputs[key]
         motors = {key: inputs[key] for key in inputs if inputs.get(f"{key}_given")}
         torque_nm = motors.pop("torque_nm", None)
-        increments = NO_INCREMENTS
+        self.outputs |= self.increments(flight.now_s)
         for _ in range(periods):
             begin_s = flight.now_s
             shots = flight.step(torque_nm, motors)
@@ -127,12 +125,23 @@ class LabUnit:
             shots += flight.capture_due(flight.schedules, solves=True)
             for shot in shots:
                 self.take_shot(shot.camera, shot_values(shot))
-            samples = flight.imu_samples(begin_s)
-            if samples:
-                new = increments_since(samples, begin_s)
-                increments = {key: increments[key] + new[key] for key in new}
-                self.outputs |= increments
+            new = self.increments(begin_s)
+            self.outputs |= {name: self.outputs[name] + new[name] for name in new}
         self.take_state()
+
+    def increments(self, begin_s: float) -> Record:
+        """What the IMU has measured since a time: sums of its increments; empty without an IMU."""
+        samples = self.flight.imu_samples(begin_s)
+        if samples is None:
+            return {}
+        # Half a sample before it: rounding must neither lose a sample nor count it twice.
+        new = samples.t_s > begin_s + samples.step_s / 2
+        return {
+            "imu.angle_rad": samples.angle_rad[new].sum(axis=0),
+            "imu.velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
+            "imu.samples": new.sum(),
+            "imu.saturated": samples.saturated[new].any(),
+        }
 
     def take_shot(self, camera: StarCamera, values: Record) -> None:
         """Take values of a camera's exposure into the outputs."""
@@ -159,26 +168,6 @@ class LabUnit:
             }
         # An array without values is no variable.
         self.outputs |= {name: one for name, one in values.items() if np.size(one)}
-
-
-NO_INCREMENTS: Record = {
-    "imu.angle_rad": np.zeros(3),
-    "imu.velocity_m_s": np.zeros(3),
-    "imu.samples": 0,
-    "imu.saturated": False,
-}
-
-
-def increments_since(samples: Increments, begin_s: float) -> Record:
-    """The values of `NO_INCREMENTS` for what the IMU has measured since a time."""
-    # Half a sample before it: rounding must neither lose a sample nor count it twice.
-    new = samples.t_s > begin_s + samples.step_s / 2
-    return {
-        "imu.angle_rad": samples.angle_rad[new].sum(axis=0),
-        "imu.velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
-        "imu.samples": int(new.sum()),
-        "imu.saturated": samples.saturated[new].any(),
-    }
 
 
 NO_SHOT: Record = {
