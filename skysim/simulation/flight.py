@@ -177,6 +177,12 @@ class Schedule:
             self.camera.scene, self.index + self.skipped, exposure_s
         )
 
+    def window_until(self, close_s: float) -> Window:
+        """Window of an exposure outside of the schedule, whose last row ends at a time."""
+        scene = self.camera.scene
+        window = timing.window_from(scene, 0.0, self.exposure_control.exposure_s)
+        return window._replace(open_s=close_s - window.close_s(scene.camera.height_px))
+
     @property
     def close_s(self) -> float:
         """Time at which the exposure of the next frame ends."""
@@ -635,9 +641,7 @@ class Flight:
         Each observation has its own noise. Before t = 0 the vehicle rotates at its initial rate.
         """
         schedule = self.schedules[camera]
-        scene = schedule.camera.scene
-        window = timing.window_from(scene, 0.0, schedule.exposure_control.exposure_s)
-        window = window._replace(open_s=self.now_s - window.close_s(scene.camera.height_px))
+        window = schedule.window_until(self.now_s)
         index = FIRST_OBSERVATION + self.observations
         self.observations += 1
         return self.capture(schedule, index, window, solves, updates_filter=False)

@@ -29,7 +29,7 @@ from skysim.scene.sections.layouts import (
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, StarCamera
-from skysim.simulation.lights.light import Exposure, Lit, any_of, beam_of
+from skysim.simulation.lights.light import Exposure, Lit, beam_of
 from skysim.sources.dome.display import (
     gray_number,
     on_chip_m,
@@ -116,8 +116,10 @@ class DisplayPattern:
             )
         if screen.gray_levels != 256:
             raise InputError("gray_levels", f"{screen.gray_levels}", "256")
-        stands = expected_exposure(bench.camera, bench.start, np.zeros(3), 0.0)
-        flies = expected_exposure(flown.camera, flown.start, np.zeros(3), 0.0)
+        stands, flies = (
+            expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)
+            for lab in (bench, flown)
+        )
         _, irradiance = lights_of([flown.camera.known.during(flies)], flies)
         return cls(
             flown.camera,
@@ -139,18 +141,18 @@ class DisplayPattern:
         lits = [lit._replace(hidden_by=beam.before(lit)) for lit in beam.lits]
         toward_cam, irradiance = lights_of(lits, exposure)
         # 2. Places. A spot at the edge would be cut, and its centroid wrong.
+        width, height = self.screen.pixels
         xy_px, shown = self.places_px(self.lab_from_cam.apply(toward_cam))
-        shown &= np.all((xy_px > 0.5) & (xy_px < np.array(self.screen.pixels) - 1.5), axis=1)
+        shown &= np.all((xy_px > 0.5) & (xy_px < [width - 1.5, height - 1.5]), axis=1)
         # 3. Spots.
         level = irradiance[shown] / self.white_e_s_m2
-        index, share = spots(xy_px[shown], self.screen.pixels[0])
-        pixel, of_spot = np.unique(index, return_inverse=True)
+        index, share = spots(xy_px[shown], width)
         spot = level[:, None] / PEAK * share
-        total = np.bincount(of_spot.ravel(), spot.ravel(), len(pixel))
-        # 4. Gray levels.
-        width, height = self.screen.pixels
-        gray = np.zeros(width * height, np.uint8)
-        gray[pixel] = gray_number(self.screen, np.minimum(total, 1.0))
+        total = np.bincount(index.ravel(), spot.ravel(), width * height)
+        # 4. Gray levels, where there is light: those of all pixels would take 25 ms.
+        lit = np.flatnonzero(total)
+        gray = np.zeros(len(total), np.uint8)
+        gray[lit] = gray_number(self.screen, np.minimum(total[lit], 1.0))
         peak = gray_number(self.screen, np.minimum(spot.max(axis=1, initial=0), 1.0))
         return DisplayPicture(
             gray.reshape(height, width),
@@ -183,7 +185,7 @@ def lights_of(lits: Iterable[Lit], exposure: Exposure) -> tuple[Floats, Floats]:
     toward = [np.zeros((0, 3))]
     irradiance = [np.zeros(0)]
     for lit in lits:
-        hidden = any_of(lit.hidden_by)
+        hidden = lit.occlusion
         for sources in filter(None, (lit.points, centers_of(lit.discs))):
             seen = sources.take(~hidden(sources.place)) if hidden else sources
             offset_m = seen.place[:, :3] - seen.place[:, 3:] * exposure.camera_m

@@ -73,8 +73,8 @@ class IndiCamera(IPyDriver):
     def __init__(self, live: Live, port: int) -> None:
         self.scene = live.flight.lab.scene
         self.inbox = live.inbox
-        self.vectors = {one.name: one for one in properties(self.scene)}
-        super().__init__(Device(DEVICE, list(self.vectors.values())))
+        self.vectors = Device(DEVICE, properties(self.scene))
+        super().__init__(self.vectors)
         self.exposure = self.vectors[EXPOSURE]
         with listen("--indi", HOST, port) as free:
             self.port = int(free.getsockname()[1])
@@ -131,8 +131,9 @@ class IndiCamera(IPyDriver):
             return self.refuse(f"{EXPOSURE}: not a number")
         abort = self.exposure.state == "Busy"
         await self.show(exposure_s, "Busy", "exposing")
-        command = {"exposure_s": exposure_s, "trigger": True, "abort": abort}
-        self.inbox.put(command, self.refuse)
+        self.inbox.put(
+            {"exposure_s": exposure_s, "trigger": True, "abort": abort}, self.refuse
+        )
 
     async def show(self, exposure_s: float, state: str, message: str) -> None:
         """Tell the clients the state of the exposure; an empty message would repeat the one before it."""
@@ -160,6 +161,7 @@ class IndiCamera(IPyDriver):
         await self.show(0, "Ok", "exposed")
         blob = self.vectors["CCD1"]
         blob["CCD1"] = data
+        # Else it stays that of the first image.
         blob.set_blobsize("CCD1", len(data))
         await blob.send_setVectorMembers(state="Ok", members=["CCD1"])
 
@@ -194,7 +196,8 @@ def properties(scene: Scene) -> list[Any]:
     if celsius is None:
         celsius = detector.dark_temperature_c
     pixel_um = 1e6 * camera.pixel_m
-    readings: dict[str, dict[str, float]] = {
+    numbers: dict[str, dict[str, float]] = {
+        EXPOSURE: {SECONDS: 0},
         "CCD_INFO": {
             "CCD_MAX_X": camera.width_px,
             "CCD_MAX_Y": camera.height_px,
@@ -207,25 +210,23 @@ def properties(scene: Scene) -> list[Any]:
         "CCD_BINNING": {"HOR_BIN": 1, "VER_BIN": 1},
         "CCD_TEMPERATURE": {"CCD_TEMPERATURE_VALUE": celsius},
     }
-    driver = {"DRIVER_NAME": DEVICE, "DRIVER_INTERFACE": CCD_INTERFACE}
-    texts = [TextMember(name, membervalue=value) for name, value in driver.items()]
-    return [
-        switches("CONNECTION", "OneOfMany", CONNECT="Off", DISCONNECT="On"),
-        switches("CCD_ABORT_EXPOSURE", "AtMostOne", ABORT="Off"),
-        TextVector("DRIVER_INFO", "Driver", GROUP, "ro", "Idle", texts),
-        numbers(EXPOSURE, {SECONDS: 0}, longest_live_s(scene), "rw"),
-        *(numbers(name, values) for name, values in readings.items()),
-        BLOBVector(
-            "CCD1", "Image", GROUP, "ro", "Idle", [BLOBMember("CCD1", blobformat=".fits")]
-        ),
+    driver = [
+        TextMember("DRIVER_NAME", membervalue=DEVICE),
+        TextMember("DRIVER_INTERFACE", membervalue=CCD_INTERFACE),
     ]
-
-
-def numbers(name: str, values: dict[str, float], most: float = 0, perm: str = "ro") -> Any:
-    members = [NumberMember(key, None, "%g", 0, most, 0, one) for key, one in values.items()]
-    return NumberVector(name, name, GROUP, perm, "Idle", members)
-
-
-def switches(name: str, rule: str, **states: str) -> Any:
-    members = [SwitchMember(key, membervalue=state) for key, state in states.items()]
-    return SwitchVector(name, name, GROUP, "rw", rule, "Idle", members)
+    connection = [SwitchMember("CONNECT"), SwitchMember("DISCONNECT", membervalue="On")]
+    abort = "CCD_ABORT_EXPOSURE"
+    image = [BLOBMember("CCD1", blobformat=".fits")]
+    vectors = [
+        SwitchVector(
+            "CONNECTION", "CONNECTION", GROUP, "rw", "OneOfMany", "Idle", connection
+        ),
+        SwitchVector(abort, abort, GROUP, "rw", "AtMostOne", "Idle", [SwitchMember("ABORT")]),
+        TextVector("DRIVER_INFO", "Driver", GROUP, "ro", "Idle", driver),
+    ]
+    for name, values in numbers.items():
+        most = longest_live_s(scene) if name == EXPOSURE else 0
+        members = [NumberMember(key, None, "%g", 0, most, 0, values[key]) for key in values]
+        perm = "rw" if most else "ro"
+        vectors.append(NumberVector(name, name, GROUP, perm, "Idle", members))
+    return [*vectors, BLOBVector("CCD1", "Image", GROUP, "ro", "Idle", image)]

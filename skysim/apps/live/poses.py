@@ -17,12 +17,10 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.pacing import Live
-from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
 from skysim.simulation.flight import Shot
-from skysim.simulation.timing import window_from
 from skysim.sources.orbit_elements import OemOrbit
 from skysim.tracking.onboard_model import OrbitStarTracker
 
@@ -44,27 +42,27 @@ def pose_samples(pose: Any, in_orbit: bool) -> dict[str, Floats]:
     if not isinstance(pose, dict) or set(pose) != set(keys):
         raise InputError("pose", f"{pose!r:.60}", ", ".join(keys))
     count = len(pose["t_s"]) if isinstance(pose["t_s"], list) else 0
-    require_within("number of samples", np.array([count]), 2, MOST_SAMPLES)
+    require_within("number of samples", count, 2, MOST_SAMPLES)
     try:
         values = {"t_s": finite_array(pose["t_s"], "t_s", (count,))}
-        for key, (size, _, _) in vectors.items():
+        for key, (size, *_) in vectors.items():
             values[key] = finite_array(pose[key], key, (count, size))
     except ValueError as error:
         raise InputError("pose", error) from None
     require_within("t_s", values["t_s"], 0.0, LATEST_S)
     require_within("step of t_s", np.diff(values["t_s"]), *STEP_S)
-    for key, (_, least, most) in vectors.items():
+    for key, (_, *limits) in vectors.items():
         # Without overflow.
-        length = np.hypot.reduce(values[key], axis=1)
-        require_within(f"length of {key}", length, least, most)
+        require_within(f"length of {key}", np.hypot.reduce(values[key], axis=1), *limits)
     return values
 
 
-def require_within(name: str, values: Floats, least: float, most: float) -> None:
+def require_within(name: str, values: Floats | float, least: float, most: float) -> None:
     """Raise InputError for values (n,) of a pose beyond these limits."""
-    beyond = values[(values < least - ROUNDING) | (values > most + ROUNDING)]
-    if len(beyond):
-        raise InputError("pose", f"{name} {beyond[0]:.9g}", f"{least:.9g} to {most:.9g}")
+    outside = np.maximum(least - values, values - most) > ROUNDING
+    if np.any(outside):
+        first = np.extract(outside, values)[0]
+        raise InputError("pose", f"{name} {first:.9g}", f"{least:.9g} to {most:.9g}")
 
 
 @dataclass
@@ -82,14 +80,8 @@ class PosedLive(Live):
     @property
     def greeting(self) -> dict[str, Any]:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
-        return super().greeting | {"exposure_s": -self.window(0.0).open_s}
-
-    def window(self, close_s: float) -> Window:
-        """Window of an exposure whose last row ends at a time."""
-        schedule = self.flight.schedules[0]
-        scene = schedule.camera.scene
-        window = window_from(scene, 0.0, schedule.exposure_control.exposure_s)
-        return window._replace(open_s=close_s - window.close_s(scene.camera.height_px))
+        window = self.flight.schedules[0].window_until(0.0)
+        return super().greeting | {"exposure_s": -window.open_s}
 
     def run(self) -> None:
         """Answer poses until the last frame, or until all outputs have failed."""
@@ -120,13 +112,15 @@ class PosedLive(Live):
         """
         # 1. Window.
         schedule = self.flight.schedules[0]
-        values = pose_samples(pose, schedule.camera.orbit is not None)
+        in_orbit = schedule.camera.orbit is not None
+        values = pose_samples(pose, in_orbit)
         t_s = values["t_s"]
-        window = self.window(float(t_s[-1]))
-        open_s = np.array([window.open_s])
-        require_within("exposure's start", open_s, max(self.closed_s, t_s[0]), LATEST_S)
+        close_s = float(t_s[-1])
+        window = schedule.window_until(close_s)
+        begin_s = max(self.closed_s, t_s[0])
+        require_within("exposure's start", window.open_s, begin_s, LATEST_S)
         # 2. Place.
-        if schedule.camera.orbit is not None:
+        if in_orbit:
             states = np.stack([values[key] for key in PLACE], axis=1)
             # Rounding may place the exposure's end beyond the samples.
             always = np.array([-np.inf, np.inf])
@@ -150,5 +144,5 @@ class PosedLive(Live):
         )
         schedule.index += 1
         schedule.exposure_control.update(shot.frame)
-        self.closed_s = float(t_s[-1])
+        self.closed_s = close_s
         return shot

@@ -14,9 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import uuid
 import zipfile
-from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,8 +30,8 @@ from skysim.core.paths import DATA
 from skysim.core.types import ROUNDING, Record
 from skysim.scene.loader import keys_of
 from skysim.scene.scene import Scene
-from skysim.simulation.flight import Flight, Schedule, Shot
-from skysim.simulation.lab import build_lab
+from skysim.simulation.flight import Flight, Shot
+from skysim.simulation.lab import StarCamera, build_lab
 from skysim.simulation.timing import longest_live_s
 
 SOURCES = DATA / "fmu"
@@ -58,7 +56,7 @@ class UnitVariable(NamedTuple):
     @property
     def code(self) -> str:
         """Type, as `struct` writes it: ? (Boolean), q (Int64) or d (Float64)."""
-        return {bool: "?", int: "q"}.get(type(self.start), "d")
+        return {"b": "?", "i": "q"}.get(np.asarray(self.start).dtype.kind, "d")
 
 
 class LabUnit:
@@ -88,11 +86,10 @@ class LabUnit:
             for name, size in {"torque_nm": 3, **motors}.items():
                 self.inputs |= {name: np.zeros(size), f"{name}_given": False}
         for camera in lab.cameras:
-            self.outputs |= {f"{camera.name}.{name}": NO_SHOT[name] for name in NO_SHOT}
+            self.take_shot(camera, NO_SHOT)
             if not camera.scene.tracker.exposure_control:
                 self.inputs[f"{camera.name}.exposure_s"] = camera.scene.exposure.time_s
-        if self.flight.motion.navigation:
-            self.outputs |= NO_INCREMENTS
+        self.outputs |= self.increments(0.0)
         self.take_state()
 
     @property
@@ -110,45 +107,49 @@ class LabUnit:
         """
         flight = self.flight
         for schedule in flight.schedules:
-            set_exposure(schedule, inputs)
-            self.outputs[f"{schedule.camera.name}.is_new"] = False
+            self.take_shot(schedule.camera, {"is_new": False})
+            key = f"{schedule.camera.name}.exposure_s"
+            if key in inputs:
+                longest_s = longest_live_s(schedule.camera.scene)
+                if not 0 < inputs[key] <= longest_s * (1 + ROUNDING):
+                    allowed = f"above 0, up to {longest_s:g} s"
+                    raise InputError(key, f"{inputs[key]:g} s", allowed)
+                schedule.exposure_control.exposure_s = inputs[key]
         motors = {key: inputs[key] for key in inputs if inputs.get(f"{key}_given")}
         torque_nm = motors.pop("torque_nm", None)
-        self.outputs |= {
-            name: NO_INCREMENTS[name] for name in NO_INCREMENTS if name in self.outputs
-        }
+        self.outputs |= self.increments(flight.now_s)
         for _ in range(periods):
             begin_s = flight.now_s
             shots = flight.step(torque_nm, motors)
             # Without a filter a step takes no exposure.
             shots += flight.capture_due(flight.schedules, solves=True)
             for shot in shots:
-                values = shot_values(shot)
-                self.outputs |= {
-                    f"{shot.camera.name}.{name}": values[name] for name in values
-                }
-            self.add_increments(begin_s)
+                self.take_shot(shot.camera, shot_values(shot))
+            new = self.increments(begin_s)
+            self.outputs |= {name: self.outputs[name] + new[name] for name in new}
         self.take_state()
 
-    def add_increments(self, begin_s: float) -> None:
-        """Add what the IMU has measured since a time."""
+    def increments(self, begin_s: float) -> Record:
+        """What the IMU has measured since a time: sums of its increments; empty without an IMU."""
         samples = self.flight.imu_samples(begin_s)
         if samples is None:
-            return
+            return {}
         # Half a sample before it: rounding must neither lose a sample nor count it twice.
         new = samples.t_s > begin_s + samples.step_s / 2
-        sums = {
+        return {
             "imu.angle_rad": samples.angle_rad[new].sum(axis=0),
             "imu.velocity_m_s": samples.velocity_m_s[new].sum(axis=0),
-            "imu.samples": int(new.sum()),
+            "imu.samples": new.sum(),
+            "imu.saturated": samples.saturated[new].any(),
         }
-        self.outputs |= {name: self.outputs[name] + one for name, one in sums.items()}
-        self.outputs["imu.saturated"] |= bool(samples.saturated[new].any())
+
+    def take_shot(self, camera: StarCamera, values: Record) -> None:
+        """Take values of a camera's exposure into the outputs."""
+        self.outputs |= {f"{camera.name}.{name}": values[name] for name in values}
 
     def take_state(self) -> None:
         """Take the true state and the attitudes of navigator and filter into the outputs."""
         state = self.flight.state
-        navigation = self.flight.motion.navigation
         values = {
             "t_s": state.t_s,
             "true.lab_from_body_xyzw": state.lab_from_body.as_quat(),
@@ -156,37 +157,17 @@ class LabUnit:
             "true.wheel_rad_s": state.wheel_rad_s,
             "true.gimbal_rad": state.gimbal_rad,
         }
-        # An array without values is no variable.
-        self.outputs |= {name: one for name, one in values.items() if np.size(one)}
+        navigation = self.flight.motion.navigation
         if navigation:
-            self.outputs["imu.lab_from_body_xyzw"] = np.roll(
-                navigation.attitude_wxyz("imu"), -1
-            )
+            values["imu.lab_from_body_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1)
         if navigation and navigation.filter:
-            self.outputs |= {
+            values |= {
                 "filter.lab_from_body_xyzw": np.roll(navigation.attitude_wxyz("filter"), -1),
                 "filter.rate_body_rad_s": navigation.filter.rate_rad_s,
                 "filter.sigma_rad": navigation.filter.state.sigma_attitude_rad,
             }
-
-
-NO_INCREMENTS: Record = {
-    "imu.angle_rad": np.zeros(3),
-    "imu.velocity_m_s": np.zeros(3),
-    "imu.samples": 0,
-    "imu.saturated": False,
-}
-
-
-def set_exposure(schedule: Schedule, inputs: Record) -> None:
-    """Set the exposure time of a camera's next frames. Raises InputError beyond the limits."""
-    key = f"{schedule.camera.name}.exposure_s"
-    if key not in inputs:
-        return
-    longest_s = longest_live_s(schedule.camera.scene)
-    if not 0 < inputs[key] <= longest_s * (1 + ROUNDING):
-        raise InputError(key, f"{inputs[key]:g} s", f"above 0, up to {longest_s:g} s")
-    schedule.exposure_control.exposure_s = inputs[key]
+        # An array without values is no variable.
+        self.outputs |= {name: one for name, one in values.items() if np.size(one)}
 
 
 NO_SHOT: Record = {
@@ -224,17 +205,11 @@ def shot_values(shot: Shot) -> Record:
 
 def variables(unit: LabUnit) -> list[UnitVariable]:
     """The variables of a unit that has just begun; their value references are their indices."""
-    outputs = dict(unit.outputs)
-    causes = {
-        "independent": {"t_s": outputs.pop("t_s")},
-        "parameter": {"seed": unit.lab.scene.seed},
-        "input": unit.inputs,
-        "output": outputs,
-    }
+    starts = unit.inputs | {"seed": unit.lab.scene.seed} | unit.outputs
+    causes = {"t_s": "independent", "seed": "parameter"} | dict.fromkeys(unit.inputs, "input")
     return [
-        UnitVariable(name, causality, value)
-        for causality, values in causes.items()
-        for name, value in values.items()
+        UnitVariable(name, causes.get(name, "output"), start)
+        for name, start in starts.items()
     ]
 
 
@@ -263,23 +238,33 @@ def write_unit(path: Path, scene: Scene) -> None:
     compiler = shutil.which("cc")
     if platform.system() != "Linux" or compiler is None:
         raise InputError("export.file", f"{path.name} needs Linux and a C compiler, cc")
-    keys = keys_of(scene)
+    import pythonfmu3
+
+    setup = yaml.safe_dump({"path": str(Path(__file__).parents[3]), "scene": keys_of(scene)})
     unit = LabUnit(scene)
-    table = variables(unit)
-    setup = yaml.safe_dump({"path": str(Path(__file__).parents[3]), "scene": keys})
-    token = str(uuid.uuid4())
     name = re.sub(r"\W|^(?=\d)", "_", scene.name)
+    description = describe(unit, name)
+    standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
     with tempfile.TemporaryDirectory() as folder:
-        library = compile_program(Path(folder), compiler, program_table(unit, table, token))
+        header = program_table(unit, description.attrib["instantiationToken"])
+        write_text(Path(folder) / "variables.h", header)
+        library = f"{folder}/laboratory.so"
+        words = [compiler, "-shared", "-fPIC", f"-I{folder}", f"-I{standard}", "-o", library]
+        words += [str(SOURCES / "laboratory.c"), "-lm"]
+        done = subprocess.run(words, capture_output=True, text=True)
+        if done.returncode:
+            problem = f"{compiler} failed: {done.stderr.strip()[-300:]}"
+            raise InputError("export.file", problem)
         make_folder(path.parent)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", describe(unit, table, name, token))
+            xml = ElementTree.tostring(description, "utf-8", xml_declaration=True)
+            archive.writestr("modelDescription.xml", xml)
             archive.write(library, f"binaries/{platform.machine()}-linux/{name}.so")
             archive.write(SOURCES / SLAVE, f"resources/{SLAVE}")
             archive.writestr("resources/laboratory.yaml", setup)
 
 
-def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str) -> bytes:
+def describe(unit: LabUnit, name: str) -> ElementTree.Element:
     """The model description (XML) of a unit, with the texts of `variables.yaml`."""
     import pythonfmu3
     from pythonfmu3.default_experiment import DefaultExperiment
@@ -288,7 +273,6 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
 
     model = pythonfmu3.Fmi3Slave(instance_name=name)
     model.modelName = name
-    model.guid = token
     model.description = unit.lab.scene.title
     stop_s = math.ceil(unit.lab.duration_s / unit.period_s) * unit.period_s
     model.default_experiment = DefaultExperiment(0.0, stop_s, unit.period_s)
@@ -296,16 +280,15 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
     units = texts["units"]
     model.register_units([Unit(symbol, **units[symbol]) for symbol in units])
     kinds = {"d": pythonfmu3.Float64, "q": pythonfmu3.Int64, "?": pythonfmu3.Boolean}
-    for one in table:
+    for one in variables(unit):
         value = np.asarray(one.start)
         # Without the name of a camera or of a command.
         own = re.sub(r"^\w+(\.|_(?=given$))", "", one.name)
         symbol, description = texts["variables"].get(one.name) or texts["variables"][own]
-        is_fixed = one.causality == "parameter"
         variable = kinds[one.code](
             one.name,
             causality=pythonfmu3.Fmi3Causality[one.causality],
-            variability=pythonfmu3.Fmi3Variability.fixed if is_fixed else None,
+            variability={"parameter": pythonfmu3.Fmi3Variability.fixed}.get(one.causality),
             description=description,
             dimensions=[Dimension(str(size)) for size in value.shape],
             getter=value.tolist,
@@ -314,46 +297,27 @@ def describe(unit: LabUnit, table: Iterable[UnitVariable], name: str, token: str
         model.register_variable(variable, nested=False)
     xml = model.to_xml()
     xml.set("generationTool", f"skysim {__version__}")
-    abilities = {
-        "canHandleVariableCommunicationStepSize": "true",
-        "fixedInternalStepSize": repr(unit.period_s),
-    }
-    xml.find("CoSimulation").attrib.update(abilities)
+    xml.find("CoSimulation").attrib.update(
+        canHandleVariableCommunicationStepSize="true",
+        fixedInternalStepSize=repr(unit.period_s),
+    )
     ElementTree.indent(xml)
-    return ElementTree.tostring(xml, "utf-8", xml_declaration=True)
+    return xml
 
 
-def program_table(unit: LabUnit, table: Iterable[UnitVariable], token: str) -> str:
+def program_table(unit: LabUnit, token: str) -> str:
     """The header `variables.h` of the unit's program: its variables and the Python that it starts."""
     rows = []
     cells: list[int] = []
-    for one in table:
-        rows.append(f"{{'{one.code}', \"{one.causality}\", {np.size(one.start)}}},")
+    for one in variables(unit):
+        rows.append(f"{{'{one.code}', \"{one.causality}\", {np.size(one.start)}}}")
         start = np.array(one.start, float if one.code == "d" else np.int64)
         cells += start.reshape(-1).view(np.uint64).tolist()
-    lines = [
-        f'#define TOKEN "{token}"',
-        f"#define PYTHON {json.dumps(sys.executable)}",
-        f"#define PERIOD_S {unit.period_s!r}",
-        f"#define CELLS {len(cells)}",
-        "static const Variable VARIABLES[] = {",
-        *rows,
-        "};",
-        f"static const uint64_t STARTS[CELLS] = {{{', '.join(map(hex, cells))}}};",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def compile_program(folder: Path, compiler: str, header: str) -> Path:
-    """Compile the unit's program in a folder; return the shared library. Raises InputError if the compiler fails."""
-    import pythonfmu3
-
-    write_text(folder / "variables.h", header)
-    standard = Path(pythonfmu3.__file__).parent / "pythonfmu-export" / "src" / "fmi"
-    library = folder / "laboratory.so"
-    words: list[str | Path] = [compiler, "-shared", "-fPIC", f"-I{folder}", f"-I{standard}"]
-    words += ["-o", library, SOURCES / "laboratory.c", "-lm"]
-    done = subprocess.run(words, capture_output=True, text=True)
-    if done.returncode:
-        raise InputError("export.file", f"{compiler} failed: {done.stderr.strip()[-300:]}")
-    return library
+    return (
+        f'#define TOKEN "{token}"\n'
+        f"#define PYTHON {json.dumps(sys.executable)}\n"
+        f"#define PERIOD_S {unit.period_s!r}\n"
+        f"#define CELLS {len(cells)}\n"
+        f"static const Variable VARIABLES[] = {{{', '.join(rows)}}};\n"
+        f"static const uint64_t STARTS[CELLS] = {{{', '.join(map(hex, cells))}}};\n"
+    )
