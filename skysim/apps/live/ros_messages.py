@@ -17,8 +17,6 @@ from scipy.spatial.transform import Rotation
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
 from skysim.core.paths import DATA
-from skysim.dynamics.imu import build_triad
-from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig
 from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard_dome
 
 BODY = "body"
@@ -35,6 +33,8 @@ class RosEncoder:
     ----------
     topics
         Encoders of the messages of each topic, those of the truth only where it is on
+    color
+        Encoding of pixels of unsigned numbers, without their bits
     camera, lever
         Calibration that the tracker assumes, and mount of the camera on the body
     reference
@@ -44,14 +44,16 @@ class RosEncoder:
     def __init__(self, live: Live) -> None:
         self.pace = live.pace
         main = live.flight.lab.camera
-        self.scene = main.scene
-        self.reference = "icrs" if self.scene.stars else "lab"
-        self.camera = assumed_camera(self.scene)
-        self.lever = assumed_lever(self.scene, main.mount)
-        if self.scene.dome:
+        scene = main.scene
+        bayer = scene.camera.detector.bayer
+        self.color = f"bayer_{bayer.lower()}" if bayer else "mono"
+        self.reference = "icrs" if scene.stars else "lab"
+        self.camera = assumed_camera(scene)
+        self.lever = assumed_lever(scene, main.mount)
+        if scene.dome:
             # A surveyed map contains both.
             self.camera, _, self.lever = onboard_dome(
-                self.scene, self.scene.dome, main.mount, main.sources
+                scene, scene.dome, main.mount, main.sources
             )
         self.topics = {
             topic: serialize_dynamic(topic.type, topic.definition)[topic.type]
@@ -80,15 +82,11 @@ class RosEncoder:
 
 
 def image(encoder: RosEncoder, packet: Packet) -> Messages:
-    """The frame; a color camera's is a Bayer mosaic."""
+    """The frame, whose height and width have the same names in the packet; a color camera's is a Bayer mosaic."""
     pixels = packet.pixels
-    bayer = encoder.scene.camera.detector.bayer
     bits = 8 * pixels.itemsize
-    color = f"bayer_{bayer.lower()}" if bayer else "mono"
-    yield {
-        "height": packet.header["height"],
-        "width": packet.header["width"],
-        "encoding": f"{color}{bits}" if pixels.dtype.kind == "u" else f"{bits}FC1",
+    yield packet.header | {
+        "encoding": f"{encoder.color}{bits}" if pixels.dtype.kind == "u" else f"{bits}FC1",
         "step": pixels.strides[0],
         "data": pixels.tobytes(),
     }
@@ -111,10 +109,11 @@ def camera_info(encoder: RosEncoder, _: Packet) -> Messages:
     }
 
 
-def imu(encoder: RosEncoder, packet: Packet) -> Messages:
-    """Mean rate and specific force of each sample, stamped at the end of its interval, without an attitude (-1)."""
-    config = encoder.scene.vehicle.imu
-    assert config is not None
+def imu(_: RosEncoder, packet: Packet) -> Messages:
+    """Mean rate and specific force of each sample, stamped at the end of its interval.
+
+    There is no attitude (-1), and the covariances are unknown (0, as `sensor_msgs/Imu` says).
+    """
     header = packet.header
     step_s = header["step_s"]
     for angle_rad, velocity_m_s in zip(
@@ -123,21 +122,8 @@ def imu(encoder: RosEncoder, packet: Packet) -> Messages:
         yield {
             "orientation_covariance": [-1],
             "angular_velocity": named(np.divide(angle_rad, step_s)),
-            "angular_velocity_covariance": mean_covariance(config.gyro, step_s),
             "linear_acceleration": named(np.divide(velocity_m_s, step_s)),
-            "linear_acceleration_covariance": mean_covariance(config.accelerometer, step_s),
         }
-
-
-def mean_covariance(config: GyroConfig | AccelerometerConfig, step_s: float) -> list[float]:
-    """(9,) covariance of the mean over a sample of h: white noise N^2 / h, and the counter's steps q^2 / (6 h^2).
-
-    An increment has the difference of two carried remainders, which are uniform with q^2 / 12. Bias, scale and
-    misalignment are no noise of a sample and are left out.
-    """
-    triad = build_triad(config, np.zeros((4, 3)), np.zeros(3))
-    variance = triad.white**2 / step_s + triad.quantum**2 / (6 * step_s**2)
-    return [variance, 0, 0, 0, variance, 0, 0, 0, variance]
 
 
 def named(numbers: Iterable[float]) -> Message:
