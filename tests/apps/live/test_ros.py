@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+import time
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
@@ -25,6 +26,7 @@ from skysim.apps.cli import main
 from skysim.apps.live.commands import CommandState
 from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import Packet
+from skysim.apps.live.poses import PosedLive
 from skysim.apps.live.ros_messages import TOPICS, TRUE_TOPICS, RosEncoder
 from skysim.apps.live.ros_outputs import FoxgloveSink, McapSink
 from skysim.core.errors import InputError
@@ -324,3 +326,12 @@ def test_without_truth_no_topic_tells_it(flown: Flown) -> None:
     live = flown.live
     hidden = Live(live.flight, live.pace, [], live.commands, has_truth=False)
     assert not any("truth" in one.name for one in RosEncoder(hidden).topics)
+
+
+def test_a_flight_of_poses_has_stamps(flown: Flown) -> None:
+    """They are the start's wall clock plus the poses' times; the flight is over, so that it ends at once."""
+    live = PosedLive(flown.live.flight, Pace(0.0, 2.0), [], flown.live.commands)
+    before_ns = time.time_ns()
+    live.run()
+    stamp_ns, _ = RosEncoder(live).stamped(2.0, "lab")
+    assert before_ns < stamp_ns - 2 * 10**9 < time.time_ns()
