@@ -86,6 +86,7 @@ class PosedLive(Live):
     def run(self) -> None:
         """Answer poses until the last frame, or until all outputs have failed."""
         self.warm_up()
+        self.pace.start(0.0)
         while not self.flight.schedules[0].is_over and not self.is_abandoned:
             for command, reply in self.inbox.take():
                 try:

@@ -7,27 +7,23 @@ z forward), and the first row of pixels is the upper one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from mcap_ros2._dynamic import serialize_dynamic
-from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
 from skysim.core.paths import DATA
-from skysim.core.types import Floats
-from skysim.dynamics.imu import build_triad
-from skysim.scene.sections.vehicle import AccelerometerConfig, GyroConfig
 from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard_dome
 
 BODY = "body"
 CAMERA = "camera_optical_frame"
-ENCODINGS = {"|u1": "mono8", "<u2": "mono16", "<f4": "32FC1", "<f8": "64FC1"}
 
 Message = dict[str, Any]
+Messages = Iterator[Message]
 
 
 class RosEncoder:
@@ -36,7 +32,9 @@ class RosEncoder:
     Attributes
     ----------
     topics
-        Topics, those of the truth only where it is on
+        Encoders of the messages of each topic, those of the truth only where it is on
+    color
+        Encoding of pixels of unsigned numbers, without their bits
     camera, lever
         Calibration that the tracker assumes, and mount of the camera on the body
     reference
@@ -45,147 +43,125 @@ class RosEncoder:
 
     def __init__(self, live: Live) -> None:
         self.pace = live.pace
-        self.topics = TOPICS + (TRUE_TOPICS if live.has_truth else ())
         main = live.flight.lab.camera
-        self.scene = main.scene
-        self.reference = "icrs" if self.scene.stars else "lab"
-        self.camera = assumed_camera(self.scene)
-        self.lever = assumed_lever(self.scene, main.mount)
-        if self.scene.dome:
+        scene = main.scene
+        bayer = scene.camera.detector.bayer
+        self.color = f"bayer_{bayer.lower()}" if bayer else "mono"
+        self.reference = "icrs" if scene.stars else "lab"
+        self.camera = assumed_camera(scene)
+        self.lever = assumed_lever(scene, main.mount)
+        if scene.dome:
             # A surveyed map contains both.
             self.camera, _, self.lever = onboard_dome(
-                self.scene, self.scene.dome, main.mount, main.sources
+                scene, scene.dome, main.mount, main.sources
             )
-        self.encoders = {
-            one.type: serialize_dynamic(one.type, one.definition)[one.type]
-            for one in self.topics
+        self.topics = {
+            topic: serialize_dynamic(topic.type, topic.definition)[topic.type]
+            for topic in TOPICS + (TRUE_TOPICS if live.has_truth else ())
         }
 
-    def stamp_ns(self, t_s: float) -> int:
-        """Unix time of a time of the simulator; two stamps differ by exactly that of their times."""
-        assert self.pace.zero_s is not None
-        return round(1e9 * (self.pace.zero_s + self.pace.offset_s)) + round(1e9 * t_s)
-
-    def header(self, t_s: float, frame: str) -> Message:
-        sec, nanosec = divmod(self.stamp_ns(t_s), 10**9)
-        return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
-
-    def encode(self, topic: Topic, packet: Packet) -> Iterator[tuple[int, bytes]]:
-        """Stamps in ns and messages of a packet on one of its topics."""
+    def encode(
+        self, packet: Packet, topics: Iterable[Topic]
+    ) -> Iterator[tuple[Topic, int, bytes]]:
+        """Topic, stamp in ns and bytes of each message of a packet on some of the topics."""
         times_s = packet.header.get("times_s", [packet.header["t_s"]])
-        for t_s, message in zip(times_s, topic.messages(self, packet), strict=False):
-            header = self.header(t_s, topic.frame or self.reference)
-            data = self.encoders[topic.type]({"header": header} | message)
-            yield self.stamp_ns(t_s), data
+        for topic in topics:
+            if topic.channel == packet.channel:
+                for t_s, message in zip(times_s, topic.messages(self, packet), strict=False):
+                    stamp_ns, message["header"] = self.stamped(
+                        t_s, topic.frame or self.reference
+                    )
+                    yield topic, stamp_ns, self.topics[topic](message)
+
+    def stamped(self, t_s: float, frame: str) -> tuple[int, Message]:
+        """Unix time in ns of a time of the simulator, and a header with it; two differ by exactly those times."""
+        assert self.pace.zero_s is not None
+        stamp_ns = round(1e9 * (self.pace.zero_s + self.pace.offset_s)) + round(1e9 * t_s)
+        sec, nanosec = divmod(stamp_ns, 10**9)
+        return stamp_ns, {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
 
-def image(encoder: RosEncoder, packet: Packet) -> list[Message]:
-    """The frame; a color camera's is a Bayer mosaic."""
+def image(encoder: RosEncoder, packet: Packet) -> Messages:
+    """The frame, whose height and width have the same names in the packet; a color camera's is a Bayer mosaic."""
     pixels = packet.pixels
-    bayer = encoder.scene.camera.detector.bayer
-    encoding = ENCODINGS[pixels.dtype.str]
-    if bayer and pixels.dtype.kind == "u":
-        encoding = f"bayer_{bayer.lower()}{8 * pixels.itemsize}"
-    height, width = pixels.shape
-    return [
-        {
-            "height": height,
-            "width": width,
-            "encoding": encoding,
-            "step": width * pixels.itemsize,
-            "data": pixels.tobytes(),
-        }
-    ]
+    bits = 8 * pixels.itemsize
+    yield packet.header | {
+        "encoding": f"{encoder.color}{bits}" if pixels.dtype.kind == "u" else f"{bits}FC1",
+        "step": pixels.strides[0],
+        "data": pixels.tobytes(),
+    }
 
 
-def camera_info(encoder: RosEncoder, _: Packet) -> list[Message]:
+def camera_info(encoder: RosEncoder, _: Packet) -> Messages:
     """The assumed calibration: K, D of plumb_bob, R = 1, and P = [K 0], so that rectifying keeps the scale."""
     camera = encoder.camera
-    k = np.diag([camera.focal_px, camera.focal_px * camera.aspect, 1.0])
-    k[:2, 2] = camera.center_px
-    return [
-        {
-            "height": camera.height_px,
-            "width": camera.width_px,
-            "distortion_model": "plumb_bob",
-            "d": camera.distortion,
-            "k": flat(k),
-            "r": flat(np.eye(3)),
-            "p": flat(k @ np.eye(3, 4)),
-        }
-    ]
-
-
-def imu(encoder: RosEncoder, packet: Packet) -> list[Message]:
-    """Mean rate and specific force of each sample, stamped at the end of its interval, without an attitude (-1)."""
-    config = encoder.scene.vehicle.imu
-    assert config is not None
-    step_s = packet.header["step_s"]
-    spread = {
-        "orientation_covariance": [-1.0] + [0.0] * 8,
-        "angular_velocity_covariance": mean_covariance(config.gyro, step_s),
-        "linear_acceleration_covariance": mean_covariance(config.accelerometer, step_s),
+    fx = camera.focal_px
+    fy = fx * camera.aspect
+    cx, cy = camera.center_px
+    yield {
+        "height": camera.height_px,
+        "width": camera.width_px,
+        "distortion_model": "plumb_bob",
+        "d": camera.distortion,
+        "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+        "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+        "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
     }
-    rates_rad_s = np.divide(packet.header["angle_rad"], step_s)
-    forces_m_s2 = np.divide(packet.header["velocity_m_s"], step_s)
-    return [
-        {"angular_velocity": named(rate), "linear_acceleration": named(force)} | spread
-        for rate, force in zip(rates_rad_s, forces_m_s2, strict=True)
-    ]
 
 
-def mean_covariance(config: GyroConfig | AccelerometerConfig, step_s: float) -> list[float]:
-    """(9,) covariance of the mean over a sample of h: white noise N^2 / h, and the counter's steps q^2 / (6 h^2).
+def imu(_: RosEncoder, packet: Packet) -> Messages:
+    """Mean rate and specific force of each sample, stamped at the end of its interval.
 
-    An increment has the difference of two carried remainders, which are uniform with q^2 / 12. Bias, scale and
-    misalignment are no noise of a sample and are left out.
+    There is no attitude (-1), and the covariances are unknown (0, as `sensor_msgs/Imu` says).
     """
-    triad = build_triad(config, np.zeros((4, 3)), np.zeros(3))
-    variance = triad.white**2 / step_s + triad.quantum**2 / (6 * step_s**2)
-    return flat(variance * np.eye(3))
+    header = packet.header
+    step_s = header["step_s"]
+    for angle_rad, velocity_m_s in zip(
+        header["angle_rad"], header["velocity_m_s"], strict=True
+    ):
+        yield {
+            "orientation_covariance": [-1],
+            "angular_velocity": named(np.divide(angle_rad, step_s)),
+            "linear_acceleration": named(np.divide(velocity_m_s, step_s)),
+        }
 
 
-def flat(matrix: Floats) -> list[float]:
-    return matrix.ravel().tolist()
-
-
-def named(numbers: ArrayLike) -> Message:
+def named(numbers: Iterable[float]) -> Message:
     """The numbers of a vector, or of a quaternion with its scalar last, by their names."""
-    return dict(zip("xyzw", np.asarray(numbers).tolist(), strict=False))
+    return dict(zip("xyzw", numbers, strict=False))
 
 
-def inverse(xyzw: ArrayLike) -> Message:
-    return named(Rotation.from_quat(xyzw).inv().as_quat())
-
-
-def transforms(encoder: RosEncoder, packet: Packet) -> list[Message]:
+def transforms(encoder: RosEncoder, packet: Packet) -> Messages:
     """The estimated attitude of the body, of the filter if there is one, and the mount of the camera."""
     header = packet.header
     lever = encoder.lever
-    links = [(BODY, CAMERA, lever.camera_body_m, inverse(lever.cam_from_body.as_quat()))]
+    mount = named(lever.cam_from_body.inv().as_quat())
+    links = [(BODY, CAMERA, named(lever.camera_body_m), mount)]
     found = header.get("lab_from_filter_xyzw", header.get("lab_from_imu_xyzw"))
     if found:
-        links.append((encoder.reference, BODY, np.zeros(3), named(found)))
-    made = [
-        {
-            "header": encoder.header(header["t_s"], parent),
-            "child_frame_id": child,
-            "transform": {"translation": named(place_m), "rotation": rotation},
-        }
-        for parent, child, place_m, rotation in links
-    ]
-    return [{"transforms": made}]
+        links.append((encoder.reference, BODY, {}, named(found)))
+    yield {
+        "transforms": [
+            {
+                "header": encoder.stamped(header["t_s"], parent)[1],
+                "child_frame_id": child,
+                "transform": {"translation": place, "rotation": rotation},
+            }
+            for parent, child, place, rotation in links
+        ]
+    }
 
 
-def true_attitude(_: RosEncoder, packet: Packet) -> list[Message]:
+def true_attitude(_: RosEncoder, packet: Packet) -> Messages:
     """Attitude of the body."""
-    return [{"quaternion": named(packet.header["lab_from_body_xyzw"])}]
+    yield {"quaternion": named(packet.header["lab_from_body_xyzw"])}
 
 
-def camera_attitude(_: RosEncoder, packet: Packet) -> list[Message]:
+def camera_attitude(_: RosEncoder, packet: Packet) -> Messages:
     """Attitude of the camera: of a frame the true mean over its exposure, with which its solution is compared."""
     found = packet.truth.get("mean_cam_from_ref_xyzw", packet.header.get("cam_from_ref_xyzw"))
-    return [{"quaternion": inverse(found)}] if found else []
+    if found:
+        yield {"quaternion": named(Rotation.from_quat(found).inv().as_quat())}
 
 
 class Topic(NamedTuple):
@@ -195,7 +171,7 @@ class Topic(NamedTuple):
     type: str
     frame: str
     channel: str
-    messages: Callable[[RosEncoder, Packet], list[Message]]
+    messages: Callable[[RosEncoder, Packet], Messages]
 
     @property
     def definition(self) -> str:
@@ -205,8 +181,8 @@ class Topic(NamedTuple):
 
 ATTITUDE = "geometry_msgs/msg/QuaternionStamped"
 TOPICS = (
-    Topic("/camera/image_raw", "sensor_msgs/msg/Image", CAMERA, "frame", image),
     Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", CAMERA, "frame", camera_info),
+    Topic("/camera/image_raw", "sensor_msgs/msg/Image", CAMERA, "frame", image),
     Topic("/imu/data_raw", "sensor_msgs/msg/Imu", BODY, "imu", imu),
     Topic("/star_tracker/attitude", ATTITUDE, "", "solution", camera_attitude),
     Topic("/tf", "tf2_msgs/msg/TFMessage", "", "telemetry", transforms),
