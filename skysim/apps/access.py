@@ -2,6 +2,8 @@
 
 import hmac
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from skysim.core.errors import InputError
 
@@ -15,8 +17,15 @@ def token_matches(candidate: str, token: str) -> bool:
 
 def listen(option: str, host: str, port: int) -> socket.socket:
     """A socket that listens; port 0 is any free one. Raises InputError for an address that cannot be bound."""
-    try:
+    with names_address(option, host, port):
         return socket.create_server((host, port))
+
+
+@contextmanager
+def names_address(option: str, host: str, port: int) -> Iterator[None]:
+    """Raise InputError, with the option and its address, instead of OSError."""
+    try:
+        yield
     except OSError as error:
         problem = f"cannot listen on {host}:{port}: {error.strerror or error}"
         raise InputError(f"{option} {port}", problem) from None

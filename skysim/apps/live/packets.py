@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
-from skysim.core.types import Truth
 from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
 
@@ -65,19 +65,6 @@ class Packet(NamedTuple):
     def channel(self) -> str:
         return str(self.header["channel"])
 
-    @property
-    def number(self) -> int:
-        """Sequence number among the frames that were rendered."""
-        return int(self.header["index"] - self.header["dropped"])
-
-    def plus_dropped(self, missed: int) -> Packet:
-        """The same frame for a receiver that missed further ones: its header's `dropped` is that much larger."""
-        if not missed or self.channel != "frame":
-            return self
-        return self._replace(
-            header=self.header | {"dropped": self.header["dropped"] + missed}
-        )
-
     def pack(self, has_truth: bool = False) -> bytes:
         """Serialize: the header line, with the truth if wanted, then the pixels row by row from the top."""
         header = self.header | {"bytes": self.pixels.nbytes}
@@ -96,19 +83,15 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
         if not header["bytes"]:
             return header, NO_PIXELS
         shape = (int(header["height"]), int(header["width"]))
-        dtype_name = header["dtype"]
-        if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", dtype_name):
-            raise ValueError(dtype_name)
+        known = re.fullmatch(r"[<>|]?(u[1248]|f[248])", header["dtype"])
+        if not known or min(shape) < 1 or math.prod(shape) > MAX_PIXELS:
+            raise ValueError(shape)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError("", f"not a packet of skysim live: {line[:40]!r}") from error
-    count = shape[0] * shape[1]
-    dtype = np.dtype(dtype_name)
-    if min(shape) < 1 or count > MAX_PIXELS:
-        raise InputError(
-            "", f"not a packet of skysim live: {shape[1]} x {shape[0]} pixels of {dtype}"
-        )
-    pixels = stream.read(count * dtype.itemsize)
-    if len(pixels) < count * dtype.itemsize:
+        raise InputError("", f"not a packet of skysim live: {line[:80]!r}") from error
+    dtype = np.dtype(known[0])
+    size = math.prod(shape) * dtype.itemsize
+    pixels = stream.read(size)
+    if len(pixels) < size:
         raise InputError("", f"the stream ended within frame {header.get('index')}")
     return header, np.frombuffer(pixels, dtype).reshape(shape)
 
@@ -124,6 +107,8 @@ def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         Number of frames dropped before it
     """
     frame = shot.frame
+    truth = shot.truth
+    sources = truth.sources
     pixels = np.ascontiguousarray(frame.image_dn)
     pixels = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
@@ -140,19 +125,15 @@ def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "made_unix_s": made_unix_s,
         "dropped": dropped,
     }
-    return Packet(header, pixels, frame_truth(shot.truth))
-
-
-def frame_truth(truth: Truth) -> dict[str, Any]:
-    """The truth of a frame, as `Packet` has it."""
-    return {
+    truths = {
         "cam_from_ref_xyzw": truth.cam_from_lab.as_quat().tolist(),
         "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat().tolist(),
         "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
-        "ids": truth.sources.id.tolist(),
-        "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),
-        "y_px": truth.sources.xy_px[:, 1].round(4).tolist(),
+        "ids": sources.id.tolist(),
+        "x_px": sources.xy_px[:, 0].round(4).tolist(),
+        "y_px": sources.xy_px[:, 1].round(4).tolist(),
     }
+    return Packet(header, pixels, truths)
 
 
 def solution_packet(shot: Shot, made_unix_s: float) -> Packet:

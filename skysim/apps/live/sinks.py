@@ -135,8 +135,11 @@ class Sink:
             if self.fault or not self.has_room(is_frame):
                 self.dropped[packet.channel] += 1
                 return
-            # The header's count includes frames dropped by this sink.
-            self.packets.append(packet.plus_dropped(self.dropped["frame"]))
+            if is_frame:
+                # The header's count includes frames dropped by this sink.
+                dropped = packet.header["dropped"] + self.dropped["frame"]
+                packet = packet._replace(header=packet.header | {"dropped": dropped})
+            self.packets.append(packet)
             self.changed.notify_all()
 
     def close(self) -> None:

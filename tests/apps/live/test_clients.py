@@ -62,7 +62,7 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
     live = Live(
         flight, Pace(SPEED, 2.0), [], CommandState(flight, 0.5, False), may_solve=True
     )
-    server = WireServer("127.0.0.1", 0, "", live.greeting, live.inbox)
+    server = WireServer(live, "127.0.0.1", 0, "")
     live.outputs.append(server)
     start = flight.state.lab_from_body
     live.warm_up()

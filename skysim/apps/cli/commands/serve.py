@@ -11,12 +11,13 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+from typer import Option
 
 from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
+    from skysim.apps.live.display_pattern import DisplayPicture
     from skysim.apps.live.pacing import Live
     from skysim.apps.live.sinks import Output
 
@@ -29,94 +30,88 @@ def live(
     scene: SceneArg,
     tcp: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Send packets to clients on this port, and take their commands; 0: any free port.",
         ),
     ] = None,
     http: Annotated[
         int | None,
-        typer.Option(**PORTS, help="Serve MJPEG and packets on this port; 0: any free port."),
+        Option(**PORTS, help="Serve MJPEG on this port; 0: any free port."),
     ] = None,
     gige: Annotated[
-        bool,
-        typer.Option(
-            "--gige", help="Be a GigE Vision camera, which GenICam clients control."
-        ),
-    ] = False,
+        bool | None,
+        Option("--gige", help="Be a GigE Vision camera, which GenICam clients control."),
+    ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(
-            help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
-        ),
+        Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
     ] = None,
     display: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="BENCH",
             help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
         ),
     ] = None,
     indi: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.",
         ),
     ] = None,
     pipe: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
         ),
     ] = None,
     mcap: Annotated[
         Path | None,
-        typer.Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
+        Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
     ] = None,
     foxglove: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve on; other than loopback with a token.")
+        str, Option(help="Address to serve on; other than loopback with a token.")
     ] = HOST,
     token: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Token that clients must send; default: none on loopback, else a random one, which is printed."
         ),
     ] = "",
     truth: Annotated[
         bool,
-        typer.Option("--truth", help="Let clients, files and /truth.json have the truth."),
+        Option("--truth", help="Let clients, files and /truth.json have the truth."),
     ] = False,
     trigger: Annotated[
         bool,
-        typer.Option(
-            "--trigger", help="Expose frames when a client triggers, not by the scene."
-        ),
+        Option("--trigger", help="Expose frames when a client triggers, not by the scene."),
     ] = False,
     poses: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--poses",
             help="A client simulates the motion: expose a frame for each of its poses.",
         ),
     ] = False,
     client_tracker: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--client-tracker",
             help="The filter takes attitudes of clients, not of the scene's tracker.",
         ),
     ] = False,
     command_timeout: Annotated[
         float,
-        typer.Option(
+        Option(
             min=0,
             metavar="SECONDS",
             help="Time of the simulator after which a client's command of actuators ends.",
@@ -124,7 +119,7 @@ def live(
     ] = 0.5,
     wait: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--wait",
             help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
         ),
@@ -132,17 +127,18 @@ def live(
     frames: Frames = None,
     endless: Annotated[
         bool,
-        typer.Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
+        Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
     ] = False,
     speed: Annotated[
         float,
-        typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
+        Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
     ] = 1.0,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
     """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
+    options = locals()
     from skysim.apps.live.commands import CommandState
     from skysim.apps.live.pacing import Live, Pace
     from skysim.apps.live.poses import PosedLive
@@ -150,20 +146,9 @@ def live(
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
-    outputs = {
-        "folder": folder,
-        "pipe": pipe,
-        "http": http,
-        "display": display,
-        "gige": gige or None,
-        "indi": indi,
-        "mcap": mcap,
-        "foxglove": foxglove,
-        "tcp": tcp,
-    }
-    chosen = {name: value for name, value in outputs.items() if value is not None}
+    chosen = {name: options[name] for name in OPENERS if options[name] is not None}
     if not chosen:
-        raise InputError("", "no output", ", ".join(f"--{name}" for name in outputs))
+        raise InputError("", "no output", ", ".join(f"--{name}" for name in OPENERS))
     needs: dict[tuple[str, ...], bool] = {
         (f"--host {host}", "tcp", "http", "gige"): host != HOST,
         ("--token", "tcp", "http"): bool(token),
@@ -267,13 +252,10 @@ def open_pipe(opening: Opening, path: str) -> None:
 
 
 def open_http(opening: Opening, port: int) -> None:
-    from skysim.apps.live.http import FrameHub, start_server
+    from skysim.apps.live.http import FrameServer
 
-    hub = FrameHub(opening.live.statistics)
-    server = start_server(hub, opening.host, port, opening.token)
-    opening.stack.callback(server.server_close)
-    opening.stack.callback(server.shutdown)
-    opening.add(hub)
+    server = FrameServer(opening.live.statistics, opening.host, port, opening.token)
+    opening.add(server)
     query = f"?token={opening.token}" if opening.token else ""
     opening.say(f"http://{opening.host}:{server.server_port}/{query}")
 
@@ -281,17 +263,22 @@ def open_http(opening: Opening, port: int) -> None:
 def open_display(opening: Opening, bench: str) -> None:
     """Serve pictures for the display of a bench by the HTTP server."""
     from skysim.apps.live.display_pattern import DisplayPattern
-    from skysim.apps.live.http import FrameHub
+    from skysim.apps.live.http import FrameServer
     from skysim.scene.loader import load as load_scene
     from skysim.simulation.lab import build_lab
 
     live = opening.live
-    (hub,) = (output for output in live.outputs if isinstance(output, FrameHub))
+    (server,) = (output for output in live.outputs if isinstance(output, FrameServer))
     # A lab of its own: the server's threads draw beside the flight.
     lab = build_lab(live.flight.lab.scene)
-    hub.pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
-    hub.instant = live.instant
-    picture = hub.pattern.picture(*live.instant())
+    pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
+
+    def show() -> DisplayPicture:
+        state = live.flight.state
+        return pattern.picture(state.t_s, state.lab_from_body)
+
+    server.show = show
+    picture = show()
     opening.say(
         f"/display shows {picture.shown} lights at the start;"
         f" {picture.faint} are too faint for its gray levels"
@@ -338,9 +325,8 @@ def open_tcp(opening: Opening, port: int) -> None:
     """Serve the wire."""
     from skysim.apps.live.wire import WireServer
 
-    live = opening.live
     token = opening.token
-    server = WireServer(opening.host, port, token, live.greeting, live.inbox, live.has_truth)
+    server = WireServer(opening.live, opening.host, port, token)
     opening.add(server)
     opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
     opening.entered.append(server.entered)
@@ -413,35 +399,29 @@ def counts(receiver: str, counters: dict[str, Any]) -> str:
 def gui(
     scene: SceneArg = "shefex2",
     host: Annotated[
-        str, typer.Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
+        str, Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    port: Annotated[int, Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Access token that browsers must send; default: a random one, in the printed link."
         ),
     ] = "",
-    folder: Annotated[
-        Path, typer.Option(help="Folder in which new scenes are saved.")
-    ] = Path("."),
-    out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path(
-        "out"
-    ),
+    folder: Annotated[Path, Option(help="Folder in which new scenes are saved.")] = Path("."),
+    out: Annotated[Path, Option(help="Folder of studies and their reports.")] = Path("out"),
     camera: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="SOURCE",
             help="Live camera that the page may watch: index, file or address; repeatable.",
         ),
     ] = None,
     workers: Annotated[
         int,
-        typer.Option(
-            min=1, help="Most worker processes, one for each page; further pages wait."
-        ),
+        Option(min=1, help="Most worker processes, one for each page; further pages wait."),
     ] = 12,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
+    show: Annotated[bool, Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
     """Open the interactive simulator in the browser (extra `gui`)."""
     from skysim.scene.loader import load
