@@ -148,8 +148,8 @@ class Handler(BaseHTTPRequestHandler):
         elif not newest.truth:
             self.send_error(404, "the truth is off; allowed: start with --truth")
         else:
-            truth = newest.header | {"truth": dict(newest.truth)}
-            self.respond("application/json", files.to_json(truth).encode())
+            text = files.to_json(newest.header_with_truth)
+            self.respond("application/json", text.encode())
 
     do_HEAD = do_GET  # the same without a body
 

@@ -8,6 +8,7 @@
    period or more before its rendering starts is dropped.
 """
 
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from skysim.apps.live.packets import (
     Packet,
     frame_packet,
     period_values,
+    plain,
     solution_packet,
 )
 from skysim.apps.live.sinks import Output
@@ -78,6 +80,8 @@ class Live:
         Commands of clients
     inbox
         Where they arrive
+    entered
+        Set when the first client has begun
     has_truth
         Whether truth may be sent
     solves_itself
@@ -97,6 +101,7 @@ class Live:
     outputs: list[Output]
     commands: CommandState
     inbox: Inbox = field(default_factory=Inbox)
+    entered: threading.Event = field(default_factory=threading.Event)
     has_truth: bool = False
     solves_itself: bool = True
     may_solve: bool = False
@@ -177,7 +182,7 @@ class Live:
             values = period_values(flight, channel, began_s) if channel in wanted else {}
             if values:
                 head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
-                self.send(Packet(head | values))
+                self.send(Packet(head | plain(values)))
         # 5. Frames.
         self.send_frames()
 

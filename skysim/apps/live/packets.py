@@ -65,11 +65,14 @@ class Packet(NamedTuple):
     def channel(self) -> str:
         return str(self.header["channel"])
 
+    @property
+    def header_with_truth(self) -> dict[str, Any]:
+        return self.header | ({"truth": dict(self.truth)} if self.truth else {})
+
     def pack(self, has_truth: bool = False) -> bytes:
         """Serialize: the header line, with the truth if wanted, then the pixels row by row from the top."""
-        header = self.header | {"bytes": self.pixels.nbytes}
-        if has_truth and self.truth:
-            header["truth"] = dict(self.truth)
+        header = self.header_with_truth if has_truth else self.header
+        header = header | {"bytes": self.pixels.nbytes}
         return json.dumps(header).encode() + b"\n" + self.pixels.tobytes()
 
 
@@ -94,6 +97,11 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
     if len(pixels) < size:
         raise InputError("", f"the stream ended within frame {header.get('index')}")
     return header, np.frombuffer(pixels, dtype).reshape(shape)
+
+
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Copies of the values, as Python's numbers and lists."""
+    return {key: np.asarray(value).tolist() for key, value in values.items()}
 
 
 def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
@@ -126,14 +134,14 @@ def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "dropped": dropped,
     }
     truths = {
-        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat().tolist(),
-        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat().tolist(),
-        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
-        "ids": sources.id.tolist(),
-        "x_px": sources.xy_px[:, 0].round(4).tolist(),
-        "y_px": sources.xy_px[:, 1].round(4).tolist(),
+        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat(),
+        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s,
+        "ids": sources.id,
+        "x_px": sources.xy_px[:, 0].round(4),
+        "y_px": sources.xy_px[:, 1].round(4),
     }
-    return Packet(header, pixels, truths)
+    return Packet(header, pixels, plain(truths))
 
 
 def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
@@ -148,9 +156,9 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
         "status": solution.status,
     }
     if solution.cam_from_ref is not None and solution.covariance_rad2 is not None:
-        header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat().tolist()
-        header["covariance_rad2"] = solution.covariance_rad2.tolist()
-    return Packet(header, attitude=solution)
+        header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat()
+        header["covariance_rad2"] = solution.covariance_rad2
+    return Packet(plain(header), attitude=solution)
 
 
 def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any]:
@@ -160,14 +168,14 @@ def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any
     navigation = motion.navigation
     if channel == "state":
         return {
-            "wheel_rad_s": state.wheel_rad_s.tolist(),
-            "gimbal_rad": state.gimbal_rad.tolist(),
-            **{name: values.tolist() for name, values in state.readings.items()},
+            "wheel_rad_s": state.wheel_rad_s,
+            "gimbal_rad": state.gimbal_rad,
+            **state.readings,
         }
     if channel == "truth":
         return {
-            "lab_from_body_xyzw": state.lab_from_body.as_quat().tolist(),
-            "rate_body_rad_s": state.rate_body_rad_s.tolist(),
+            "lab_from_body_xyzw": state.lab_from_body.as_quat(),
+            "rate_body_rad_s": state.rate_body_rad_s,
         }
     if channel == "imu":
         samples = flight.imu_samples(began_s)
@@ -176,19 +184,19 @@ def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any
             return {}
         return {
             "step_s": samples.step_s,
-            "times_s": samples.t_s[new].tolist(),
-            "angle_rad": samples.angle_rad[new].tolist(),
-            "velocity_m_s": samples.velocity_m_s[new].tolist(),
+            "times_s": samples.t_s[new],
+            "angle_rad": samples.angle_rad[new],
+            "velocity_m_s": samples.velocity_m_s[new],
         }
     computer = motion.flight_computer
     values = {
-        "torque_nm": computer.control_torque_nm.tolist(),
+        "torque_nm": computer.control_torque_nm,
         "loads": dict(zip(computer.names, computer.loads.tolist(), strict=True)),
     }
     if navigation:
-        values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1).tolist()
+        values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1)
         if navigation.filter:
             attitude_wxyz = navigation.attitude_wxyz("filter")
-            values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1).tolist()
-            values["bias_rad_s"] = navigation.filter.state.bias_rad_s.tolist()
+            values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1)
+            values["bias_rad_s"] = navigation.filter.state.bias_rad_s
     return values

@@ -77,7 +77,7 @@ class WireClient(Sink):
         if "take" in command:
             self.channels = server.checked_channels(command.pop("take"))
             self.offer(Packet({"channel": "hello"} | server.live.greeting), False)
-            server.entered.set()
+            server.live.entered.set()
         if command:
             server.live.inbox.put(command, self.reply)
 
@@ -113,7 +113,6 @@ class WireServer:
     def __init__(self, live: Live, host: str, port: int, token: str) -> None:
         self.live = live
         self.token = token
-        self.entered = threading.Event()
         self.lock = threading.Lock()
         self.clients: list[WireClient] = []
         # Counters of clients that have left.
@@ -157,14 +156,11 @@ class WireServer:
     @property
     def channels(self) -> Collection[str]:
         """The channels that any client takes."""
-        with self.lock:
-            return frozenset[str]().union(*(client.channels for client in self.clients))
+        return frozenset[str]().union(*(client.channels for client in list(self.clients)))
 
     def offer(self, packet: Packet, patient: bool) -> None:
         """Offer a packet to each client that takes its channel."""
-        with self.lock:
-            clients = list(self.clients)
-        for client in clients:
+        for client in list(self.clients):
             if packet.channel in client.channels and not client.fault:
                 client.offer(packet, patient)
 

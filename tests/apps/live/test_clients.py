@@ -67,7 +67,7 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
     start = flight.state.lab_from_body
     live.warm_up()
     with subprocess.Popen([*client(language, tmp_path), str(server.port)]) as process:
-        assert server.entered.wait(30)
+        assert live.entered.wait(30)
         live.pace.start(0.0)
         while flight.now_s < 7.5:
             live.advance()

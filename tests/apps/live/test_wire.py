@@ -211,7 +211,7 @@ def test_a_client_without_the_token_gets_nothing(live: Live) -> None:
         assert packet is not None
         assert "token missing or wrong" in packet["problem"]
         assert client.receive() is None
-    assert not server_of(live).entered.is_set()
+    assert not live.entered.is_set()
 
 
 def test_the_truth_is_off_by_default(live: Live) -> None:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import secrets
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from typer import Option
@@ -139,6 +137,7 @@ def live(
 ) -> None:
     """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
     options = locals()
+    from skysim.apps.access import LOOPBACK
     from skysim.apps.live.commands import CommandState
     from skysim.apps.live.pacing import Live, Pace
     from skysim.apps.live.poses import PosedLive
@@ -183,12 +182,14 @@ def live(
         may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
-        opening = Opening(flown, stack, host, token or new_token(host), [])
+        if not token and host not in LOOPBACK:
+            token = secrets.token_urlsafe(16)
+        opening = Opening(flown, stack, host, token, display)
         try:
             for name, value in chosen.items():
-                OPENERS[name](opening, value)
-            while wait and not any(one.is_set() for one in opening.entered):
-                time.sleep(0.05)
+                open_output(opening, name, value)
+            if wait:
+                flown.entered.wait()
             flown.run()
         except KeyboardInterrupt:
             print(file=sys.stderr)
@@ -204,13 +205,6 @@ def live(
             raise InputError(f"--{output.name}", output.fault)
 
 
-def new_token(host: str) -> str:
-    """A random token where other machines can connect, else none."""
-    from skysim.apps.access import LOOPBACK
-
-    return "" if host in LOOPBACK else secrets.token_urlsafe(16)
-
-
 class Opening(NamedTuple):
     """What the outputs of a flight share.
 
@@ -220,15 +214,15 @@ class Opening(NamedTuple):
         The flight, and what closes its outputs
     host, token
         Address to serve on, and the token of its clients
-    entered
-        Set when the first client of a server has begun, for each server that `--wait` waits for
+    display
+        Scene of the bench whose display shows the sky
     """
 
     live: Live
     stack: ExitStack
     host: str
     token: str
-    entered: list[Event]
+    display: str | None
 
     def add(self, output: Output) -> None:
         """Send the flight's packets to an output, which the stack closes."""
@@ -258,17 +252,21 @@ def open_http(opening: Opening, port: int) -> None:
     opening.add(server)
     query = f"?token={opening.token}" if opening.token else ""
     opening.say(f"http://{opening.host}:{server.server_port}/{query}")
+    if opening.display:
+        server.show = shown(opening.live, opening.display)
+        picture = server.show()
+        opening.say(
+            f"/display shows {picture.shown} lights at the start;"
+            f" {picture.faint} are too faint for its gray levels"
+        )
 
 
-def open_display(opening: Opening, bench: str) -> None:
-    """Serve pictures for the display of a bench by the HTTP server."""
+def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
+    """The function that returns the present picture for the display of a bench."""
     from skysim.apps.live.display_pattern import DisplayPattern
-    from skysim.apps.live.http import FrameServer
     from skysim.scene.loader import load as load_scene
     from skysim.simulation.lab import build_lab
 
-    live = opening.live
-    (server,) = (output for output in live.outputs if isinstance(output, FrameServer))
     # A lab of its own: the server's threads draw beside the flight.
     lab = build_lab(live.flight.lab.scene)
     pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
@@ -277,27 +275,11 @@ def open_display(opening: Opening, bench: str) -> None:
         state = live.flight.state
         return pattern.picture(state.t_s, state.lab_from_body)
 
-    server.show = show
-    picture = show()
-    opening.say(
-        f"/display shows {picture.shown} lights at the start;"
-        f" {picture.faint} are too faint for its gray levels"
-    )
-
-
-@contextmanager
-def extra_of(option: str, extra: str) -> Iterator[None]:
-    """Name the extra that an option needs, where a package is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        allowed = f"after pip install 'skysim[{extra}]'"
-        raise InputError(option, f"{error.name} is not installed", allowed) from None
+    return show
 
 
 def open_indi(opening: Opening, port: int) -> None:
-    with extra_of("--indi", "indi"):
-        from skysim.apps.live.indi import IndiCamera
+    from skysim.apps.live.indi import IndiCamera
 
     camera = IndiCamera(opening.live, port)
     opening.stack.callback(camera.close)
@@ -306,15 +288,13 @@ def open_indi(opening: Opening, port: int) -> None:
 
 
 def open_mcap(opening: Opening, path: Path) -> None:
-    with extra_of("--mcap", "ros"):
-        from skysim.apps.live.ros_outputs import McapSink, RosEncoder
+    from skysim.apps.live.ros_outputs import McapSink, RosEncoder
 
     opening.add(McapSink(RosEncoder(opening.live), path))
 
 
 def open_foxglove(opening: Opening, port: int) -> None:
-    with extra_of("--foxglove", "ros"):
-        from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
+    from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
 
     sink = FoxgloveSink(RosEncoder(opening.live), port)
     opening.add(sink)
@@ -322,14 +302,12 @@ def open_foxglove(opening: Opening, port: int) -> None:
 
 
 def open_tcp(opening: Opening, port: int) -> None:
-    """Serve the wire."""
     from skysim.apps.live.wire import WireServer
 
     token = opening.token
     server = WireServer(opening.live, opening.host, port, token)
     opening.add(server)
     opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
-    opening.entered.append(server.entered)
 
 
 def open_gige(opening: Opening, _: bool) -> None:
@@ -339,7 +317,6 @@ def open_gige(opening: Opening, _: bool) -> None:
     opening.add(camera)
     risk = "" if camera.is_local else ", no token: all that reach it can control it"
     opening.say(f"gige {camera.host}:{camera.port}{risk}")
-    opening.entered.append(camera.entered)
 
 
 # By the option's name, in the order in which they are opened.
@@ -347,14 +324,23 @@ OPENERS: dict[str, Callable[[Opening, Any], None]] = {
     "folder": open_folder,
     "pipe": open_pipe,
     "http": open_http,
-    "display": open_display,
     "gige": open_gige,
     "indi": open_indi,
     "mcap": open_mcap,
     "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
+EXTRAS = {"indi": "indi", "mcap": "ros", "foxglove": "ros"}
 TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
+
+
+def open_output(opening: Opening, name: str, value: Any) -> None:
+    """Open an output; name the extra that it needs, where a package is missing."""
+    try:
+        OPENERS[name](opening, value)
+    except ModuleNotFoundError as error:
+        allowed = f"after pip install 'skysim[{EXTRAS[name]}]'"
+        raise InputError(f"--{name}", f"{error.name} is not installed", allowed) from None
 
 
 def summary(statistics: dict[str, Any]) -> str:
@@ -374,16 +360,13 @@ def summary(statistics: dict[str, Any]) -> str:
         updates = [f"{number} {status}" for status, number in commands["updates"].items()]
         if updates:
             lines.append("attitudes of clients: " + ", ".join(updates))
-    for name, output in statistics["outputs"].items():
-        lines.append(counts(name, output))
+    lines += [counts(*output) for output in statistics["outputs"].items()]
     return "\n".join(lines)
 
 
 def counts(receiver: str, counters: dict[str, Any]) -> str:
     """What an output has sent and dropped, by channel, and its fault."""
-    parts = []
-    if "clients" in counters:
-        parts.append(f"{counters['clients']} clients")
+    parts = [f"{counters['clients']} clients"] if "clients" in counters else []
     for word in ("sent", "dropped"):
         numbers = [f"{number} {name}" for name, number in counters[word].items() if number]
         if numbers or word == "sent":
