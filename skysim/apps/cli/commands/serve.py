@@ -224,41 +224,37 @@ class Opening(NamedTuple):
     token: str
     display: str | None
 
-    def add(self, output: Output) -> None:
-        """Send the flight's packets to an output, which the stack closes."""
-        self.live.outputs.append(output)
-        self.stack.callback(output.close)
-
     def say(self, text: str) -> None:
         print(f"skysim live: {text}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
 
 
-def open_folder(opening: Opening, path: Path) -> None:
+def open_folder(opening: Opening, path: Path) -> Output:
     from skysim.apps.live.sinks import Sink, folder_writer
 
-    opening.add(Sink("folder", folder_writer(path)))
+    return Sink("folder", folder_writer(path))
 
 
-def open_pipe(opening: Opening, path: str) -> None:
+def open_pipe(opening: Opening, path: str) -> Output:
     from skysim.apps.live.sinks import Sink, pipe_writer
 
-    opening.add(Sink("pipe", pipe_writer(path)))
+    return Sink("pipe", pipe_writer(path))
 
 
-def open_http(opening: Opening, port: int) -> None:
+def open_http(opening: Opening, port: int) -> Output:
     from skysim.apps.live.http import FrameServer
 
+    show = shown(opening.live, opening.display) if opening.display else None
     server = FrameServer(opening.live.statistics, opening.host, port, opening.token)
-    opening.add(server)
+    server.show = show
     query = f"?token={opening.token}" if opening.token else ""
     opening.say(f"http://{opening.host}:{server.server_port}/{query}")
-    if opening.display:
-        server.show = shown(opening.live, opening.display)
-        picture = server.show()
+    if show:
+        picture = show()
         opening.say(
             f"/display shows {picture.shown} lights at the start;"
             f" {picture.faint} are too faint for its gray levels"
         )
+    return server
 
 
 def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
@@ -278,49 +274,49 @@ def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
     return show
 
 
-def open_indi(opening: Opening, port: int) -> None:
+def open_indi(opening: Opening, port: int) -> Output:
     from skysim.apps.live.indi import IndiCamera
 
     camera = IndiCamera(opening.live, port)
     opening.stack.callback(camera.close)
-    opening.add(camera.sink)
     opening.say(f"indi {HOST}:{camera.port}")
+    return camera.sink
 
 
-def open_mcap(opening: Opening, path: Path) -> None:
+def open_mcap(opening: Opening, path: Path) -> Output:
     from skysim.apps.live.ros_outputs import McapSink, RosEncoder
 
-    opening.add(McapSink(RosEncoder(opening.live), path))
+    return McapSink(RosEncoder(opening.live), path)
 
 
-def open_foxglove(opening: Opening, port: int) -> None:
+def open_foxglove(opening: Opening, port: int) -> Output:
     from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
 
     sink = FoxgloveSink(RosEncoder(opening.live), port)
-    opening.add(sink)
     opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
+    return sink
 
 
-def open_tcp(opening: Opening, port: int) -> None:
+def open_tcp(opening: Opening, port: int) -> Output:
     from skysim.apps.live.wire import WireServer
 
     token = opening.token
     server = WireServer(opening.live, opening.host, port, token)
-    opening.add(server)
     opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
+    return server
 
 
-def open_gige(opening: Opening, _: bool) -> None:
+def open_gige(opening: Opening, _: bool) -> Output:
     from skysim.apps.live.gige import GigeCamera
 
     camera = GigeCamera(opening.live, opening.host)
-    opening.add(camera)
     risk = "" if camera.is_local else ", no token: all that reach it can control it"
     opening.say(f"gige {camera.host}:{camera.port}{risk}")
+    return camera
 
 
 # By the option's name, in the order in which they are opened.
-OPENERS: dict[str, Callable[[Opening, Any], None]] = {
+OPENERS: dict[str, Callable[[Opening, Any], Output]] = {
     "folder": open_folder,
     "pipe": open_pipe,
     "http": open_http,
@@ -335,12 +331,14 @@ TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
 
 
 def open_output(opening: Opening, name: str, value: Any) -> None:
-    """Open an output; name the extra that it needs, where a package is missing."""
+    """Send the flight's packets to an output, which the stack closes; name the extra that it needs."""
     try:
-        OPENERS[name](opening, value)
+        output = OPENERS[name](opening, value)
     except ModuleNotFoundError as error:
         allowed = f"after pip install 'skysim[{EXTRAS[name]}]'"
         raise InputError(f"--{name}", f"{error.name} is not installed", allowed) from None
+    opening.live.outputs.append(output)
+    opening.stack.callback(output.close)
 
 
 def summary(statistics: dict[str, Any]) -> str:
