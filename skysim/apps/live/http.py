@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
-from skysim.apps.access import LOOPBACK, names_address, same_site, token_matches
+from skysim.apps.access import names_address, same_site, token_matches
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.sinks import encode_png
 from skysim.core import files
@@ -63,7 +63,7 @@ class FrameServer(ThreadingHTTPServer):
         self, status: Callable[[], dict[str, Any]], host: str, port: int, token: str = ""
     ) -> None:
         self.status = status
-        self.hosts = LOOPBACK if host in LOOPBACK else ("*",)
+        self.host = host
         self.token = token
         self.show: Callable[[], DisplayPicture] | None = None
         self.newest: Packet | None = None
@@ -114,7 +114,7 @@ class Handler(BaseHTTPRequestHandler):
         if server.token and not token_matches(token, server.token):
             return "token missing or wrong; open the address that the server printed: /?token=..."
         headers = self.headers
-        return same_site(headers.get("Host", ""), headers.get("Origin", ""), server.hosts)
+        return same_site(headers.get("Host", ""), headers.get("Origin", ""), server.host)
 
     def do_GET(self) -> None:
         path, _, query = self.path.partition("?")
@@ -171,7 +171,12 @@ class Handler(BaseHTTPRequestHandler):
         packet = None
         if self.begin(**{"Content-Type": "multipart/x-mixed-replace; boundary=frame"}):
             while packet := self.server.newer_than(packet):
-                self.wfile.write(mjpeg_part(packet))
+                data = jpeg(to_8bit(packet.pixels, "square root"))
+                head = "--frame\r\nContent-Type: image/jpeg\r\n"
+                head += f"Content-Length: {len(data)}\r\n"
+                for name in ("index", "t_s", "due_unix_s", "dropped"):
+                    head += f"X-{name}: {packet.header[name]}\r\n"
+                self.wfile.write(head.encode() + b"\r\n" + data + b"\r\n")
 
     def handle(self) -> None:
         """Handle the connection; ignore a client that disconnects or times out during a response."""
@@ -180,12 +185,3 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *_: Any) -> None:
         """Suppress the access log."""
-
-
-def mjpeg_part(packet: Packet) -> bytes:
-    """One part of a multipart/x-mixed-replace response: a JPEG with header fields of the packet."""
-    data = jpeg(to_8bit(packet.pixels, "square root"))
-    head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
-    for name in ("index", "t_s", "due_unix_s", "dropped"):
-        head += f"X-{name}: {packet.header[name]}\r\n"
-    return head.encode() + b"\r\n" + data + b"\r\n"
