@@ -2,6 +2,8 @@
 
 import hmac
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from skysim.core.errors import InputError
 
@@ -15,8 +17,15 @@ def token_matches(candidate: str, token: str) -> bool:
 
 def listen(option: str, host: str, port: int) -> socket.socket:
     """A socket that listens; port 0 is any free one. Raises InputError for an address that cannot be bound."""
-    try:
+    with names_address(option, host, port):
         return socket.create_server((host, port))
+
+
+@contextmanager
+def names_address(option: str, host: str, port: int) -> Iterator[None]:
+    """Raise InputError, with the option and its address, instead of OSError."""
+    try:
+        yield
     except OSError as error:
         problem = f"cannot listen on {host}:{port}: {error.strerror or error}"
         raise InputError(f"{option} {port}", problem) from None
@@ -27,16 +36,16 @@ def host_of(header: str) -> str:
     return header.rpartition(":")[0] if header.rpartition(":")[2].isdigit() else header
 
 
-def same_site(host: str, origin: str, hosts: tuple[str, ...]) -> str:
+def same_site(host: str, origin: str, served: str) -> str:
     """Why a request by its headers Host and Origin is refused; empty if it is allowed.
 
     Parameters
     ----------
-    hosts
-        Allowed hosts ("*": any). This stops DNS rebinding: the name of another site that resolves to this server comes
-        with its own Host header
+    served
+        Address that the server listens on; on loopback the host has to be of loopback too. This stops DNS rebinding:
+        the name of another site that resolves to this server comes with its own Host header
     """
-    if "*" not in hosts and host_of(host) not in hosts:
+    if served in LOOPBACK and host_of(host) not in LOOPBACK:
         return "host name not allowed"
     if origin and origin.partition("://")[2] != host:
         return "request of another site refused"

@@ -206,9 +206,8 @@ class Guard:
 
     Attributes
     ----------
-    hosts
-        Allowed Host headers ("*": any). This stops DNS rebinding: the name of another site that
-        resolves to this server comes with its own Host header
+    host
+        Address that the server listens on, for `same_site`
     token
         Required access token; `/?token=...` stores it in a cookie
     port
@@ -216,9 +215,9 @@ class Guard:
         cookie contains the port
     """
 
-    def __init__(self, app: Any, hosts: tuple[str, ...], token: str, port: int) -> None:
+    def __init__(self, app: Any, host: str, token: str, port: int) -> None:
         self.app = KeptFiles(app)
-        self.hosts = hosts
+        self.host = host
         self.token = token
         self.cookie = f"skysim_gui_{port}"
 
@@ -238,7 +237,7 @@ class Guard:
     def refusal(self, request: HTTPConnection) -> Response | None:
         """The response to a refused request; None if it is allowed."""
         headers = request.headers
-        refused = same_site(headers.get("host", ""), headers.get("origin", ""), self.hosts)
+        refused = same_site(headers.get("host", ""), headers.get("origin", ""), self.host)
         if refused:
             return PlainTextResponse(refused, 403)
         if int(headers.get("content-length") or 0) > LIMIT_BYTES + 2**16:
@@ -377,11 +376,10 @@ def serve(
     workers
         Maximum number of worker processes; further pages wait for one
     """
-    hosts = LOOPBACK if host in LOOPBACK else ("*",)
     token = token or secrets.token_urlsafe(16)
     layers = app.build_middleware_stack
     # NiceGUI adds further layers when it runs; the guard is outside of them.
-    app.build_middleware_stack = lambda: Guard(layers(), hosts, token, port)
+    app.build_middleware_stack = lambda: Guard(layers(), host, token, port)
     routes(scene, folder, out, cameras, workers)
     login = f"/?token={quote(token)}"
     address = f"http://{host}:{port}{login}"

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
-from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
+from skysim.dynamics.flight_computer import Commands
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import longest_live_s
 
@@ -42,15 +43,11 @@ Reply = Callable[[str], None]
 
 def parse(line: bytes) -> dict[str, Any]:
     """The object in a line. Raises InputError for anything else."""
-    try:
+    with suppress(ValueError, RecursionError):
         found = json.loads(line)
-    except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict):
-        raise InputError(
-            "", f"not an object of JSON: {line[:40]!r}", '{"torque_nm": [0, 0, 0]}'
-        )
-    return found
+        if isinstance(found, dict):
+            return found
+    raise InputError("", f"not an object of JSON: {line[:40]!r}", '{"torque_nm": [0, 0, 0]}')
 
 
 class Inbox:
@@ -61,12 +58,11 @@ class Inbox:
 
     def put(self, command: dict[str, Any], reply: Reply) -> bool:
         """Add a command; refuse it where too many wait. Return whether it waits."""
-        has_room = len(self.waiting) < MOST_WAITING
-        if has_room:
-            self.waiting.append((command, reply))
-        else:
+        if len(self.waiting) >= MOST_WAITING:
             reply(f"more than {MOST_WAITING} commands in a control period")
-        return has_room
+            return False
+        self.waiting.append((command, reply))
+        return True
 
     def take(self) -> Iterator[tuple[dict[str, Any], Reply]]:
         """All that waits; each command waits until its caller asks for the next."""
@@ -132,57 +128,47 @@ class CommandState:
 
     def apply(self, command: dict[str, Any]) -> None:
         """Check a command as a whole, then take it. Raises InputError."""
-        command = dict(command)
-        exposure_s = self.exposure_s(command.pop("exposure_s", None))
-        triggered = command.pop("triggered", self.has_triggers)
-        if not isinstance(triggered, bool):
-            raise InputError("triggered", repr(triggered)[:40], "true or false")
-        trigger = command.pop("trigger", False)
-        self.check_trigger("trigger", trigger, triggered)
-        abort = command.pop("abort", False)
-        self.check_trigger("abort", abort, triggered)
-        solution = command.pop("attitude", None)
+        flight = self.flight
+        schedule = flight.schedules[0]
+        actuators = dict(command)
+        exposure_s = actuators.pop("exposure_s", None)
+        if exposure_s is not None:
+            exposure_s = self.exposure_s(exposure_s)
+        flags = {"triggered": self.has_triggers, "trigger": False, "abort": False}
+        for key, default in flags.items():
+            flags[key] = actuators.pop(key, default)
+            if not isinstance(flags[key], bool):
+                raise InputError(key, repr(flags[key])[:40], "true or false")
+            if flags[key] and not flags["triggered"]:
+                problem = "the scene's schedule exposes the frames"
+                raise InputError(key, problem, "--trigger, or triggered")
+        waiting = sum(index >= schedule.index for index in schedule.triggers_s or ())
+        if flags["trigger"] and waiting >= MOST_TRIGGERS:
+            raise InputError("trigger", f"{MOST_TRIGGERS} exposures are waiting")
+        solution = actuators.pop("attitude", None)
         attitude = None if solution is None else self.solution(solution)
-        # What is left are commands of actuators.
-        motors = dict(command)
-        self.flight.commands(motors.pop("torque_nm", None), motors)
-        now_s = self.flight.now_s
-        self.held |= {key: (value, now_s) for key, value in command.items()}
+        self.checked(actuators)
+        self.held |= {key: (value, flight.now_s) for key, value in actuators.items()}
         if exposure_s:
-            self.flight.schedules[0].exposure_control.exposure_s = exposure_s
-        self.set_triggered(triggered)
-        if abort:
-            self.flight.schedules[0].triggers_s = {}
-        if trigger:
-            self.flight.schedules[0].trigger(now_s)
-        if attitude and self.flight.motion.navigation:
-            status = self.flight.motion.navigation.update_filter(solution["t_s"], attitude)
+            schedule.exposure_control.exposure_s = exposure_s
+        self.set_triggered(flags["triggered"])
+        if flags["abort"]:
+            schedule.triggers_s = {}
+        if flags["trigger"]:
+            schedule.trigger(flight.now_s)
+        if attitude and flight.motion.navigation:
+            status = flight.motion.navigation.update_filter(solution["t_s"], attitude)
             self.updates[status] += 1
 
-    def check_trigger(self, key: str, value: Any, triggered: bool) -> None:
-        """Raise InputError for a trigger, or an abort, that cannot be taken."""
-        if value is False:
-            return
-        if value is not True:
-            raise InputError(key, repr(value)[:40], "true")
-        if not triggered:
-            problem = "the scene's schedule exposes the frames"
-            raise InputError(key, problem, "--trigger, or triggered")
-        schedule = self.flight.schedules[0]
-        waiting = sum(index >= schedule.index for index in schedule.triggers_s or ())
-        if key == "trigger" and waiting >= MOST_TRIGGERS:
-            raise InputError("trigger", f"{MOST_TRIGGERS} exposures are waiting")
+    def checked(self, actuators: dict[str, Any]) -> Commands:
+        """Commands of actuators by key, for a control period. Raises InputError."""
+        motors = dict(actuators)
+        return self.flight.commands(motors.pop("torque_nm", None), motors)
 
-    def exposure_s(self, value: Any) -> float | None:
+    def exposure_s(self, value: Any) -> float:
         """A commanded exposure time, checked."""
-        if value is None:
-            return None
         longest_s = self.longest_exposure_s
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float))
-            or not 0 < value <= longest_s
-        ):
+        if type(value) not in (int, float) or not 0 < value <= longest_s:
             raise InputError("exposure_s", repr(value)[:40], f"more than 0, to {longest_s:g}")
         if self.flight.lab.scene.tracker.exposure_control:
             raise InputError("exposure_s", "the scene's tracker.exposure_control sets it")
@@ -224,7 +210,4 @@ class CommandState:
         kept = {key: held for key, held in self.held.items() if held[1] >= end_s}
         self.timeouts += len(self.held) - len(kept)
         self.held = kept
-        if not kept:
-            return NO_COMMANDS
-        values = {key: value for key, (value, _) in kept.items()}
-        return self.flight.commands(values.pop("torque_nm", None), values)
+        return self.checked({key: value for key, (value, _) in kept.items()})

@@ -136,7 +136,7 @@ class GigeCamera(Sink, ControlChannel):
         self.start_s = 0.0
         self.block = 0
         self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
-        self.entered = threading.Event()
+        self.entered = live.entered
         ControlChannel.__init__(self)
         self.fill_memory()
         Sink.__init__(self, "gige", self.send_frame, ())

@@ -8,14 +8,13 @@
    period or more before its rendering starts is dropped.
 """
 
+import threading
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.commands import CommandState, Inbox
 from skysim.apps.live.packets import (
@@ -23,6 +22,7 @@ from skysim.apps.live.packets import (
     Packet,
     frame_packet,
     period_values,
+    plain,
     solution_packet,
 )
 from skysim.apps.live.sinks import Output
@@ -65,6 +65,7 @@ class Pace:
 
 
 DELAY_WINDOW = 10_000  # newest delays from which the quantiles are computed
+QUANTILES = {"median": 0.5, "p99": 0.99, "worst": 1.0}
 
 
 @dataclass
@@ -79,14 +80,16 @@ class Live:
         Commands of clients
     inbox
         Where they arrive
+    entered
+        Set when the first client has begun
     has_truth
         Whether truth may be sent
     solves_itself
         Whether the filter takes the solutions of the scene's tracker, and not the clients'
     may_solve
         Whether a client may take solutions
-    rendered, dropped
-        Numbers of rendered and of dropped frames
+    rendered
+        Number of rendered frames
     periods, missed
         Numbers of control periods, and of those that ended late by a period or more
     late_ms
@@ -98,11 +101,11 @@ class Live:
     outputs: list[Output]
     commands: CommandState
     inbox: Inbox = field(default_factory=Inbox)
+    entered: threading.Event = field(default_factory=threading.Event)
     has_truth: bool = False
     solves_itself: bool = True
     may_solve: bool = False
     rendered: int = 0
-    dropped: int = 0
     periods: int = 0
     missed: int = 0
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
@@ -121,19 +124,13 @@ class Live:
             "rate_hz": scene.exposure.rate_hz,
             "actuators": {
                 key: {"motors": len(command_map), "limit": limit}
-                for key, (command_map, limit) in (
-                    (key, one.command_map()) for key, one in sets.items()
-                )
+                for key, one in sets.items()
+                for command_map, limit in [one.command_map()]
             },
             "cam_from_body_xyzw": flight.lab.cameras[0]
             .mount.cam_from_body.as_quat()
             .tolist(),
         }
-
-    def instant(self) -> tuple[float, Rotation]:
-        """Time and lab_from_body at the end of the last control period."""
-        state = self.flight.state
-        return state.t_s, state.lab_from_body
 
     def run(self) -> None:
         """Fly until the end, or until all outputs have failed."""
@@ -141,10 +138,7 @@ class Live:
         self.pace.start(0.0)
         while not self.flight.is_over and not self.is_abandoned:
             self.advance()
-        for shot in self.shots("solution" in self.wanted, late=True):
-            self.send_shot(shot)
-        # With those after the last rendered one.
-        self.dropped = self.flight.schedules[0].index - self.rendered
+        self.send_frames(late=True)
 
     @property
     def is_abandoned(self) -> bool:
@@ -188,13 +182,12 @@ class Live:
             values = period_values(flight, channel, began_s) if channel in wanted else {}
             if values:
                 head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
-                self.send(Packet(head | values))
+                self.send(Packet(head | plain(values)))
         # 5. Frames.
-        for shot in self.shots("solution" in wanted):
-            self.send_shot(shot)
+        self.send_frames()
 
-    def shots(self, solves: bool, late: bool = False) -> Iterator[Shot]:
-        """The exposures of the main camera that are due; late ones are due only after the end.
+    def send_frames(self, late: bool = False) -> None:
+        """Send the exposures of the main camera that are due; late ones are due only after the end.
 
         Frames that a filter or a client that triggers waits for are not dropped.
         """
@@ -204,13 +197,13 @@ class Live:
         main = flight.schedules[0]
         for shot in flight.capture_due(
             flight.schedules if updates else [main],
-            solves,
+            "solution" in self.wanted,
             None if all_come else self.pace.is_on_time,
             late,
             updates,
         ):
             if shot.camera is main.camera:
-                yield shot
+                self.send_shot(shot)
 
     def send_shot(self, shot: Shot) -> None:
         """Send a frame, and its solution."""
@@ -219,12 +212,10 @@ class Live:
         # With a rolling shutter, the end of the last row's exposure.
         due_s = pace.due_s(shot.window.close_s(rows))
         now_s = time.monotonic()
-        self.dropped = shot.frame.index - self.rendered
+        dropped = shot.frame.index - self.rendered
         self.rendered += 1
         self.late_ms.append(1e3 * (now_s - due_s))
-        packet = frame_packet(
-            shot, due_s + pace.offset_s, now_s + pace.offset_s, self.dropped
-        )
+        packet = frame_packet(shot, due_s + pace.offset_s, now_s + pace.offset_s, dropped)
         self.send(packet if self.has_truth else packet._replace(truth={}))
         if shot.report is not None:
             self.send(solution_packet(shot, time.monotonic() + pace.offset_s))
@@ -237,14 +228,15 @@ class Live:
 
     def statistics(self) -> dict[str, Any]:
         """Counts, delay statistics in ms, and the counters of each output."""
-        late = np.array(self.late_ms or [np.nan])
+        late_ms = self.late_ms or [np.nan]
         commands = self.commands
         return {
             "made": self.rendered,
-            "dropped": self.dropped,
-            "late_ms_median": float(np.quantile(late, 0.5)),
-            "late_ms_p99": float(np.quantile(late, 0.99)),
-            "late_ms_worst": float(late.max()),
+            "dropped": self.flight.schedules[0].index - self.rendered,
+            **{
+                f"late_ms_{name}": float(np.quantile(late_ms, part))
+                for name, part in QUANTILES.items()
+            },
             "periods": self.periods,
             "missed": self.missed,
             "commands": {

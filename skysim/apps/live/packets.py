@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
-from skysim.core.types import Truth
 from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
 
@@ -66,23 +66,13 @@ class Packet(NamedTuple):
         return str(self.header["channel"])
 
     @property
-    def number(self) -> int:
-        """Sequence number among the frames that were rendered."""
-        return int(self.header["index"] - self.header["dropped"])
-
-    def plus_dropped(self, missed: int) -> Packet:
-        """The same frame for a receiver that missed further ones: its header's `dropped` is that much larger."""
-        if not missed or self.channel != "frame":
-            return self
-        return self._replace(
-            header=self.header | {"dropped": self.header["dropped"] + missed}
-        )
+    def header_with_truth(self) -> dict[str, Any]:
+        return self.header | ({"truth": dict(self.truth)} if self.truth else {})
 
     def pack(self, has_truth: bool = False) -> bytes:
         """Serialize: the header line, with the truth if wanted, then the pixels row by row from the top."""
-        header = self.header | {"bytes": self.pixels.nbytes}
-        if has_truth and self.truth:
-            header["truth"] = dict(self.truth)
+        header = self.header_with_truth if has_truth else self.header
+        header = header | {"bytes": self.pixels.nbytes}
         return json.dumps(header).encode() + b"\n" + self.pixels.tobytes()
 
 
@@ -96,21 +86,22 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
         if not header["bytes"]:
             return header, NO_PIXELS
         shape = (int(header["height"]), int(header["width"]))
-        dtype_name = header["dtype"]
-        if not re.fullmatch(r"[<>|]?(u[1248]|f[248])", dtype_name):
-            raise ValueError(dtype_name)
+        known = re.fullmatch(r"[<>|]?(u[1248]|f[248])", header["dtype"])
+        if not known or min(shape) < 1 or math.prod(shape) > MAX_PIXELS:
+            raise ValueError(shape)
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError("", f"not a packet of skysim live: {line[:40]!r}") from error
-    count = shape[0] * shape[1]
-    dtype = np.dtype(dtype_name)
-    if min(shape) < 1 or count > MAX_PIXELS:
-        raise InputError(
-            "", f"not a packet of skysim live: {shape[1]} x {shape[0]} pixels of {dtype}"
-        )
-    pixels = stream.read(count * dtype.itemsize)
-    if len(pixels) < count * dtype.itemsize:
+        raise InputError("", f"not a packet of skysim live: {line[:80]!r}") from error
+    dtype = np.dtype(known[0])
+    size = math.prod(shape) * dtype.itemsize
+    pixels = stream.read(size)
+    if len(pixels) < size:
         raise InputError("", f"the stream ended within frame {header.get('index')}")
     return header, np.frombuffer(pixels, dtype).reshape(shape)
+
+
+def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Copies of the values, as Python's numbers and lists."""
+    return {key: np.asarray(value).tolist() for key, value in values.items()}
 
 
 def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int) -> Packet:
@@ -124,6 +115,8 @@ def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         Number of frames dropped before it
     """
     frame = shot.frame
+    truth = shot.truth
+    sources = truth.sources
     pixels = np.ascontiguousarray(frame.image_dn)
     pixels = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
@@ -140,19 +133,15 @@ def frame_packet(shot: Shot, due_unix_s: float, made_unix_s: float, dropped: int
         "made_unix_s": made_unix_s,
         "dropped": dropped,
     }
-    return Packet(header, pixels, frame_truth(shot.truth))
-
-
-def frame_truth(truth: Truth) -> dict[str, Any]:
-    """The truth of a frame, as `Packet` has it."""
-    return {
-        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat().tolist(),
-        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat().tolist(),
-        "rate_cam_rad_s": truth.rate_cam_rad_s.tolist(),
-        "ids": truth.sources.id.tolist(),
-        "x_px": truth.sources.xy_px[:, 0].round(4).tolist(),
-        "y_px": truth.sources.xy_px[:, 1].round(4).tolist(),
+    truths = {
+        "cam_from_ref_xyzw": truth.cam_from_lab.as_quat(),
+        "mean_cam_from_ref_xyzw": truth.mean_cam_from_lab.as_quat(),
+        "rate_cam_rad_s": truth.rate_cam_rad_s,
+        "ids": sources.id,
+        "x_px": sources.xy_px[:, 0].round(4),
+        "y_px": sources.xy_px[:, 1].round(4),
     }
+    return Packet(header, pixels, plain(truths))
 
 
 def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
@@ -167,9 +156,9 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
         "status": solution.status,
     }
     if solution.cam_from_ref is not None and solution.covariance_rad2 is not None:
-        header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat().tolist()
-        header["covariance_rad2"] = solution.covariance_rad2.tolist()
-    return Packet(header, attitude=solution)
+        header["cam_from_ref_xyzw"] = solution.cam_from_ref.as_quat()
+        header["covariance_rad2"] = solution.covariance_rad2
+    return Packet(plain(header), attitude=solution)
 
 
 def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any]:
@@ -179,14 +168,14 @@ def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any
     navigation = motion.navigation
     if channel == "state":
         return {
-            "wheel_rad_s": state.wheel_rad_s.tolist(),
-            "gimbal_rad": state.gimbal_rad.tolist(),
-            **{name: values.tolist() for name, values in state.readings.items()},
+            "wheel_rad_s": state.wheel_rad_s,
+            "gimbal_rad": state.gimbal_rad,
+            **state.readings,
         }
     if channel == "truth":
         return {
-            "lab_from_body_xyzw": state.lab_from_body.as_quat().tolist(),
-            "rate_body_rad_s": state.rate_body_rad_s.tolist(),
+            "lab_from_body_xyzw": state.lab_from_body.as_quat(),
+            "rate_body_rad_s": state.rate_body_rad_s,
         }
     if channel == "imu":
         samples = flight.imu_samples(began_s)
@@ -195,19 +184,19 @@ def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any
             return {}
         return {
             "step_s": samples.step_s,
-            "times_s": samples.t_s[new].tolist(),
-            "angle_rad": samples.angle_rad[new].tolist(),
-            "velocity_m_s": samples.velocity_m_s[new].tolist(),
+            "times_s": samples.t_s[new],
+            "angle_rad": samples.angle_rad[new],
+            "velocity_m_s": samples.velocity_m_s[new],
         }
     computer = motion.flight_computer
     values = {
-        "torque_nm": computer.control_torque_nm.tolist(),
+        "torque_nm": computer.control_torque_nm,
         "loads": dict(zip(computer.names, computer.loads.tolist(), strict=True)),
     }
     if navigation:
-        values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1).tolist()
+        values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1)
         if navigation.filter:
             attitude_wxyz = navigation.attitude_wxyz("filter")
-            values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1).tolist()
-            values["bias_rad_s"] = navigation.filter.state.bias_rad_s.tolist()
+            values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1)
+            values["bias_rad_s"] = navigation.filter.state.bias_rad_s
     return values

@@ -98,13 +98,13 @@ class Sink:
                 packet = self.packets[0]
             fault = self.fault_of_writing(packet)
             with self.changed:
-                (self.dropped if fault else self.sent)[packet.channel] += 1
-                if self.packets:
-                    self.packets.popleft()
                 self.fault = fault
                 self.changed.notify_all()
-                if fault:
+                # What a failed sink keeps is counted at its end.
+                if fault or not self.packets:
                     return
+                self.sent[packet.channel] += 1
+                self.packets.popleft()
 
     def fault_of_writing(self, packet: Packet) -> str:
         """Write a packet; return the error, or ""."""
@@ -135,8 +135,11 @@ class Sink:
             if self.fault or not self.has_room(is_frame):
                 self.dropped[packet.channel] += 1
                 return
-            # The header's count includes frames dropped by this sink.
-            self.packets.append(packet.plus_dropped(self.dropped["frame"]))
+            if is_frame:
+                # The header's count includes frames dropped by this sink.
+                dropped = packet.header["dropped"] + self.dropped["frame"]
+                packet = packet._replace(header=packet.header | {"dropped": dropped})
+            self.packets.append(packet)
             self.changed.notify_all()
 
     def close(self) -> None:
@@ -170,8 +173,7 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
             files.write_bytes(stem.with_suffix(".png"), encode_png(packet.pixels))
         else:
             files.write_bytes(stem.with_suffix(".raw"), packet.pixels.tobytes())
-        truth = {"truth": dict(packet.truth)} if packet.truth else {}
-        files.write_text(stem.with_suffix(".json"), files.to_json(packet.header | truth))
+        files.write_text(stem.with_suffix(".json"), files.to_json(packet.header_with_truth))
 
     return write
 

@@ -259,7 +259,7 @@ def test_frames_are_served_only_to_logged_in_browsers(
     async def nothing(*_: object) -> None:
         raise AssertionError("not a frame")
 
-    guard = Guard(nothing, ("*",), "right", 1)
+    guard = Guard(nothing, "0.0.0.0", "right", 1)
     image = sky(8)
     frames = {3: served(image), 4: served(image, Display((40, 40), near_px=(5, 6)))}
     monkeypatch.setitem(FRAMES, "tab", TabFrames(print, frames))

@@ -491,7 +491,7 @@ async def page(scope: dict, receive: object, send) -> None:
 def test_a_local_page_requires_token_host_and_origin(
     headers: dict[str, str], query: str, status: int
 ) -> None:
-    guard = Guard(page, ("127.0.0.1", "localhost"), "right", 8080)
+    guard = Guard(page, "127.0.0.1", "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
 
@@ -508,7 +508,7 @@ def test_a_local_page_requires_token_host_and_origin(
 def test_a_shared_page_requires_its_token(
     headers: dict[str, str], query: str, status: int
 ) -> None:
-    guard = Guard(page, ("*",), "right", 8080)
+    guard = Guard(page, "0.0.0.0", "right", 8080)
     assert asyncio.run(knock(guard, headers, query)) == status
 
 
@@ -666,7 +666,7 @@ def test_every_response_forbids_framing_by_other_sites() -> None:
             "headers": headers,
             "query_string": b"",
         }
-        asyncio.run(Guard(served, ("*",), "right", 1)(scope, None, send))
+        asyncio.run(Guard(served, "0.0.0.0", "right", 1)(scope, None, send))
     policies = [dict(message["headers"]) for message in sent]
     assert b"frame-ancestors 'none'" in policies[0][b"content-security-policy"]
     assert policies[1][b"content-security-policy"] == b"none"

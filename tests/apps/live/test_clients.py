@@ -62,12 +62,12 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
     live = Live(
         flight, Pace(SPEED, 2.0), [], CommandState(flight, 0.5, False), may_solve=True
     )
-    server = WireServer("127.0.0.1", 0, "", live.greeting, live.inbox)
+    server = WireServer(live, "127.0.0.1", 0, "")
     live.outputs.append(server)
     start = flight.state.lab_from_body
     live.warm_up()
     with subprocess.Popen([*client(language, tmp_path), str(server.port)]) as process:
-        assert server.entered.wait(30)
+        assert live.entered.wait(30)
         live.pace.start(0.0)
         while flight.now_s < 7.5:
             live.advance()

@@ -275,19 +275,17 @@ def test_a_measured_gamma_rises_from_black_to_white() -> None:
 
 
 def test_the_server_shows_the_flight_s_instant(flown: Lab) -> None:
-    hub = http.FrameHub(dict)
-    server = http.start_server(hub, "127.0.0.1", 0)
+    server = http.FrameServer(dict, "127.0.0.1", 0)
     address = f"http://127.0.0.1:{server.server_port}"
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(f"{address}/display", timeout=10)
-    hub.pattern = DisplayPattern.of_bench(flown, bench())
-    hub.instant = lambda: (0.0, flown.start)
+    pattern = DisplayPattern.of_bench(flown, bench())
+    server.show = lambda: pattern.picture(0.0, flown.start)
     assert b"/display.png" in urllib.request.urlopen(f"{address}/display", timeout=10).read()
     png = urllib.request.urlopen(f"{address}/display.png?&7", timeout=10).read()
     gray = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(gray, hub.pattern.picture(0.0, flown.start).gray)
-    hub.close()
-    server.shutdown()
+    np.testing.assert_array_equal(gray, server.show().gray)
+    server.close()
 
 
 @pytest.mark.browser

@@ -45,7 +45,7 @@ class Client:
 @pytest.fixture
 def live() -> Iterator[Live]:
     live = live_flight()
-    server = WireServer("127.0.0.1", 0, "secret", live.greeting, live.inbox)
+    server = WireServer(live, "127.0.0.1", 0, "secret")
     live.outputs.append(server)
     yield live
     server.close()
@@ -180,7 +180,7 @@ def test_thrusters_push_one_way_and_replace_the_law() -> None:
 
 
 def test_each_channel_has_what_the_flight_has(live: Live) -> None:
-    live.has_truth = server_of(live).has_truth = True
+    live.has_truth = True
     client = Client(
         server_of(live), token="secret", take=["imu", "state", "telemetry", "truth", "frame"]
     )
@@ -211,7 +211,7 @@ def test_a_client_without_the_token_gets_nothing(live: Live) -> None:
         assert packet is not None
         assert "token missing or wrong" in packet["problem"]
         assert client.receive() is None
-    assert not server_of(live).entered.is_set()
+    assert not live.entered.is_set()
 
 
 def test_the_truth_is_off_by_default(live: Live) -> None:

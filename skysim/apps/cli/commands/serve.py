@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import secrets
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import typer
+from typer import Option
 
 from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:
+    from skysim.apps.live.display_pattern import DisplayPicture
     from skysim.apps.live.pacing import Live
     from skysim.apps.live.sinks import Output
 
@@ -29,94 +28,88 @@ def live(
     scene: SceneArg,
     tcp: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Send packets to clients on this port, and take their commands; 0: any free port.",
         ),
     ] = None,
     http: Annotated[
         int | None,
-        typer.Option(**PORTS, help="Serve MJPEG and packets on this port; 0: any free port."),
+        Option(**PORTS, help="Serve MJPEG on this port; 0: any free port."),
     ] = None,
     gige: Annotated[
-        bool,
-        typer.Option(
-            "--gige", help="Be a GigE Vision camera, which GenICam clients control."
-        ),
-    ] = False,
+        bool | None,
+        Option("--gige", help="Be a GigE Vision camera, which GenICam clients control."),
+    ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option(
-            help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."
-        ),
+        Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
     ] = None,
     display: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="BENCH",
             help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
         ),
     ] = None,
     indi: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.",
         ),
     ] = None,
     pipe: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
         ),
     ] = None,
     mcap: Annotated[
         Path | None,
-        typer.Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
+        Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
     ] = None,
     foxglove: Annotated[
         int | None,
-        typer.Option(
+        Option(
             **PORTS,
             help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to serve on; other than loopback with a token.")
+        str, Option(help="Address to serve on; other than loopback with a token.")
     ] = HOST,
     token: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Token that clients must send; default: none on loopback, else a random one, which is printed."
         ),
     ] = "",
     truth: Annotated[
         bool,
-        typer.Option("--truth", help="Let clients, files and /truth.json have the truth."),
+        Option("--truth", help="Let clients, files and /truth.json have the truth."),
     ] = False,
     trigger: Annotated[
         bool,
-        typer.Option(
-            "--trigger", help="Expose frames when a client triggers, not by the scene."
-        ),
+        Option("--trigger", help="Expose frames when a client triggers, not by the scene."),
     ] = False,
     poses: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--poses",
             help="A client simulates the motion: expose a frame for each of its poses.",
         ),
     ] = False,
     client_tracker: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--client-tracker",
             help="The filter takes attitudes of clients, not of the scene's tracker.",
         ),
     ] = False,
     command_timeout: Annotated[
         float,
-        typer.Option(
+        Option(
             min=0,
             metavar="SECONDS",
             help="Time of the simulator after which a client's command of actuators ends.",
@@ -124,7 +117,7 @@ def live(
     ] = 0.5,
     wait: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--wait",
             help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
         ),
@@ -132,17 +125,19 @@ def live(
     frames: Frames = None,
     endless: Annotated[
         bool,
-        typer.Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
+        Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
     ] = False,
     speed: Annotated[
         float,
-        typer.Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
+        Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
     ] = 1.0,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
     """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
+    options = locals()
+    from skysim.apps.access import LOOPBACK
     from skysim.apps.live.commands import CommandState
     from skysim.apps.live.pacing import Live, Pace
     from skysim.apps.live.poses import PosedLive
@@ -150,20 +145,9 @@ def live(
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
-    outputs = {
-        "folder": folder,
-        "pipe": pipe,
-        "http": http,
-        "display": display,
-        "gige": gige or None,
-        "indi": indi,
-        "mcap": mcap,
-        "foxglove": foxglove,
-        "tcp": tcp,
-    }
-    chosen = {name: value for name, value in outputs.items() if value is not None}
+    chosen = {name: options[name] for name in OPENERS if options[name] is not None}
     if not chosen:
-        raise InputError("", "no output", ", ".join(f"--{name}" for name in outputs))
+        raise InputError("", "no output", ", ".join(f"--{name}" for name in OPENERS))
     needs: dict[tuple[str, ...], bool] = {
         (f"--host {host}", "tcp", "http", "gige"): host != HOST,
         ("--token", "tcp", "http"): bool(token),
@@ -198,12 +182,14 @@ def live(
         may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
-        opening = Opening(flown, stack, host, token or new_token(host), [])
+        if not token and host not in LOOPBACK:
+            token = secrets.token_urlsafe(16)
+        opening = Opening(flown, stack, host, token, display)
         try:
             for name, value in chosen.items():
-                OPENERS[name](opening, value)
-            while wait and not any(one.is_set() for one in opening.entered):
-                time.sleep(0.05)
+                open_output(opening, name, value)
+            if wait:
+                flown.entered.wait()
             flown.run()
         except KeyboardInterrupt:
             print(file=sys.stderr)
@@ -219,13 +205,6 @@ def live(
             raise InputError(f"--{output.name}", output.fault)
 
 
-def new_token(host: str) -> str:
-    """A random token where other machines can connect, else none."""
-    from skysim.apps.access import LOOPBACK
-
-    return "" if host in LOOPBACK else secrets.token_urlsafe(16)
-
-
 class Opening(NamedTuple):
     """What the outputs of a flight share.
 
@@ -235,140 +214,131 @@ class Opening(NamedTuple):
         The flight, and what closes its outputs
     host, token
         Address to serve on, and the token of its clients
-    entered
-        Set when the first client of a server has begun, for each server that `--wait` waits for
+    display
+        Scene of the bench whose display shows the sky
     """
 
     live: Live
     stack: ExitStack
     host: str
     token: str
-    entered: list[Event]
-
-    def add(self, output: Output) -> None:
-        """Send the flight's packets to an output, which the stack closes."""
-        self.live.outputs.append(output)
-        self.stack.callback(output.close)
+    display: str | None
 
     def say(self, text: str) -> None:
         print(f"skysim live: {text}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
 
 
-def open_folder(opening: Opening, path: Path) -> None:
+def open_folder(opening: Opening, path: Path) -> Output:
     from skysim.apps.live.sinks import Sink, folder_writer
 
-    opening.add(Sink("folder", folder_writer(path)))
+    return Sink("folder", folder_writer(path))
 
 
-def open_pipe(opening: Opening, path: str) -> None:
+def open_pipe(opening: Opening, path: str) -> Output:
     from skysim.apps.live.sinks import Sink, pipe_writer
 
-    opening.add(Sink("pipe", pipe_writer(path)))
+    return Sink("pipe", pipe_writer(path))
 
 
-def open_http(opening: Opening, port: int) -> None:
-    from skysim.apps.live.http import FrameHub, start_server
+def open_http(opening: Opening, port: int) -> Output:
+    from skysim.apps.live.http import FrameServer
 
-    hub = FrameHub(opening.live.statistics)
-    server = start_server(hub, opening.host, port, opening.token)
-    opening.stack.callback(server.server_close)
-    opening.stack.callback(server.shutdown)
-    opening.add(hub)
+    show = shown(opening.live, opening.display) if opening.display else None
+    server = FrameServer(opening.live.statistics, opening.host, port, opening.token)
+    server.show = show
     query = f"?token={opening.token}" if opening.token else ""
     opening.say(f"http://{opening.host}:{server.server_port}/{query}")
+    if show:
+        picture = show()
+        opening.say(
+            f"/display shows {picture.shown} lights at the start;"
+            f" {picture.faint} are too faint for its gray levels"
+        )
+    return server
 
 
-def open_display(opening: Opening, bench: str) -> None:
-    """Serve pictures for the display of a bench by the HTTP server."""
+def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
+    """The function that returns the present picture for the display of a bench."""
     from skysim.apps.live.display_pattern import DisplayPattern
-    from skysim.apps.live.http import FrameHub
     from skysim.scene.loader import load as load_scene
     from skysim.simulation.lab import build_lab
 
-    live = opening.live
-    (hub,) = (output for output in live.outputs if isinstance(output, FrameHub))
     # A lab of its own: the server's threads draw beside the flight.
     lab = build_lab(live.flight.lab.scene)
-    hub.pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
-    hub.instant = live.instant
-    picture = hub.pattern.picture(*live.instant())
-    opening.say(
-        f"/display shows {picture.shown} lights at the start;"
-        f" {picture.faint} are too faint for its gray levels"
-    )
+    pattern = DisplayPattern.of_bench(lab, build_lab(load_scene(bench)))
+
+    def show() -> DisplayPicture:
+        state = live.flight.state
+        return pattern.picture(state.t_s, state.lab_from_body)
+
+    return show
 
 
-@contextmanager
-def extra_of(option: str, extra: str) -> Iterator[None]:
-    """Name the extra that an option needs, where a package is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        allowed = f"after pip install 'skysim[{extra}]'"
-        raise InputError(option, f"{error.name} is not installed", allowed) from None
-
-
-def open_indi(opening: Opening, port: int) -> None:
-    with extra_of("--indi", "indi"):
-        from skysim.apps.live.indi import IndiCamera
+def open_indi(opening: Opening, port: int) -> Output:
+    from skysim.apps.live.indi import IndiCamera
 
     camera = IndiCamera(opening.live, port)
     opening.stack.callback(camera.close)
-    opening.add(camera.sink)
     opening.say(f"indi {HOST}:{camera.port}")
+    return camera.sink
 
 
-def open_mcap(opening: Opening, path: Path) -> None:
-    with extra_of("--mcap", "ros"):
-        from skysim.apps.live.ros_outputs import McapSink, RosEncoder
+def open_mcap(opening: Opening, path: Path) -> Output:
+    from skysim.apps.live.ros_outputs import McapSink, RosEncoder
 
-    opening.add(McapSink(RosEncoder(opening.live), path))
+    return McapSink(RosEncoder(opening.live), path)
 
 
-def open_foxglove(opening: Opening, port: int) -> None:
-    with extra_of("--foxglove", "ros"):
-        from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
+def open_foxglove(opening: Opening, port: int) -> Output:
+    from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
 
     sink = FoxgloveSink(RosEncoder(opening.live), port)
-    opening.add(sink)
     opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
+    return sink
 
 
-def open_tcp(opening: Opening, port: int) -> None:
-    """Serve the wire."""
+def open_tcp(opening: Opening, port: int) -> Output:
     from skysim.apps.live.wire import WireServer
 
-    live = opening.live
     token = opening.token
-    server = WireServer(opening.host, port, token, live.greeting, live.inbox, live.has_truth)
-    opening.add(server)
+    server = WireServer(opening.live, opening.host, port, token)
     opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
-    opening.entered.append(server.entered)
+    return server
 
 
-def open_gige(opening: Opening, _: bool) -> None:
+def open_gige(opening: Opening, _: bool) -> Output:
     from skysim.apps.live.gige import GigeCamera
 
     camera = GigeCamera(opening.live, opening.host)
-    opening.add(camera)
     risk = "" if camera.is_local else ", no token: all that reach it can control it"
     opening.say(f"gige {camera.host}:{camera.port}{risk}")
-    opening.entered.append(camera.entered)
+    return camera
 
 
 # By the option's name, in the order in which they are opened.
-OPENERS: dict[str, Callable[[Opening, Any], None]] = {
+OPENERS: dict[str, Callable[[Opening, Any], Output]] = {
     "folder": open_folder,
     "pipe": open_pipe,
     "http": open_http,
-    "display": open_display,
     "gige": open_gige,
     "indi": open_indi,
     "mcap": open_mcap,
     "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
+EXTRAS = {"indi": "indi", "mcap": "ros", "foxglove": "ros"}
 TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
+
+
+def open_output(opening: Opening, name: str, value: Any) -> None:
+    """Send the flight's packets to an output, which the stack closes; name the extra that it needs."""
+    try:
+        output = OPENERS[name](opening, value)
+    except ModuleNotFoundError as error:
+        allowed = f"after pip install 'skysim[{EXTRAS[name]}]'"
+        raise InputError(f"--{name}", f"{error.name} is not installed", allowed) from None
+    opening.live.outputs.append(output)
+    opening.stack.callback(output.close)
 
 
 def summary(statistics: dict[str, Any]) -> str:
@@ -388,16 +358,13 @@ def summary(statistics: dict[str, Any]) -> str:
         updates = [f"{number} {status}" for status, number in commands["updates"].items()]
         if updates:
             lines.append("attitudes of clients: " + ", ".join(updates))
-    for name, output in statistics["outputs"].items():
-        lines.append(counts(name, output))
+    lines += [counts(*output) for output in statistics["outputs"].items()]
     return "\n".join(lines)
 
 
 def counts(receiver: str, counters: dict[str, Any]) -> str:
     """What an output has sent and dropped, by channel, and its fault."""
-    parts = []
-    if "clients" in counters:
-        parts.append(f"{counters['clients']} clients")
+    parts = [f"{counters['clients']} clients"] if "clients" in counters else []
     for word in ("sent", "dropped"):
         numbers = [f"{number} {name}" for name, number in counters[word].items() if number]
         if numbers or word == "sent":
@@ -413,35 +380,29 @@ def counts(receiver: str, counters: dict[str, Any]) -> str:
 def gui(
     scene: SceneArg = "shefex2",
     host: Annotated[
-        str, typer.Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
+        str, Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 8080,
+    port: Annotated[int, Option(min=1, max=65535, help="Port to serve on.")] = 8080,
     token: Annotated[
         str,
-        typer.Option(
+        Option(
             help="Access token that browsers must send; default: a random one, in the printed link."
         ),
     ] = "",
-    folder: Annotated[
-        Path, typer.Option(help="Folder in which new scenes are saved.")
-    ] = Path("."),
-    out: Annotated[Path, typer.Option(help="Folder of studies and their reports.")] = Path(
-        "out"
-    ),
+    folder: Annotated[Path, Option(help="Folder in which new scenes are saved.")] = Path("."),
+    out: Annotated[Path, Option(help="Folder of studies and their reports.")] = Path("out"),
     camera: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="SOURCE",
             help="Live camera that the page may watch: index, file or address; repeatable.",
         ),
     ] = None,
     workers: Annotated[
         int,
-        typer.Option(
-            min=1, help="Most worker processes, one for each page; further pages wait."
-        ),
+        Option(min=1, help="Most worker processes, one for each page; further pages wait."),
     ] = 12,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open a browser.")] = True,
+    show: Annotated[bool, Option("--open/--no-open", help="Open a browser.")] = True,
 ) -> None:
     """Open the interactive simulator in the browser (extra `gui`)."""
     from skysim.scene.loader import load
