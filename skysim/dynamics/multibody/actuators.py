@@ -12,13 +12,12 @@ import mujoco
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
     ActuatorKind,
     Actuators,
     ControlInput,
-    MomentumFree,
     add_motor,
     joints,
     sites,
@@ -44,10 +43,11 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
     motors = np.array([model.actuator(name).id for name in TORQUES])
-    found: dict[str, Actuators] = {"ideal": IdealTorque(motors, vehicle.torque_limit_nm)}
-    for kind in kinds_on(vehicle):
-        found[kind.key] = kind.control(model, getattr(vehicle, kind.key))
-    return found
+    ideal = IdealTorque(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    return {"ideal": ideal} | {
+        kind.key: kind.control(model, getattr(vehicle, kind.key))
+        for kind in kinds_on(vehicle)
+    }
 
 
 def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
@@ -69,27 +69,16 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
     """Add three ideal torques and the motors of all actuators that are on; model is the compiled spec."""
     for name, axis in zip(TORQUES, np.eye(3), strict=True):
         # The motor of a ball joint acts about an axis of the body.
-        add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
+        add_motor(spec, "bearing", gear=[*axis, 0, 0, 0]).name = name
     for kind in kinds_on(vehicle):
         kind.add(spec, model, getattr(vehicle, kind.key))
 
 
-class IdealTorque(MomentumFree):
-    """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
-
-    def __init__(self, motor: Ints, limit_nm: float) -> None:
-        self.motor = motor
-        self.limit_nm = limit_nm
+class IdealTorque(Actuators):
+    """Ideal actuator: torques about the body's axes, each clipped to a limit."""
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         return self.command(control, torque_nm, inputs)
-
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        control[self.motor] = achieved_nm = np.clip(commands, -self.limit_nm, self.limit_nm)
-        return achieved_nm
-
-    def command_map(self) -> tuple[Floats, float]:
-        return np.eye(3), self.limit_nm
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
@@ -120,14 +109,13 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
                 raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
     # 3. Names of the motors that `add_actuators` adds.
     for actuator in spec.actuators:
+        problem = ""
         if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
-            problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
-            raise InputError(path, problem)
-        if actuator.target.startswith(PREFIXES):
-            problem = (
-                f"actuator of {actuator.target} is set by the scene; remove it from the file"
-            )
-            raise InputError(path, problem)
+            problem = f"actuator {actuator.name}: an actuator of this name is added"
+        elif actuator.target.startswith(PREFIXES):
+            problem = f"actuator of {actuator.target} is set by the scene"
+        if problem:
+            raise InputError(path, f"{problem}; remove it from the file")
     return locked
 
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
@@ -27,6 +26,7 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
+    Actuators,
     ControlInput,
     Hinges,
     add_motor,
@@ -64,15 +64,11 @@ def solve_gram(gram: Floats, rhs: Floats) -> Floats:
 
 @jit
 def gram_determinant(m: Floats) -> float:
-    """Determinant of A A^T (3, 3) by cofactors, clipped at zero against rounding.
+    """Determinant of A A^T (3, 3) as the triple product of its rows, clipped at zero against rounding.
 
     np.linalg.det takes several times as long.
     """
-    # Cofactors of the first row.
-    minor_0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
-    minor_1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
-    minor_2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
-    return max(m[0, 0] * minor_0 - m[0, 1] * minor_1 + m[0, 2] * minor_2, 0.0)
+    return max((m[0] * np.cross(m[1], m[2])).sum(), 0.0)
 
 
 @jit
@@ -275,22 +271,24 @@ class CmgSet:
         return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
 
 
-class CmgActuator:
+class CmgActuator(Actuators):
     """Actuators of the flight computer: control moment gyroscopes, see `CmgSet`."""
 
     def __init__(self, model: Any, config: CmgsConfig) -> None:
-        self.gimbals = Hinges.from_model(model, GIMBAL)
-        self.motor = self.gimbals.motor
-        self.rotors = Hinges.from_model(model, ROTOR)
-        self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
+        self.gimbals = gimbals = Hinges.from_model(model, GIMBAL)
+        self.rotors = rotors = Hinges.from_model(model, ROTOR)
+        limit_rad_s = math.radians(config.gimbal_rate_limit_deg_s)
         self.model = CmgSet(
-            self.gimbals.axes,
-            self.rotors.axes,
-            self.rotors.inertia_kg_m2,
-            math.radians(config.gimbal_rate_limit_deg_s),
+            gimbals.axes,
+            rotors.axes,
+            rotors.inertia_kg_m2,
+            limit_rad_s,
             config.rotor_torque_limit_nm,
             config.steering,
         )
+        speeds = np.full(len(rotors), config.rotor_rpm * RPM_RAD_S)
+        jacobian = self.model.jacobian(np.zeros(len(gimbals)), speeds)
+        super().__init__(gimbals.motor, -jacobian, -np.linalg.pinv(jacobian), limit_rad_s)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         angle = inputs.angles_rad[self.gimbals.qpos]
@@ -298,26 +296,16 @@ class CmgActuator:
         rate, torque = self.model.drive(
             torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s
         )
-        control[self.gimbals.motor] = rate
         # T = -A d(angle)/dt - sum axle u; the second term is the momentum of speeds u / inertia.
-        achieved_nm = -self.model.jacobian(angle, spin) @ rate
+        achieved_nm = self.command(control, rate, inputs)
         if self.model.rotor_torque_limit_nm is not None:
             control[self.rotors.motor] = torque
             achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
         return achieved_nm
 
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        limit_rad_s = self.model.gimbal_rate_limit_rad_s
-        control[self.gimbals.motor] = rate = np.clip(commands, -limit_rad_s, limit_rad_s)
+    def torque_per_command(self, inputs: ControlInput) -> Floats:
         angle = inputs.angles_rad[self.gimbals.qpos]
-        return -self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof]) @ rate
-
-    def command_map(self) -> tuple[Floats, float]:
-        jacobian = self.model.jacobian(
-            np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)
-        )
-        rates_from_torque = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
-        return rates_from_torque, self.model.gimbal_rate_limit_rad_s
+        return -self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(
@@ -351,13 +339,7 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
         add_servo(spec, joint.name, inertia, cmgs.gimbal_time_constant_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
-            add_motor(
-                spec,
-                joint.name,
-                mujoco.mjtTrn.mjTRN_JOINT,
-                joint.name,
-                cmgs.rotor_torque_limit_nm,
-            )
+            add_motor(spec, joint.name, cmgs.rotor_torque_limit_nm)
 
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:

@@ -11,13 +11,12 @@ import numpy as np
 
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
-    RANK_TOLERANCE,
     ActuatorKind,
     Actuators,
     ControlInput,
-    MomentumFree,
     add_motor,
     all_names,
+    inverse,
     scale_to_limit,
     sites,
 )
@@ -53,9 +52,7 @@ class Fans:
         """The sites whose name begins with prefix and that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        names = sorted(
-            name for name in all_names(model.actuator, model.nu) if name.startswith(prefix)
-        )
+        names = sorted(all_names(model.actuator, model.nu, prefix))
         sites = [model.site(name).id for name in names]
         # z axes of the sites; at zero joint angles lab and body axes coincide.
         axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
@@ -90,9 +87,7 @@ class FanSet:
 
     def __post_init__(self) -> None:
         self.torque_per_thrust_m = np.cross(self.positions_m, self.force_axes, axis=0)
-        self.thrust_from_torque = np.asarray(
-            np.linalg.pinv(self.torque_per_thrust_m, rcond=RANK_TOLERANCE), np.float64
-        )
+        self.thrust_from_torque = inverse(self.torque_per_thrust_m)
 
     def torque(self, thrust_n: Floats) -> Floats:
         """Torque (3,) on the body of thrusts (n,)."""
@@ -107,25 +102,17 @@ class FanSet:
         return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
 
 
-class FanActuator(MomentumFree):
+class FanActuator(Actuators):
     """Actuators of the flight computer: fans, commanded as if they had no lag; see `FanSet`."""
 
     def __init__(self, model: Any, config: FansConfig) -> None:
         fans = Fans.from_model(model)
-        self.motor = fans.motor
+        limit_n = config.thrust_limit_n
+        levers = FanSet(fans.axes, fans.positions_m, limit_n)
+        super().__init__(
+            fans.motor, levers.torque_per_thrust_m, levers.thrust_from_torque, limit_n
+        )
         self.lag_s = config.time_constant_s
-        self.model = FanSet(fans.axes, fans.positions_m, config.thrust_limit_n)
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, self.model.drive(torque_nm), inputs)
-
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        limit_n = self.model.thrust_limit_n
-        control[self.motor] = thrust = np.clip(commands, -limit_n, limit_n)
-        return self.model.torque(thrust)
-
-    def command_map(self) -> tuple[Floats, float]:
-        return self.model.thrust_from_torque, self.model.thrust_limit_n
 
 
 @dataclass(slots=True)
@@ -154,10 +141,10 @@ class Desaturator:
 class MomentumDump:
     """Momentum dumping by fans, with a model of their lag."""
 
-    def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
+    def __init__(self, fans: Actuators, config: DesaturationConfig) -> None:
         assert isinstance(fans, FanActuator)
         self.fans = fans
-        self.desaturator = desaturator
+        self.desaturator = Desaturator(config)
         self.fan_torque_nm = np.zeros(3)
 
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
@@ -176,8 +163,7 @@ class MomentumDump:
 
 def add_force(spec: Any, site: str, limit_n: float) -> Any:
     """Add a force along z of a site."""
-    site_type = mujoco.mjtTrn.mjTRN_SITE
-    return add_motor(spec, site, site_type, site, limit_n, [0, 0, 1, 0, 0, 0])
+    return add_motor(spec, site, limit_n, [0, 0, 1, 0, 0, 0], mujoco.mjtTrn.mjTRN_SITE)
 
 
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
