@@ -121,9 +121,10 @@ class FlightComputer:
         self.actuator = self.actuator_sets[self.config.actuators]
         self.names = [vehicle.model.actuator(number).name for number in self.actuator.motor]
         self.law = self.build_law(scene, vehicle, reference, programs)
-        if self.config.desaturation:
+        fans = scene.vehicle.fans
+        if self.config.desaturation and fans:
             self.momentum_dump = MomentumDump(
-                self.actuator_sets["fans"], self.config.desaturation
+                self.actuator_sets["fans"], fans.time_constant_s, self.config.desaturation
             )
 
     def build_law(

@@ -42,7 +42,8 @@ class ControlInput(NamedTuple):
 class Actuators:
     """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
 
-    It stores no momentum, and its torque is proportional to its commands. Kinds override what differs.
+    It stores no momentum, its torque is proportional to its commands, and a command beyond the limit is clipped. Kinds
+    override what differs.
 
     Attributes
     ----------
@@ -60,21 +61,17 @@ class Actuators:
     limit: float
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        """Write the commands into control; return the torque (3,) that they will give.
-
-        One factor scales all commands to the limit, which keeps the direction of the torque.
-        """
-        commands = scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
-        return self.command(control, commands, inputs)
+        """Write the commands into control; return the torque (3,) that they will give."""
+        return self.command(control, self.command_from_torque @ torque_nm, inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
         control[self.motor] = given = np.clip(commands, -self.limit, self.limit)
-        return self.torque_per_command(inputs) @ given
+        return self.torque(given)
 
-    def torque_per_command(self, inputs: ControlInput) -> Floats:
-        """(3, n) present torque on the body per unit of command."""
-        return self.torque_from_command
+    def torque(self, commands: Floats) -> Floats:
+        """Torque (3,) on the body of commands (n,)."""
+        return self.torque_from_command @ commands
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored angular momentum, in body axes."""
@@ -247,8 +244,8 @@ def add_motor(
     return motor
 
 
-def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
-    """Add a servo of a joint, whose set-point is the integral of the commanded rate.
+def add_servos(spec: Any, model: Any, prefix: str, tau_s: float) -> None:
+    """Add a servo at each joint whose name begins with prefix; its set-point is the integral of the commanded rate.
 
     A critically damped spring pulls the joint to it with the time constant tau,
 
@@ -256,8 +253,12 @@ def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
 
     The inertia of a slide is its mass, and its angle a position.
     """
-    servo = spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
-    servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+    inertias = Hinges.from_model(model, prefix).inertia_kg_m2
+    for joint, inertia in zip(joints(spec, prefix), inertias, strict=True):
+        servo = spec.add_actuator(
+            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
+        )
+        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
 
 
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:

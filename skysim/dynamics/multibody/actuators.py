@@ -12,12 +12,10 @@ import mujoco
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
     ActuatorKind,
     Actuators,
-    ControlInput,
     add_motor,
     joints,
     sites,
@@ -43,7 +41,7 @@ def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
     motors = np.array([model.actuator(name).id for name in TORQUES])
-    ideal = IdealTorque(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    ideal = Actuators(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
     return {"ideal": ideal} | {
         kind.key: kind.control(model, getattr(vehicle, kind.key))
         for kind in kinds_on(vehicle)
@@ -72,13 +70,6 @@ def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
         add_motor(spec, "bearing", gear=[*axis, 0, 0, 0]).name = name
     for kind in kinds_on(vehicle):
         kind.add(spec, model, getattr(vehicle, kind.key))
-
-
-class IdealTorque(Actuators):
-    """Ideal actuator: torques about the body's axes, each clipped to a limit."""
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, torque_nm, inputs)
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
@@ -141,8 +132,8 @@ def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
     named |= {
         name for equality in spec.equalities for name in (equality.name1, equality.name2)
     }
-    names = [name for name in locked if name in named]
-    return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
+    name = next((name for name in locked if name in named), "")
+    return name and f"; {locked[name]} is off, which locks joint {name}"
 
 
 def check_names(spec: Any, path: Path) -> None:

@@ -30,7 +30,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     ControlInput,
     Hinges,
     add_motor,
-    add_servo,
+    add_servos,
     joints,
     member_values,
     scale_to_limit,
@@ -265,9 +265,9 @@ class CmgSet:
         if self.rotor_torque_limit_nm is not None:
             limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
             return vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
-        if unit_nms == 0:
-            return np.zeros_like(spin_nms), np.zeros_like(spin_nms)
-        rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
+        rate = np.zeros_like(spin_nms)
+        if unit_nms:
+            rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
         return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
 
 
@@ -303,9 +303,11 @@ class CmgActuator(Actuators):
             achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
         return achieved_nm
 
-    def torque_per_command(self, inputs: ControlInput) -> Floats:
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        super().command(control, commands, inputs)
         angle = inputs.angles_rad[self.gimbals.qpos]
-        return -self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
+        jacobian = self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
+        return -jacobian @ control[self.motor]
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(
@@ -333,10 +335,7 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     The spring of the servo holds the rate against gyroscopic torque from the vehicle's rotation. A damper alone would
     not hold it.
     """
-    for joint, inertia in zip(
-        joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True
-    ):
-        add_servo(spec, joint.name, inertia, cmgs.gimbal_time_constant_s)
+    add_servos(spec, model, GIMBAL, cmgs.gimbal_time_constant_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
             add_motor(spec, joint.name, cmgs.rotor_torque_limit_nm)

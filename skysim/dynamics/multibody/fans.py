@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -24,6 +24,8 @@ from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
 
 FAN = "fan_"
+
+NO_MOTORS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,12 @@ class Fans:
         return len(self.names)
 
 
-@dataclass(slots=True)
-class FanSet:
-    """A set of n fans, whose thrust has a lever arm about the bearing's center: T = sum position x axis thrust.
+class FanSet(Actuators):
+    """Actuators of the flight computer: n fans, commanded as if they had no lag.
 
-    Attributes
+    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust.
+
+    Parameters
     ----------
     force_axes
         (3, n) unit vectors along which a positive thrust pushes the body, in body axes
@@ -75,23 +78,19 @@ class FanSet:
         (3, n) positions from the center of rotation, in body axes
     thrust_limit_n
         Greatest thrust of each fan
-    torque_per_thrust_m, thrust_from_torque
-        (3, n) lever arms in N m per N, and their pseudo-inverse (n, 3)
+    motor
+        Numbers of the motors; none without a model
     """
 
-    force_axes: Floats
-    positions_m: Floats
-    thrust_limit_n: float
-    torque_per_thrust_m: Floats = field(init=False, repr=False)
-    thrust_from_torque: Floats = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.torque_per_thrust_m = np.cross(self.positions_m, self.force_axes, axis=0)
-        self.thrust_from_torque = inverse(self.torque_per_thrust_m)
-
-    def torque(self, thrust_n: Floats) -> Floats:
-        """Torque (3,) on the body of thrusts (n,)."""
-        return self.torque_per_thrust_m @ thrust_n
+    def __init__(
+        self,
+        force_axes: Floats,
+        positions_m: Floats,
+        thrust_limit_n: float,
+        motor: Ints = NO_MOTORS,
+    ) -> None:
+        lever_m = np.cross(positions_m, force_axes, axis=0)
+        super().__init__(motor, lever_m, inverse(lever_m), thrust_limit_n)
 
     def drive(self, torque_nm: Floats) -> Floats:
         """The smallest thrusts (n,) that give the torque (3,), or the nearest to it in least squares.
@@ -99,20 +98,16 @@ class FanSet:
         One factor scales all thrusts to the limit, which keeps the direction of the torque. Each fan can blow either
         way. The bearing takes the net force.
         """
-        return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
+        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
+
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        return self.command(control, self.drive(torque_nm), inputs)
 
 
-class FanActuator(Actuators):
-    """Actuators of the flight computer: fans, commanded as if they had no lag; see `FanSet`."""
-
-    def __init__(self, model: Any, config: FansConfig) -> None:
-        fans = Fans.from_model(model)
-        limit_n = config.thrust_limit_n
-        levers = FanSet(fans.axes, fans.positions_m, limit_n)
-        super().__init__(
-            fans.motor, levers.torque_per_thrust_m, levers.thrust_from_torque, limit_n
-        )
-        self.lag_s = config.time_constant_s
+def fan_actuators(model: Any, config: FansConfig) -> FanSet:
+    """The fans of a compiled model."""
+    fans = Fans.from_model(model)
+    return FanSet(fans.axes, fans.positions_m, config.thrust_limit_n, fans.motor)
 
 
 @dataclass(slots=True)
@@ -141,9 +136,9 @@ class Desaturator:
 class MomentumDump:
     """Momentum dumping by fans, with a model of their lag."""
 
-    def __init__(self, fans: Actuators, config: DesaturationConfig) -> None:
-        assert isinstance(fans, FanActuator)
+    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
         self.fans = fans
+        self.lag_s = lag_s
         self.desaturator = Desaturator(config)
         self.fan_torque_nm = np.zeros(3)
 
@@ -156,7 +151,7 @@ class MomentumDump:
         # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
         # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
-            -inputs.period_s / self.fans.lag_s
+            -inputs.period_s / self.lag_s
         )
         return present_nm
 
@@ -175,4 +170,4 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
         fan.dynprm[0] = config.time_constant_s
 
 
-FANS = ActuatorKind("fans", add_fans, FanActuator, sites=(FAN,))
+FANS = ActuatorKind("fans", add_fans, fan_actuators, sites=(FAN,))

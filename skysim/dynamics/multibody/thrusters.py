@@ -25,7 +25,6 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
-    Actuators,
     ControlInput,
     scale_to_limit,
     sites,
@@ -40,7 +39,7 @@ SHARING = 1e-4
 SHORTEST_LAG_S = 1e-15  # stands for no lag
 
 
-class ThrusterActuator(Actuators):
+class ThrusterActuator(FanSet):
     """Actuators of the flight computer: one-sided thrusters, commanded as if their thrust were continuous.
 
     Parameters
@@ -53,21 +52,22 @@ class ThrusterActuator(Actuators):
 
     def __init__(self, model: Any, config: ThrustersConfig) -> None:
         thrusters = Fans.from_model(model, THRUSTER)
-        levers = FanSet(thrusters.axes, thrusters.positions_m, config.thrust_n)
-        lever_m = levers.torque_per_thrust_m
+        super().__init__(
+            thrusters.axes, thrusters.positions_m, config.thrust_n, thrusters.motor
+        )
+        lever_m = self.torque_from_command
         self.weighted_m = np.vstack(
             (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(thrusters)))
         )
         # The map is that of thrusters that push both ways, scaled to the greatest thrust of one-sided ones. The scale
         # is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
-        both_ways = levers.thrust_from_torque
+        both_ways = self.command_from_torque
         scales = [
             self.thrusts(torque).max() / np.abs(both_ways @ torque).max()
             for torque in map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=3))
             if (both_ways @ torque).any()
         ]
-        both_ways = both_ways * max(scales, default=1.0)
-        super().__init__(thrusters.motor, lever_m, both_ways, config.thrust_n)
+        self.command_from_torque = both_ways * max(scales, default=1.0)
 
     def thrusts(self, torque_nm: Floats) -> Floats:
         """The smallest thrusts (n,) f >= 0 that give the torque (3,) T, or the nearest to it, without a limit.
@@ -75,13 +75,11 @@ class ThrusterActuator(Actuators):
         They minimize |A f - T|^2 + |SHARING A|^2 |f|^2 for the lever arms A, by non-negative least squares (Lawson &
         Hanson 1974). The second term shares the torque among thrusters that act alike.
         """
-        wanted = np.zeros(len(self.weighted_m))
-        wanted[:3] = torque_nm
-        return nnls(self.weighted_m, wanted)[0]
+        return nnls(self.weighted_m, np.append(torque_nm, np.zeros(len(self.motor))))[0]
 
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        thrust = scale_to_limit(self.thrusts(torque_nm), self.limit)
-        return self.command(control, thrust, inputs)
+    def drive(self, torque_nm: Floats) -> Floats:
+        """The thrusts, scaled to the limit by one factor."""
+        return scale_to_limit(self.thrusts(torque_nm), self.limit)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         return super().command(control, np.maximum(commands, 0.0), inputs)

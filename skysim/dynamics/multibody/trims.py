@@ -19,9 +19,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     Actuators,
     ControlInput,
     Hinges,
-    add_servo,
+    add_servos,
     inverse,
-    joints,
 )
 from skysim.scene.sections.vehicle import TrimsConfig
 
@@ -132,10 +131,8 @@ class TrimDrive(TrimMotors):
 
 
 def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
-    """Add a servo at each slide, critically damped, whose set-point is the integral of its control."""
-    masses_kg = Hinges.from_model(model, TRIM).inertia_kg_m2
-    for joint, mass_kg in zip(joints(spec, TRIM), masses_kg, strict=True):
-        add_servo(spec, joint.name, mass_kg, SERVO_S)
+    """Add a servo at each slide."""
+    add_servos(spec, model, TRIM, SERVO_S)
 
 
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:

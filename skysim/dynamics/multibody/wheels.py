@@ -103,6 +103,11 @@ class WheelActuator(Actuators):
         self.model = WheelSet(hinges.axes, hinges.inertia_kg_m2, limit_nm, limit_rad_s)
         super().__init__(hinges.motor, -hinges.axes, self.model.motor_from_torque, limit_nm)
 
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        speeds = inputs.speeds_rad_s[self.joints.dof]
+        motor = self.model.drive(torque_nm, speeds, inputs.period_s)
+        return super().command(control, motor, inputs)
+
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         speeds = inputs.speeds_rad_s[self.joints.dof]
         motor = self.model.within_limits(commands, speeds, inputs.period_s)
