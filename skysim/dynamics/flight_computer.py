@@ -20,11 +20,7 @@ import numpy as np
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers import (
-    ControllerSetup,
-    ExternalLaw,
-    external_law,
-)
+from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_law
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput

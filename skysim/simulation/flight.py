@@ -153,7 +153,8 @@ class Schedule:
         waiting = {n: t_s for n, t_s in (self.triggers_s or {}).items() if n >= self.index}
         open_s = now_s
         if waiting:
-            open_s = max(now_s, self.window_from(max(waiting.values())).close_s(self.rows))
+            last = self.window_from(max(waiting.values()))
+            open_s = max(now_s, last.close_s(self.rows))
         self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
     def resume(self, now_s: float) -> None:
@@ -167,6 +168,11 @@ class Schedule:
         """Window of an exposure that opens at this time."""
         return timing.window_from(self.scene, open_s, self.exposure_control.exposure_s)
 
+    def window_to(self, close_s: float) -> Window:
+        """Window of an exposure whose last row ends at this time."""
+        window = self.window_from(0.0)
+        return window._replace(open_s=close_s - window.close_s(self.rows))
+
     @property
     def window(self) -> Window:
         """Exposure window of the next frame."""
@@ -174,11 +180,6 @@ class Schedule:
             return self.window_from(self.triggers_s[self.index])
         number = self.index + self.skipped
         return timing.exposure_window(self.scene, number, self.exposure_control.exposure_s)
-
-    @property
-    def close_s(self) -> float:
-        """Time at which the exposure of the next frame ends."""
-        return self.window.close_s(self.rows)
 
     @property
     def due_s(self) -> float:
@@ -488,7 +489,8 @@ class Flight:
         while due := [
             one
             for one in schedules
-            if not one.is_over and (one.close_s if late else one.due_s) <= self.now_s
+            if not one.is_over
+            and (one.window.close_s(one.rows) if late else one.due_s) <= self.now_s
         ]:
             # Of several that are due at once, the first camera's.
             schedule = min(due, key=lambda one: one.due_s)
@@ -626,8 +628,7 @@ class Flight:
         Each observation has its own noise. Before t = 0 the vehicle rotates at its initial rate.
         """
         schedule = self.schedules[camera]
-        window = schedule.window_from(0.0)
-        window = window._replace(open_s=self.now_s - window.close_s(schedule.rows))
+        window = schedule.window_to(self.now_s)
         index = FIRST_OBSERVATION + self.observations
         self.observations += 1
         return self.capture(schedule, index, window, solves, updates_filter=False)

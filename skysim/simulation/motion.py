@@ -14,11 +14,10 @@ give, and `shortfall` tells what they cannot. `Motion.advance` simulates a contr
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
@@ -233,11 +232,12 @@ def shortfall(lab: Lab, forecast: TorqueForecast | None) -> str:
     if control is None or forecast is None:
         return ""
     period_s, t_s, needed, given, _ = forecast
-    missing = np.linalg.norm(needed - given, axis=1)
+    owed = needed - given
+    missing = np.linalg.norm(owed, axis=1)
     if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
     # Later the actuators give more than is needed: what they owe.
-    n = int(((needed - given) * needed).sum(axis=1).argmax())
+    n = int((owed * needed).sum(axis=1).argmax())
     text = flown_saturation(lab)
     return (
         f"motion.maneuver: needs a torque of ({components(needed[n], 2)}) N m at {t_s[n]:.1f} s, of which the"
@@ -273,8 +273,7 @@ def flown_saturation(lab: Lab) -> str:
 
 def at_limit(loads: Mapping[str, Floats]) -> dict[str, Bools]:
     """Whether each actuator is at its limit, (K,) by name; actuators that never are left out."""
-    found = {name: load >= AT_LIMIT for name, load in loads.items()}
-    return {name: full for name, full in found.items() if full.any()}
+    return {name: full for name, load in loads.items() if (full := load >= AT_LIMIT).any()}
 
 
 def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
@@ -291,23 +290,24 @@ def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
 # Records of true and estimated states.
 
 
+@dataclass
 class TelemetryRecorder:
-    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry."""
+    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry.
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        flight_computer: FlightComputer,
-        navigation: Navigation | None,
-        drives: Sequence[ActuatorDrive],
-    ) -> None:
-        self.simulation = simulation
-        self.flight_computer = flight_computer
-        self.navigation = navigation
-        self.drives = drives
-        self.period_steps = round(flight_computer.period_s / simulation.step_s)
-        self.at_step = np.arange(0, simulation.last_step, self.period_steps)
-        self.rows: dict[str, NDArray] = {}
+    Attributes
+    ----------
+    simulation, flight_computer, navigation, drives, period_steps
+        Those of the `Motion`
+    rows
+        Arrays of all rows by name, made at the first
+    """
+
+    simulation: Simulation
+    flight_computer: FlightComputer
+    navigation: Navigation | None
+    drives: Sequence[ActuatorDrive]
+    period_steps: int
+    rows: dict[str, Any] = field(default_factory=dict)
 
     def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
         """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
@@ -339,10 +339,11 @@ class TelemetryRecorder:
                     for name, estimate in state.others.items()
                     if name.startswith("mounting")
                 ]
+        count = math.ceil(self.simulation.last_step / self.period_steps)
         for name, value in row.items():
             one = np.asarray(value)
             if name not in self.rows:
-                self.rows[name] = np.zeros((len(self.at_step), *one.shape), one.dtype)
+                self.rows[name] = np.zeros((count, *one.shape), one.dtype)
             self.rows[name][self.simulation.step // self.period_steps] = one
 
     def telemetry(
@@ -351,9 +352,9 @@ class TelemetryRecorder:
         """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
         simulation = self.simulation
         vehicle = simulation.vehicle
-        steps = self.at_step[self.at_step < simulation.step]
+        steps = np.arange(0, simulation.step, self.period_steps)
         states = simulation.states[steps]
-        rows: dict[str, Any] = {name: row[: len(steps)] for name, row in self.rows.items()}
+        rows = {name: row[: len(steps)] for name, row in self.rows.items()}
         nq = simulation.model.nq
         readings = {name: rows.pop(name) for name in readings_of(self.drives)}
         # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
@@ -446,6 +447,11 @@ class Motion:
     kept_s
         Time for which past states and IMU samples are kept; None keeps all of them
 
+    Attributes
+    ----------
+    period_steps
+        Integration steps in a control period
+
     Raises
     ------
     InputError
@@ -482,6 +488,7 @@ class Motion:
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
+        self.period_steps = round(self.flight_computer.period_s / self.simulation.step_s)
         self.drives = build_drives(scene.vehicle, vehicle.model)
         self.navigation = None
         if scene.vehicle.imu is not None:
@@ -499,7 +506,11 @@ class Motion:
         self.recorder = None
         if kept_s is None:
             self.recorder = TelemetryRecorder(
-                self.simulation, self.flight_computer, self.navigation, self.drives
+                self.simulation,
+                self.flight_computer,
+                self.navigation,
+                self.drives,
+                self.period_steps,
             )
 
     def close(self) -> None:
@@ -512,11 +523,6 @@ class Motion:
         return self.disturbances.inactive and not (
             self.lab.scene.motion.control or self.navigation
         )
-
-    @property
-    def period_steps(self) -> int:
-        """Integration steps in a control period."""
-        return round(self.flight_computer.period_s / self.simulation.step_s)
 
     def advance(self, steps: int, commands: Commands = NO_COMMANDS) -> None:
         """Simulate some steps with controls that are held over them, by the steps of the module's docstring.

@@ -17,12 +17,10 @@ from scipy.interpolate import BPoly
 from scipy.spatial.transform import Rotation
 
 from skysim.apps.live.pacing import Live
-from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
 from skysim.simulation.flight import Shot
-from skysim.simulation.timing import window_from
 from skysim.sources.orbit_elements import OemOrbit
 from skysim.tracking.onboard_model import OrbitStarTracker
 
@@ -82,14 +80,9 @@ class PosedLive(Live):
     @property
     def greeting(self) -> dict[str, Any]:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
-        return super().greeting | {"exposure_s": -self.window(0.0).open_s}
-
-    def window(self, close_s: float) -> Window:
-        """Window of an exposure whose last row ends at a time."""
-        schedule = self.flight.schedules[0]
-        scene = schedule.camera.scene
-        window = window_from(scene, 0.0, schedule.exposure_control.exposure_s)
-        return window._replace(open_s=close_s - window.close_s(scene.camera.height_px))
+        return super().greeting | {
+            "exposure_s": -self.flight.schedules[0].window_to(0.0).open_s
+        }
 
     def run(self) -> None:
         """Answer poses until the last frame, or until all outputs have failed."""
@@ -122,7 +115,7 @@ class PosedLive(Live):
         schedule = self.flight.schedules[0]
         values = pose_samples(pose, schedule.camera.orbit is not None)
         t_s = values["t_s"]
-        window = self.window(float(t_s[-1]))
+        window = schedule.window_to(float(t_s[-1]))
         open_s = np.array([window.open_s])
         require_within("exposure's start", open_s, max(self.closed_s, t_s[0]), LATEST_S)
         # 2. Place.

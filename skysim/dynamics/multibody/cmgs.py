@@ -31,6 +31,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     Hinges,
     add_motor,
     add_servos,
+    inverse,
     joints,
     member_values,
     scale_to_limit,
@@ -225,8 +226,8 @@ class CmgSet:
         It is 1 if torque is equally easy in every direction, and 0 if there is no torque in one direction, or if the
         rotors are at rest. It does not depend on the size and number of the rotors.
         """
-        angle = np.asarray(angle_rad)[..., None, :]
-        spin = np.asarray(rotor_rad_s)[..., None, :]
+        angle = angle_rad[..., None, :]
+        spin = rotor_rad_s[..., None, :]
         cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
         jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
         gram = jacobian @ jacobian.swapaxes(-1, -2)
@@ -288,7 +289,7 @@ class CmgActuator(Actuators):
         )
         speeds = np.full(len(rotors), config.rotor_rpm * RPM_RAD_S)
         jacobian = self.model.jacobian(np.zeros(len(gimbals)), speeds)
-        super().__init__(gimbals.motor, -jacobian, -np.linalg.pinv(jacobian), limit_rad_s)
+        super().__init__(gimbals.motor, -jacobian, inverse(-jacobian), limit_rad_s)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         angle = inputs.angles_rad[self.gimbals.qpos]

@@ -56,7 +56,7 @@ class TrimMotors:
         self.config = config
         self.slides = Hinges.from_model(model, TRIM)
         self.motor = self.slides.motor
-        self.start_m = model.qpos0[self.slides.qpos].copy()
+        self.start_m = model.qpos0[self.slides.qpos]
         self.position_m = self.start_m
 
     def moved(self, displacement_m: Floats, times_s: Floats) -> Floats:

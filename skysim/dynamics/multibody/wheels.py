@@ -158,7 +158,7 @@ class Stiction:
         # A wheel comes to rest where its speed changes sign, or by friction alone, which lets it creep to zero.
         rests = self.sticks | (np.abs(speed) < REST_RAD_S) | (speed * self.before_rad_s < 0)
         self.sticks = rests & (np.abs(load_nm) <= self.config.stiction_nm)
-        self.before_rad_s = speed.copy()
+        self.before_rad_s = speed
         self.model.dof_frictionloss[self.joints.dof] = np.where(
             self.sticks, self.config.stiction_nm, self.config.coulomb_nm
         )
