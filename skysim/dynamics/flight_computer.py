@@ -20,16 +20,12 @@ import numpy as np
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Floats
 from skysim.dynamics.attitude_control import Pid, build_controller
-from skysim.dynamics.controllers import (
-    ControllerSetup,
-    ExternalLaw,
-    external_law,
-)
+from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_law
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators
-from skysim.dynamics.multibody.fans import Desaturator, MomentumDump
+from skysim.dynamics.multibody.fans import MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS
@@ -62,14 +58,15 @@ def authority_nm(actuators: Actuators) -> float:
 
     A torque T of unit length in the worst direction demands max |command_from_torque T| = the greatest row norm.
     """
-    command_from_torque, limit = actuators.command_map()
-    return float(limit / np.linalg.norm(command_from_torque, axis=1).max())
+    return float(
+        actuators.limit / np.linalg.norm(actuators.command_from_torque, axis=1).max()
+    )
 
 
 def usage(actuators: Actuators, torque_nm: Floats) -> Floats:
     """(N,) ratio of the greatest command to its limit, for torques (N, 3) on the body."""
-    command_from_torque, limit = actuators.command_map()
-    return np.abs(torque_nm @ command_from_torque.T).max(axis=1) / limit
+    commands = np.abs(torque_nm @ actuators.command_from_torque.T)
+    return commands.max(axis=1) / actuators.limit
 
 
 class FlightComputer:
@@ -118,13 +115,12 @@ class FlightComputer:
             return
         # With a controller: its actuators, its law, and the fans that dump momentum.
         self.actuator = self.actuator_sets[self.config.actuators]
-        self.motors = self.actuator.motor
-        self.names = [vehicle.model.actuator(number).name for number in self.motors]
-        self.limit = self.actuator.command_map()[1]
+        self.names = [vehicle.model.actuator(number).name for number in self.actuator.motor]
         self.law = self.build_law(scene, vehicle, reference, programs)
-        if self.config.desaturation:
+        fans = scene.vehicle.fans
+        if self.config.desaturation and fans:
             self.momentum_dump = MomentumDump(
-                self.actuator_sets["fans"], Desaturator(self.config.desaturation)
+                self.actuator_sets["fans"], fans.time_constant_s, self.config.desaturation
             )
 
     def build_law(
@@ -166,10 +162,8 @@ class FlightComputer:
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) momentum stored in wheels and CMGs, in body axes; the arguments are the full qpos and qvel."""
-        stored = np.zeros(3)
-        for actuator_set in self.actuator_sets.values():
-            stored += actuator_set.momentum_nms(angles_rad, speeds_rad_s)
-        return stored
+        sets = self.actuator_sets.values()
+        return np.sum([one.momentum_nms(angles_rad, speeds_rad_s) for one in sets], axis=0)
 
     def compute_controls(
         self,
@@ -192,18 +186,12 @@ class FlightComputer:
             What replaces the control law
         """
         control = np.zeros(self.nu)
-        config = self.config
-        if config is None and commands.torque_nm is None and not commands.motors:
-            return control
         # 1. Control law, unless its torque or its actuators are commanded.
-        has_law = not (
-            config is None
-            or commands.torque_nm is not None
-            or config.actuators in commands.motors
+        torque_nm = commands.torque_nm
+        has_law = (
+            self.config and torque_nm is None and self.config.actuators not in commands.motors
         )
-        self.control_torque_nm = (
-            np.zeros(3) if commands.torque_nm is None else commands.torque_nm
-        )
+        self.control_torque_nm = np.zeros(3) if torque_nm is None else torque_nm
         if has_law:
             self.control_torque_nm = self.law.torque_nm(
                 inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
@@ -219,7 +207,7 @@ class FlightComputer:
         for key, motor_commands in commands.motors.items():
             self.actuator_sets[key].command(control, motor_commands, inputs)
         if self.names:
-            self.loads = np.abs(control[self.motors]) / self.limit
+            self.loads = np.abs(control[self.actuator.motor]) / self.actuator.limit
             if isinstance(self.actuator, WheelActuator):
                 # The speed of a wheel counts if it is closer to its limit.
                 speeds = np.abs(inputs.speeds_rad_s[self.actuator.joints.dof])

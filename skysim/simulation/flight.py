@@ -110,8 +110,8 @@ class Schedule:
 
     Attributes
     ----------
-    camera, number
-        Star camera and its number in the lab
+    camera, scene, rows, number
+        Star camera, its scene, its number of rows, and its number in the lab
     frames
         Number of frames; infinite in an endless flight
     exposure_control
@@ -132,8 +132,10 @@ class Schedule:
         self.camera = camera
         self.number = number
         self.frames = frames
-        self.exposure_control = ExposureController(camera.scene)
-        self.latency_s = camera.scene.filter.latency_s if camera.scene.filter else 0.0
+        self.scene = scene = camera.scene
+        self.rows = scene.camera.height_px
+        self.exposure_control = ExposureController(scene)
+        self.latency_s = scene.filter.latency_s if scene.filter else 0.0
         self.index = 0
         self.exposures_s: dict[int, float] = {}
         self.triggers_s: dict[int, float] | None = None
@@ -151,51 +153,41 @@ class Schedule:
         waiting = {n: t_s for n, t_s in (self.triggers_s or {}).items() if n >= self.index}
         open_s = now_s
         if waiting:
-            rows = self.camera.scene.camera.height_px
-            last = timing.window_from(
-                self.camera.scene, max(waiting.values()), self.exposure_control.exposure_s
-            )
-            open_s = max(now_s, last.close_s(rows))
+            last = self.window_from(max(waiting.values()))
+            open_s = max(now_s, last.close_s(self.rows))
         self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
     def resume(self, now_s: float) -> None:
         """Expose by the scene's schedule again, from its next time on; triggers that wait are dropped."""
-        exposure = self.camera.scene.exposure
+        exposure = self.scene.exposure
         due = max(math.ceil((now_s - exposure.first_s) * exposure.rate_hz), 0)
         self.skipped = due - self.index
         self.triggers_s = None
 
+    def window_from(self, open_s: float) -> Window:
+        """Window of an exposure that opens at this time."""
+        return timing.window_from(self.scene, open_s, self.exposure_control.exposure_s)
+
+    def window_to(self, close_s: float) -> Window:
+        """Window of an exposure whose last row ends at this time."""
+        window = self.window_from(0.0)
+        return window._replace(open_s=close_s - window.close_s(self.rows))
+
     @property
     def window(self) -> Window:
         """Exposure window of the next frame."""
-        exposure_s = self.exposure_control.exposure_s
         if self.triggers_s is not None:
-            return timing.window_from(
-                self.camera.scene, self.triggers_s[self.index], exposure_s
-            )
-        return timing.exposure_window(
-            self.camera.scene, self.index + self.skipped, exposure_s
-        )
-
-    def window_until(self, close_s: float) -> Window:
-        """Window of an exposure outside of the schedule, whose last row ends at a time."""
-        scene = self.camera.scene
-        window = timing.window_from(scene, 0.0, self.exposure_control.exposure_s)
-        return window._replace(open_s=close_s - window.close_s(scene.camera.height_px))
-
-    @property
-    def close_s(self) -> float:
-        """Time at which the exposure of the next frame ends."""
-        return self.window.close_s(self.camera.scene.camera.height_px)
+            return self.window_from(self.triggers_s[self.index])
+        number = self.index + self.skipped
+        return timing.exposure_window(self.scene, number, self.exposure_control.exposure_s)
 
     @property
     def due_s(self) -> float:
         """Time at which the next frame is due: it is exposed, its solution is ready, and its time tag has passed."""
-        scene = self.camera.scene
-        rows = scene.camera.height_px
         window = self.window
-        tagged_s = window.middle_s(rows) + timing.time_tag_error_s(scene, self.index)
-        return max(window.close_s(rows) + self.latency_s, tagged_s)
+        error_s = timing.time_tag_error_s(self.scene, self.index)
+        tagged_s = window.middle_s(self.rows) + error_s
+        return max(window.close_s(self.rows) + self.latency_s, tagged_s)
 
 
 class Flight:
@@ -343,7 +335,7 @@ class Flight:
             return Commands(
                 None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,)),
                 {
-                    key: finite_array(values, key, sets[key].command_map()[0].shape[:1])
+                    key: finite_array(values, key, sets[key].motor.shape)
                     for key, values in motors.items()
                 },
             )
@@ -383,10 +375,13 @@ class Flight:
         """Schedules of the cameras whose solutions the filter needs: with a filter all, else none."""
         return self.schedules if self.lab.scene.filter and self.motion.navigation else []
 
-    def trajectory(self) -> Trajectory:
-        """The motion until now, with the vibration; only its last part in a flight without history."""
+    def trajectory(self, begin_s: float = 0.0) -> Trajectory:
+        """The motion from about a time until now, with the vibration; only its last part in a flight without history.
+
+        After the end it is always the whole motion, which is made once.
+        """
         if not self.is_over:
-            return self.motion.trajectory()
+            return self.motion.trajectory(begin_s)
         if self.flown is None:
             self.flown = self.motion.trajectory()
         return self.flown
@@ -437,10 +432,10 @@ class Flight:
         progress
             Called as progress(t_s, duration_s) after every step of the motion
         """
-        wanted = [n for n in range(len(self.schedules)) if cameras is None or n in cameras]
-        schedules = self.filter_schedules or [self.schedules[n] for n in wanted]
-        for shot in self.events(schedules, solves, selects, progress):
-            if shot is not None and shot.camera in [self.schedules[n].camera for n in wanted]:
+        wanted = [one for one in self.schedules if cameras is None or one.number in cameras]
+        shown = [one.camera for one in wanted]
+        for shot in self.events(self.filter_schedules or wanted, solves, selects, progress):
+            if shot is not None and shot.camera in shown:
                 yield shot
 
     def events(
@@ -494,15 +489,19 @@ class Flight:
         while due := [
             one
             for one in schedules
-            if not one.is_over and (one.close_s if late else one.due_s) <= self.now_s
+            if not one.is_over
+            and (one.window.close_s(one.rows) if late else one.due_s) <= self.now_s
         ]:
             # Of several that are due at once, the first camera's.
             schedule = min(due, key=lambda one: one.due_s)
             index = schedule.index
             window = schedule.window
-            close_s = schedule.close_s
             schedule.index += 1
-            if selects and schedule.number == 0 and not selects(index, close_s):
+            if (
+                selects
+                and schedule.number == 0
+                and not selects(index, window.close_s(schedule.rows))
+            ):
                 continue
             if math.isfinite(schedule.frames):
                 schedule.exposures_s[index] = window.exposure_s
@@ -541,18 +540,14 @@ class Flight:
         """
         camera = schedule.camera
         simulation = self.motion.simulation
-        if (
-            simulation.first_step
-            and simulation.first_step * simulation.step_s > window.open_s
-        ):
+        first = simulation.first_step
+        if first and first * simulation.step_s > window.open_s:
             raise InputError(
                 "shots", f"the flight has forgotten frame {index}", "keeps_history=True"
             )
         # Render.
         clock = Clock()
-        trajectory = given or (
-            self.trajectory() if self.is_over else self.motion.trajectory(window.open_s)
-        )
+        trajectory = given or self.trajectory(window.open_s)
         frame, truth = render_frame(
             camera, trajectory.since(window.open_s), index, clock, window
         )
@@ -579,23 +574,18 @@ class Flight:
         if number not in self.trackers:
             programs = self.parts.programs
             if number == 0 and self.parts.tracker is not None:
-                programs = {
-                    **programs,
-                    schedule.camera.scene.tracker.name: self.parts.tracker,
-                }
-            self.trackers[number] = build_tracker(schedule.camera, programs)
-            if not isinstance(self.trackers[number], factory.UserTracker):
-                factory.solve_frame(self.trackers[number], frame)
+                programs = {**programs, schedule.scene.tracker.name: self.parts.tracker}
+            self.trackers[number] = tracker = build_tracker(schedule.camera, programs)
+            if not isinstance(tracker, factory.UserTracker):
+                factory.solve_frame(tracker, frame)
         return self.trackers[number]
 
     def measured_rate(self, camera: StarCamera, window: Window) -> RateEstimate | None:
         """Rate from the gyros during an exposure that the tracker receives; None without `tracker.gyro`."""
         scene = camera.scene
         config = scene.vehicle.imu
-        if config is None or not scene.tracker.gyro:
-            return None
-        samples = self.imu_samples(window.open_s)
-        if samples is None:
+        samples = self.imu_samples(window.open_s) if scene.tracker.gyro else None
+        if config is None or samples is None:
             return None
         return navigation.rate_of_frame(
             samples, window, scene.camera.height_px, config, camera.mount
@@ -617,7 +607,7 @@ class Flight:
             For a frame that is not exposed yet.
         """
         schedule = self.schedules[camera]
-        scene = schedule.camera.scene
+        scene = schedule.scene
         exposure_s = schedule.exposures_s.get(index)
         if exposure_s is None and scene.tracker.exposure_control:
             raise InputError(
@@ -626,10 +616,7 @@ class Flight:
                 "after it came from shots",
             )
         window = timing.exposure_window(scene, index, exposure_s)
-        if not (
-            0 <= index < schedule.frames
-            and window.close_s(scene.camera.height_px) <= self.now_s
-        ):
+        if not (0 <= index < schedule.frames and window.close_s(schedule.rows) <= self.now_s):
             raise InputError(
                 "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"
             )
@@ -641,7 +628,7 @@ class Flight:
         Each observation has its own noise. Before t = 0 the vehicle rotates at its initial rate.
         """
         schedule = self.schedules[camera]
-        window = schedule.window_until(self.now_s)
+        window = schedule.window_to(self.now_s)
         index = FIRST_OBSERVATION + self.observations
         self.observations += 1
         return self.capture(schedule, index, window, solves, updates_filter=False)

@@ -14,7 +14,7 @@ give, and `shortfall` tells what they cannot. `Motion.advance` simulates a contr
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -232,11 +232,12 @@ def shortfall(lab: Lab, forecast: TorqueForecast | None) -> str:
     if control is None or forecast is None:
         return ""
     period_s, t_s, needed, given, _ = forecast
-    missing = np.linalg.norm(needed - given, axis=1)
+    owed = needed - given
+    missing = np.linalg.norm(owed, axis=1)
     if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
     # Later the actuators give more than is needed: what they owe.
-    n = int(((needed - given) * needed).sum(axis=1).argmax())
+    n = int((owed * needed).sum(axis=1).argmax())
     text = flown_saturation(lab)
     return (
         f"motion.maneuver: needs a torque of ({components(needed[n], 2)}) N m at {t_s[n]:.1f} s, of which the"
@@ -272,8 +273,7 @@ def flown_saturation(lab: Lab) -> str:
 
 def at_limit(loads: Mapping[str, Floats]) -> dict[str, Bools]:
     """Whether each actuator is at its limit, (K,) by name; actuators that never are left out."""
-    found = {name: load >= AT_LIMIT for name, load in loads.items()}
-    return {name: full for name, full in found.items() if full.any()}
+    return {name: full for name, load in loads.items() if (full := load >= AT_LIMIT).any()}
 
 
 def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
@@ -290,67 +290,61 @@ def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
 # Records of true and estimated states.
 
 
+@dataclass
 class TelemetryRecorder:
-    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry."""
+    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry.
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        flight_computer: FlightComputer,
-        navigation: Navigation | None,
-        drives: Sequence[ActuatorDrive],
-    ) -> None:
-        self.simulation = simulation
-        self.flight_computer = flight_computer
-        self.navigation = navigation
-        self.drives = drives
-        steps = round(flight_computer.period_s / simulation.step_s)
-        self.at_step = np.arange(0, simulation.last_step, steps)
-        self.steps_per_tick = steps
-        # The mounting states of the filter, that of the main camera first.
-        states = navigation.filter.state.others if navigation and navigation.filter else ()
-        self.mounted = [name for name in states if name.startswith("mounting")]
-        # Of the filter: sigma of the attitude, bias and its sigma, and estimate and sigma of each mounting.
-        columns = [
-            ("recorded", bool),
-            ("torque_nm", float, 3),
-            ("disturbance_nm", float, 3),
-            ("momentum_nms", float, 3),
-            ("loads", float, (len(flight_computer.names),)),
-            ("imu_wxyz", float, 4),
-            ("saturated", bool),
-            ("bias_rad_s", float, 3),
-            ("filter_wxyz", float, 4),
-            ("filter", float, (3, 3)),
-            ("mountings", float, (len(self.mounted), 2, 3)),
-            *((name, float, one.shape) for name, one in readings_of(drives).items()),
-        ]
-        self.rows = np.zeros(len(self.at_step), columns)
+    Attributes
+    ----------
+    simulation, flight_computer, navigation, drives, period_steps
+        Those of the `Motion`
+    rows
+        Arrays of all rows by name, made at the first
+    """
+
+    simulation: Simulation
+    flight_computer: FlightComputer
+    navigation: Navigation | None
+    drives: Sequence[ActuatorDrive]
+    period_steps: int
+    rows: dict[str, Any] = field(default_factory=dict)
 
     def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
         """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
-        row = self.rows[self.simulation.step // self.steps_per_tick]
-        row["recorded"] = True
-        row["torque_nm"] = self.flight_computer.control_torque_nm
-        row["disturbance_nm"] = disturbance_nm
-        row["momentum_nms"] = momentum_nms
-        row["loads"] = self.flight_computer.loads
-        for name, values in readings_of(self.drives).items():
-            row[name] = values
+        row: dict[str, Any] = {
+            "recorded": True,
+            "torque_nm": self.flight_computer.control_torque_nm,
+            "disturbance_nm": disturbance_nm,
+            "momentum_nms": momentum_nms,
+            "loads": self.flight_computer.loads,
+            **readings_of(self.drives),
+        }
         navigation = self.navigation
-        if navigation is None:
-            return
-        row["imu_wxyz"] = navigation.attitude_wxyz("imu")
-        row["saturated"] = navigation.saturated
-        row["bias_rad_s"] = navigation.apparent_bias_rad_s(
-            self.simulation.lab_from_body_wxyz, self.simulation.rate_body_rad_s
-        )
-        if navigation.filter:
-            state = navigation.filter.state
-            row["filter_wxyz"] = navigation.attitude_wxyz("filter")
-            row["filter"] = state.sigma_attitude_rad, state.bias_rad_s, state.sigma_bias_rad_s
-            for n, name in enumerate(self.mounted):
-                row["mountings"][n] = state.others[name], state.sigma(name)
+        if navigation:
+            simulation = self.simulation
+            row["lab_from_imu"] = navigation.attitude_wxyz("imu")
+            row["saturated"] = navigation.saturated
+            row["bias_rad_s"] = navigation.apparent_bias_rad_s(
+                simulation.lab_from_body_wxyz, simulation.rate_body_rad_s
+            )
+            if navigation.filter:
+                state = navigation.filter.state
+                row["lab_from_filter"] = navigation.attitude_wxyz("filter")
+                row["sigma_attitude_rad"] = state.sigma_attitude_rad
+                row["assumed_bias_rad_s"] = state.bias_rad_s
+                row["sigma_bias_rad_s"] = state.sigma_bias_rad_s
+                # The mounting states of the filter, that of the main camera first.
+                row["mountings"] = [
+                    (estimate, state.sigma(name))
+                    for name, estimate in state.others.items()
+                    if name.startswith("mounting")
+                ]
+        count = math.ceil(self.simulation.last_step / self.period_steps)
+        for name, value in row.items():
+            one = np.asarray(value)
+            if name not in self.rows:
+                self.rows[name] = np.zeros((count, *one.shape), one.dtype)
+            self.rows[name][self.simulation.step // self.period_steps] = one
 
     def telemetry(
         self, reference: Reference | None, cameras: Sequence[StarCamera]
@@ -358,73 +352,62 @@ class TelemetryRecorder:
         """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
         simulation = self.simulation
         vehicle = simulation.vehicle
-        steps = self.at_step[self.at_step < simulation.step]
+        steps = np.arange(0, simulation.step, self.period_steps)
         states = simulation.states[steps]
-        rows = self.rows[: len(steps)]
+        rows = {name: row[: len(steps)] for name, row in self.rows.items()}
         nq = simulation.model.nq
-        readings = readings_of(self.drives)
+        readings = {name: rows.pop(name) for name in readings_of(self.drives)}
         # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
-        for k in np.flatnonzero(~rows["recorded"]):
+        for k in np.flatnonzero(~rows.pop("recorded")):
             rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
                 states[k, 1 : 1 + nq], states[k, 1 + nq :]
             )
             # Actuators without commands keep their readings.
-            for name in readings:
-                rows[name][k] = rows[name][k - 1]
+            for values in readings.values():
+                values[k] = values[k - 1]
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
         t_s = steps * np.float64(simulation.step_s)
-        estimates: dict[str, Any] = {}
-        if self.navigation:
-            estimates["lab_from_imu"] = Rotation.from_quat(
-                rows["imu_wxyz"], scalar_first=True
-            )
-            estimates |= {name: rows[name] for name in ("saturated", "bias_rad_s")}
-            if self.navigation.filter:
-                estimates["lab_from_filter"] = Rotation.from_quat(
-                    rows["filter_wxyz"], scalar_first=True
-                )
-                names = ("sigma_attitude_rad", "assumed_bias_rad_s", "sigma_bias_rad_s")
-                estimates |= zip(names, rows["filter"].swapaxes(0, 1), strict=True)
+        rows["loads"] = dict(zip(self.flight_computer.names, rows["loads"].T, strict=True))
+        rows["mountings"] = mountings_by_camera(rows.get("mountings"), t_s, cameras)
+        for name in rows:
+            if name.startswith("lab_from"):
+                rows[name] = Rotation.from_quat(rows[name], scalar_first=True)
         return Telemetry(
             t_s,
             self.flight_computer.period_s,
             Rotation.from_quat(states[:, 1:5], scalar_first=True),
             states[:, 1 + nq : 4 + nq].copy(),
-            rows["torque_nm"],
-            rows["disturbance_nm"],
-            rows["momentum_nms"],
-            states[:, 1 + nq + vehicle.wheels.dof],
-            gimbals,
-            states[:, 1 : 1 + nq].copy(),
-            cmgs.model.manipulability(gimbals, rotors)
+            wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
+            gimbal_rad=gimbals,
+            joints=states[:, 1 : 1 + nq].copy(),
+            manipulability=cmgs.model.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,
-            reference.attitudes(t_s) if reference else None,
-            mountings=self.mountings_by_camera(rows["mountings"], t_s, cameras),
-            loads=dict(zip(self.flight_computer.names, rows["loads"].T, strict=True)),
+            lab_from_ref=reference.attitudes(t_s) if reference else None,
             wheel_names=vehicle.wheels.names,
             gimbal_names=vehicle.gimbals.names,
-            readings={name: rows[name] for name in readings},
-            **estimates,
+            readings=readings,
+            **rows,
         )
 
-    def mountings_by_camera(
-        self, mountings: Floats, t_s: Floats, cameras: Sequence[StarCamera]
-    ) -> dict[str, Mounting]:
-        """Estimates, sigmas and truth of the filter's mounting states (K, n, 2, 3), by name of the camera.
 
-        The state of a head is relative to that of the main camera.
-        """
-        if not self.mounted:
-            return {}
-        true_rad = [mounting_rad(camera, t_s) for camera in cameras]
-        relative_rad = [true_rad[0], *(head - true_rad[0] for head in true_rad[1:])]
-        return {
-            camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], relative_rad[n])
-            for n, camera in enumerate(cameras)
-        }
+def mountings_by_camera(
+    mountings: Floats | None, t_s: Floats, cameras: Sequence[StarCamera]
+) -> dict[str, Mounting]:
+    """Estimates, sigmas and truth of the filter's mounting states (K, n, 2, 3), by name of the camera.
+
+    The state of a head is relative to that of the main camera.
+    """
+    if mountings is None or not mountings.size:
+        return {}
+    true_rad = np.array([mounting_rad(camera, t_s) for camera in cameras])
+    true_rad[1:] -= true_rad[0]
+    return {
+        camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], true_rad[n])
+        for n, camera in enumerate(cameras)
+    }
 
 
 def readings_of(drives: Sequence[ActuatorDrive]) -> dict[str, Floats]:
@@ -464,6 +447,11 @@ class Motion:
     kept_s
         Time for which past states and IMU samples are kept; None keeps all of them
 
+    Attributes
+    ----------
+    period_steps
+        Integration steps in a control period
+
     Raises
     ------
     InputError
@@ -500,6 +488,7 @@ class Motion:
                 self.simulation.times_s(0, self.simulation.last_step + 1)
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
+        self.period_steps = round(self.flight_computer.period_s / self.simulation.step_s)
         self.drives = build_drives(scene.vehicle, vehicle.model)
         self.navigation = None
         if scene.vehicle.imu is not None:
@@ -517,7 +506,11 @@ class Motion:
         self.recorder = None
         if kept_s is None:
             self.recorder = TelemetryRecorder(
-                self.simulation, self.flight_computer, self.navigation, self.drives
+                self.simulation,
+                self.flight_computer,
+                self.navigation,
+                self.drives,
+                self.period_steps,
             )
 
     def close(self) -> None:
@@ -530,11 +523,6 @@ class Motion:
         return self.disturbances.inactive and not (
             self.lab.scene.motion.control or self.navigation
         )
-
-    @property
-    def period_steps(self) -> int:
-        """Integration steps in a control period."""
-        return round(self.flight_computer.period_s / self.simulation.step_s)
 
     def advance(self, steps: int, commands: Commands = NO_COMMANDS) -> None:
         """Simulate some steps with controls that are held over them, by the steps of the module's docstring.
@@ -549,7 +537,6 @@ class Motion:
         simulation = self.simulation
         flight_computer = self.flight_computer
         navigation = self.navigation
-        t_s = simulation.now_s
         angles = simulation.angles_rad
         speeds = simulation.speeds_rad_s
         attitude = simulation.lab_from_body_wxyz
@@ -558,16 +545,16 @@ class Motion:
         # 1. The controller gets the truth or, with feedback imu or filter, the estimates of the navigation.
         measured_attitude = attitude
         measured_rate = rate
-        feedback = flight_computer.config.feedback if flight_computer.config else "truth"
-        if feedback != "truth" and navigation:
-            measured_attitude = navigation.attitude_wxyz(feedback)
-            measured_rate = navigation.body_rate_rad_s(feedback)
+        config = flight_computer.config
+        if navigation and config and config.feedback != "truth":
+            measured_attitude = navigation.attitude_wxyz(config.feedback)
+            measured_rate = navigation.body_rate_rad_s(config.feedback)
         # 2. Controls.
-        inputs = ControlInput(t_s, flight_computer.period_s, measured_rate, angles, speeds)
-        control = np.empty((min(steps, simulation.steps_left), simulation.model.nu))
-        control[:] = flight_computer.compute_controls(
-            inputs, measured_attitude, momentum, commands
+        inputs = ControlInput(
+            simulation.now_s, flight_computer.period_s, measured_rate, angles, speeds
         )
+        held = flight_computer.compute_controls(inputs, measured_attitude, momentum, commands)
+        control = np.tile(held, (min(steps, simulation.steps_left), 1))
         # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
         mean_nm = np.zeros(3)
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):

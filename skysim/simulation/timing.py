@@ -12,9 +12,8 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import RollingShutterConfig
 
 MARGIN_S = 2e-3  # time that is simulated after the last exposure
-LONGEST_LIVE_S = (
-    1.0  # longest exposure that a client may set where the scene has none as long
-)
+# Longest exposure that a client may set where the scene has none as long.
+LONGEST_LIVE_S = 1.0
 HISTORY_MARGIN_S = 0.05  # duration of past states that is kept beyond the needs of a frame
 
 
@@ -68,11 +67,9 @@ def longest_live_s(scene: Scene) -> float:
     return max(longest_exposure_s(scene), period_s)
 
 
-def frame_end_s(scene: Scene, index: int, exposure_s: float | None = None) -> float:
+def frame_end_s(scene: Scene, index: int) -> float:
     """Time until which a motion must last for a frame."""
-    return (
-        exposure_window(scene, index, exposure_s).close_s(scene.camera.height_px) + MARGIN_S
-    )
+    return exposure_window(scene, index).close_s(scene.camera.height_px) + MARGIN_S
 
 
 def duration_s(scene: Scene) -> float:
@@ -81,20 +78,19 @@ def duration_s(scene: Scene) -> float:
     Telemetry has a row at the beginning of each control period, so it covers mid-exposure and time tag of all frames.
     """
     last = scene.exposure.frames - 1
-    exposure_s = longest_exposure_s(scene)
-    middle_s = exposure_window(scene, last, exposure_s).middle_s(scene.camera.height_px)
-    latest_s = middle_s + max(time_tag_error_s(scene, last), 0.0)
+    rows = scene.camera.height_px
+    window = exposure_window(scene, last, longest_exposure_s(scene))
+    latest_s = window.middle_s(rows) + max(time_tag_error_s(scene, last), 0.0)
     covered_s = math.ceil(latest_s * scene.control_rate_hz) / scene.control_rate_hz
-    return max(frame_end_s(scene, last, exposure_s), covered_s + MARGIN_S)
+    return max(window.close_s(rows), covered_s) + MARGIN_S
 
 
 def history_s(scene: Scene) -> float:
     """Duration of past states that a frame needs when it is due: longest exposure, latency, two control periods."""
     latency_s = scene.filter.latency_s if scene.filter else 0.0
-    window = exposure_window(scene, 0, longest_live_s(scene))
+    window = window_from(scene, 0.0, longest_live_s(scene))
     return (
         window.close_s(scene.camera.height_px)
-        - window.open_s
         + latency_s
         + 2 / scene.control_rate_hz
         + HISTORY_MARGIN_S

@@ -80,7 +80,7 @@ class PosedLive(Live):
     @property
     def greeting(self) -> dict[str, Any]:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
-        window = self.flight.schedules[0].window_until(0.0)
+        window = self.flight.schedules[0].window_to(0.0)
         return super().greeting | {"exposure_s": -window.open_s}
 
     def run(self) -> None:
@@ -117,7 +117,7 @@ class PosedLive(Live):
         values = pose_samples(pose, in_orbit)
         t_s = values["t_s"]
         close_s = float(t_s[-1])
-        window = schedule.window_until(close_s)
+        window = schedule.window_to(close_s)
         begin_s = max(self.closed_s, t_s[0])
         require_within("exposure's start", window.open_s, begin_s, LATEST_S)
         # 2. Place.

@@ -38,39 +38,48 @@ class ControlInput(NamedTuple):
     speeds_rad_s: Floats
 
 
-class Actuators(Protocol):
+@dataclass
+class Actuators:
     """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
+
+    It stores no momentum, its torque is proportional to its commands, and a command beyond the limit is clipped. Kinds
+    override what differs.
 
     Attributes
     ----------
     motor
         (n,) numbers of the commanded motors
+    torque_from_command, command_from_torque
+        (3, n) torques on the body per unit of command, and (n, 3) the reverse, with every gimbal at zero
+    limit
+        Greatest size of a command
     """
 
     motor: Ints
+    torque_from_command: Floats
+    command_from_torque: Floats
+    limit: float
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Write the commands into control; return the torque (3,) that they will give."""
-        ...
+        return self.command(control, self.command_from_torque @ torque_nm, inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
-        ...
+        control[self.motor] = given = np.clip(commands, -self.limit, self.limit)
+        return self.torque(given)
+
+    def torque(self, commands: Floats) -> Floats:
+        """Torque (3,) on the body of commands (n,)."""
+        return self.torque_from_command @ commands
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored angular momentum, in body axes."""
-        ...
+        return np.zeros(3)
 
     def command_map(self) -> tuple[Floats, float]:
-        """(n, 3) commands per unit of torque on the body, with every gimbal at zero, and the limit of a command."""
-        ...
-
-
-class MomentumFree:
-    """Actuators that store no momentum."""
-
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return np.zeros(3)
+        """The map from torques to commands, and the limit of a command."""
+        return self.command_from_torque, self.limit
 
 
 class ActuatorDrive(Protocol):
@@ -137,6 +146,11 @@ def scale_to_limit(command: Floats, limit: float) -> Floats:
     return command * (limit / peak if peak > limit else 1.0)
 
 
+def inverse(torque_from_command: Floats) -> Floats:
+    """(n, 3) pseudo-inverse of (3, n): the smallest commands that give a torque, or the nearest in least squares."""
+    return np.asarray(np.linalg.pinv(torque_from_command, rcond=RANK_TOLERANCE), np.float64)
+
+
 # Joints, sites and motors of actuators in the MuJoCo model.
 
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)
@@ -175,14 +189,12 @@ class Hinges:
         # The diagonal of the joint-space inertia matrix is the inertia about each axis.
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        names = sorted(
-            name for name in all_names(model.joint, model.njnt) if name.startswith(prefix)
-        )
+        names = sorted(all_names(model.joint, model.njnt, prefix))
         ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
         dof = model.jnt_dofadr[ids].astype(np.int64)
-        # A motor has the name of its joint.
-        actuators = all_names(model.actuator, model.nu)
-        motor = [actuators.index(name) if name in actuators else -1 for name in names]
+        # A motor has the name of its joint; MuJoCo gives -1 for a name that does not exist.
+        kind = mujoco.mjtObj.mjOBJ_ACTUATOR
+        motor = [mujoco.mj_name2id(model, kind, name) for name in names]
         return cls(
             tuple(names),
             data.xaxis[ids].T.copy(),
@@ -196,9 +208,9 @@ class Hinges:
         return len(self.names)
 
 
-def all_names(element: Any, count: int) -> list[str]:
-    """Names of all elements of one kind of a compiled model; `element` returns an element by its number."""
-    return [element(k).name for k in range(count)]
+def all_names(element: Any, count: int, prefix: str = "") -> list[str]:
+    """Names with a prefix of the elements of one kind of a compiled model; `element` returns one by its number."""
+    return [name for k in range(count) if (name := element(k).name).startswith(prefix)]
 
 
 def joints(spec: Any, prefix: str) -> list[Any]:
@@ -218,14 +230,13 @@ def sites(spec: Any, prefix: str) -> list[Any]:
 
 def add_motor(
     spec: Any,
-    name: str,
-    kind: Any,
     target: str,
     limit: float | None = None,
     gear: Sequence[float] = UNIT_GEAR,
+    kind: Any = mujoco.mjtTrn.mjTRN_JOINT,
 ) -> Any:
-    """Add a motor whose force is gear times its control; the control is limited to +-limit if one is given."""
-    motor = spec.add_actuator(name=name, trntype=kind, target=target, gear=gear)
+    """Add a motor with its target's name, whose force is gear times its control, limited to +-limit if one is given."""
+    motor = spec.add_actuator(name=target, trntype=kind, target=target, gear=gear)
     motor.set_to_motor()
     if limit is not None:
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_TRUE
@@ -233,8 +244,8 @@ def add_motor(
     return motor
 
 
-def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
-    """Add a servo of a joint, whose set-point is the integral of the commanded rate.
+def add_servos(spec: Any, model: Any, prefix: str, tau_s: float) -> None:
+    """Add a servo at each joint whose name begins with prefix; its set-point is the integral of the commanded rate.
 
     A critically damped spring pulls the joint to it with the time constant tau,
 
@@ -242,8 +253,12 @@ def add_servo(spec: Any, joint: str, inertia: float, tau_s: float) -> None:
 
     The inertia of a slide is its mass, and its angle a position.
     """
-    servo = spec.add_actuator(name=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint)
-    servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
+    inertias = Hinges.from_model(model, prefix).inertia_kg_m2
+    for joint, inertia in zip(joints(spec, prefix), inertias, strict=True):
+        servo = spec.add_actuator(
+            name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
+        )
+        servo.set_to_intvelocity(kp=inertia / tau_s**2, kv=2 * inertia / tau_s)
 
 
 def member_values(values: tuple[float, ...], count: int, key: str) -> Floats:

@@ -4,6 +4,7 @@ A new kind is a file beside this one, an entry in `KINDS`, and its section in sc
 vehicle places the actuators by the names of joints and sites; the scene sets their limits.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,10 @@ import mujoco
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
     ActuatorKind,
     Actuators,
-    ControlInput,
-    MomentumFree,
     add_motor,
     joints,
     sites,
@@ -36,60 +34,39 @@ TORQUES = ("torque_x", "torque_y", "torque_z")
 PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
 
 
-def kinds_on(vehicle: VehicleConfig) -> list[ActuatorKind]:
-    """The kinds that a scene switches on."""
-    return [kind for kind in KINDS if getattr(vehicle, kind.key) is not None]
+def kinds_on(vehicle: VehicleConfig) -> list[tuple[ActuatorKind, Any]]:
+    """The kinds that a scene switches on, each with its section."""
+    kinds = [(kind, getattr(vehicle, kind.key)) for kind in KINDS]
+    return [(kind, config) for kind, config in kinds if config is not None]
 
 
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
     motors = np.array([model.actuator(name).id for name in TORQUES])
-    found: dict[str, Actuators] = {"ideal": IdealTorque(motors, vehicle.torque_limit_nm)}
-    for kind in kinds_on(vehicle):
-        found[kind.key] = kind.control(model, getattr(vehicle, kind.key))
-    return found
+    ideal = Actuators(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    return {"ideal": ideal} | {
+        kind.key: kind.control(model, config) for kind, config in kinds_on(vehicle)
+    }
 
 
 def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
     """The hardware between commands and motors of all actuators that are switched on."""
-    return [
-        kind.drive(model, getattr(vehicle, kind.key))
-        for kind in kinds_on(vehicle)
-        if kind.drive
-    ]
+    return [kind.drive(model, config) for kind, config in kinds_on(vehicle) if kind.drive]
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
     """Set the angles and speeds of the actuators' joints in the data of a model to those at the scene's start."""
-    for kind in kinds_on(vehicle):
-        kind.start(model, data, getattr(vehicle, kind.key))
+    for kind, config in kinds_on(vehicle):
+        kind.start(model, data, config)
 
 
 def add_actuators(spec: Any, model: Any, vehicle: VehicleConfig) -> None:
     """Add three ideal torques and the motors of all actuators that are on; model is the compiled spec."""
     for name, axis in zip(TORQUES, np.eye(3), strict=True):
         # The motor of a ball joint acts about an axis of the body.
-        add_motor(spec, name, mujoco.mjtTrn.mjTRN_JOINT, "bearing", gear=[*axis, 0, 0, 0])
-    for kind in kinds_on(vehicle):
-        kind.add(spec, model, getattr(vehicle, kind.key))
-
-
-class IdealTorque(MomentumFree):
-    """Ideal actuator: torques about the body's axes, each clipped to a limit. The methods are those of `Actuators`."""
-
-    def __init__(self, motor: Ints, limit_nm: float) -> None:
-        self.motor = motor
-        self.limit_nm = limit_nm
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, torque_nm, inputs)
-
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        control[self.motor] = achieved_nm = np.clip(commands, -self.limit_nm, self.limit_nm)
-        return achieved_nm
-
-    def command_map(self) -> tuple[Floats, float]:
-        return np.eye(3), self.limit_nm
+        add_motor(spec, "bearing", gear=[*axis, 0, 0, 0]).name = name
+    for kind, config in kinds_on(vehicle):
+        kind.add(spec, model, config)
 
 
 def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]:
@@ -113,26 +90,28 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
             else:
                 check_joints(found, prefix, key, path)
     # 2. The kinds' own checks, and their sites.
-    for kind in kinds_on(vehicle):
+    for kind, _ in kinds_on(vehicle):
         kind.check(spec, path)
         for prefix in kind.sites:
             if not sites(spec, prefix):
                 raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
     # 3. Names of the motors that `add_actuators` adds.
     for actuator in spec.actuators:
+        problem = ""
         if actuator.name in TORQUES or actuator.name.startswith(PREFIXES):
-            problem = f"actuator {actuator.name}: an actuator of this name is added; remove it from the file"
-            raise InputError(path, problem)
-        if actuator.target.startswith(PREFIXES):
-            problem = (
-                f"actuator of {actuator.target} is set by the scene; remove it from the file"
-            )
-            raise InputError(path, problem)
+            problem = f"actuator {actuator.name}: an actuator of this name is added"
+        elif actuator.target.startswith(PREFIXES):
+            problem = f"actuator of {actuator.target} is set by the scene"
+        if problem:
+            raise InputError(path, f"{problem}; remove it from the file")
     return locked
 
 
 def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> None:
-    """Raise InputError if joints of an actuator are missing, have another type, or have properties (`check_bare`)."""
+    """Raise InputError if joints of an actuator are missing, have another type, or have properties of their own.
+
+    The scene sets their limit, spring, damping and drive.
+    """
     wanted = mujoco.mjtJoint.mjJNT_SLIDE if prefix == TRIM else mujoco.mjtJoint.mjJNT_HINGE
     if not found:
         raise InputError(path, f"no joint {prefix}*, which vehicle.{key} needs")
@@ -140,8 +119,15 @@ def check_joints(found: Sequence[Any], prefix: str, key: str, path: Path) -> Non
         raise InputError(
             path, f"joints {prefix}* must be {'slides' if prefix == TRIM else 'hinges'}"
         )
-    for joint in found:
-        check_bare(joint, path)
+    # Each of these would act in addition to the scene's values.
+    names = "range stiffness springref damping frictionloss armature actfrcrange"
+    for joint, name in itertools.product(found, names.split()):
+        if np.any(getattr(joint, name)):
+            in_file = name.replace("actfrc", "actuatorfrc")
+            raise InputError(
+                path,
+                f"joint {joint.name}: {in_file} is set by the scene; remove it from the file",
+            )
 
 
 def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
@@ -153,8 +139,8 @@ def locked_joint_hint(spec: Any, locked: dict[str, str]) -> str:
     named |= {
         name for equality in spec.equalities for name in (equality.name1, equality.name2)
     }
-    names = [name for name in locked if name in named]
-    return f"; {locked[names[0]]} is off, which locks joint {names[0]}" if names else ""
+    name = next((name for name in locked if name in named), "")
+    return name and f"; {locked[name]} is off, which locks joint {name}"
 
 
 def check_names(spec: Any, path: Path) -> None:
@@ -170,17 +156,4 @@ def check_names(spec: Any, path: Path) -> None:
                 path,
                 element.name,
                 f"{prefix}{element.name[len(prefix) - 1 :]}, or another word",
-            )
-
-
-def check_bare(joint: Any, path: Path) -> None:
-    """Raise InputError if the file gives an actuator's joint a limit, spring, damping or drive; the scene sets them."""
-    # Each of these would act in addition to the scene's values.
-    names = "range stiffness springref damping frictionloss armature actfrcrange"
-    for name in names.split():
-        if np.any(getattr(joint, name)):
-            in_file = name.replace("actfrc", "actuatorfrc")
-            raise InputError(
-                path,
-                f"joint {joint.name}: {in_file} is set by the scene; remove it from the file",
             )

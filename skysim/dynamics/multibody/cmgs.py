@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
@@ -27,10 +26,12 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     RANK_TOLERANCE,
     ActuatorKind,
+    Actuators,
     ControlInput,
     Hinges,
     add_motor,
-    add_servo,
+    add_servos,
+    inverse,
     joints,
     member_values,
     scale_to_limit,
@@ -64,15 +65,11 @@ def solve_gram(gram: Floats, rhs: Floats) -> Floats:
 
 @jit
 def gram_determinant(m: Floats) -> float:
-    """Determinant of A A^T (3, 3) by cofactors, clipped at zero against rounding.
+    """Determinant of A A^T (3, 3) as the triple product of its rows, clipped at zero against rounding.
 
     np.linalg.det takes several times as long.
     """
-    # Cofactors of the first row.
-    minor_0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
-    minor_1 = m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0]
-    minor_2 = m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0]
-    return max(m[0, 0] * minor_0 - m[0, 1] * minor_1 + m[0, 2] * minor_2, 0.0)
+    return max((m[0] * np.cross(m[1], m[2])).sum(), 0.0)
 
 
 @jit
@@ -229,8 +226,8 @@ class CmgSet:
         It is 1 if torque is equally easy in every direction, and 0 if there is no torque in one direction, or if the
         rotors are at rest. It does not depend on the size and number of the rotors.
         """
-        angle = np.asarray(angle_rad)[..., None, :]
-        spin = np.asarray(rotor_rad_s)[..., None, :]
+        angle = angle_rad[..., None, :]
+        spin = rotor_rad_s[..., None, :]
         cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
         jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
         gram = jacobian @ jacobian.swapaxes(-1, -2)
@@ -269,28 +266,30 @@ class CmgSet:
         if self.rotor_torque_limit_nm is not None:
             limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
             return vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
-        if unit_nms == 0:
-            return np.zeros_like(spin_nms), np.zeros_like(spin_nms)
-        rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
+        rate = np.zeros_like(spin_nms)
+        if unit_nms:
+            rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
         return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
 
 
-class CmgActuator:
+class CmgActuator(Actuators):
     """Actuators of the flight computer: control moment gyroscopes, see `CmgSet`."""
 
     def __init__(self, model: Any, config: CmgsConfig) -> None:
-        self.gimbals = Hinges.from_model(model, GIMBAL)
-        self.motor = self.gimbals.motor
-        self.rotors = Hinges.from_model(model, ROTOR)
-        self.rotor_rad_s = config.rotor_rpm * RPM_RAD_S
+        self.gimbals = gimbals = Hinges.from_model(model, GIMBAL)
+        self.rotors = rotors = Hinges.from_model(model, ROTOR)
+        limit_rad_s = math.radians(config.gimbal_rate_limit_deg_s)
         self.model = CmgSet(
-            self.gimbals.axes,
-            self.rotors.axes,
-            self.rotors.inertia_kg_m2,
-            math.radians(config.gimbal_rate_limit_deg_s),
+            gimbals.axes,
+            rotors.axes,
+            rotors.inertia_kg_m2,
+            limit_rad_s,
             config.rotor_torque_limit_nm,
             config.steering,
         )
+        speeds = np.full(len(rotors), config.rotor_rpm * RPM_RAD_S)
+        jacobian = self.model.jacobian(np.zeros(len(gimbals)), speeds)
+        super().__init__(gimbals.motor, -jacobian, inverse(-jacobian), limit_rad_s)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         angle = inputs.angles_rad[self.gimbals.qpos]
@@ -298,26 +297,18 @@ class CmgActuator:
         rate, torque = self.model.drive(
             torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s
         )
-        control[self.gimbals.motor] = rate
         # T = -A d(angle)/dt - sum axle u; the second term is the momentum of speeds u / inertia.
-        achieved_nm = -self.model.jacobian(angle, spin) @ rate
+        achieved_nm = self.command(control, rate, inputs)
         if self.model.rotor_torque_limit_nm is not None:
             control[self.rotors.motor] = torque
             achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
         return achieved_nm
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        limit_rad_s = self.model.gimbal_rate_limit_rad_s
-        control[self.gimbals.motor] = rate = np.clip(commands, -limit_rad_s, limit_rad_s)
+        super().command(control, commands, inputs)
         angle = inputs.angles_rad[self.gimbals.qpos]
-        return -self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof]) @ rate
-
-    def command_map(self) -> tuple[Floats, float]:
-        jacobian = self.model.jacobian(
-            np.zeros(len(self.gimbals)), np.full(len(self.rotors), self.rotor_rad_s)
-        )
-        rates_from_torque = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
-        return rates_from_torque, self.model.gimbal_rate_limit_rad_s
+        jacobian = self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
+        return -jacobian @ control[self.motor]
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(
@@ -345,19 +336,10 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     The spring of the servo holds the rate against gyroscopic torque from the vehicle's rotation. A damper alone would
     not hold it.
     """
-    for joint, inertia in zip(
-        joints(spec, GIMBAL), Hinges.from_model(model, GIMBAL).inertia_kg_m2, strict=True
-    ):
-        add_servo(spec, joint.name, inertia, cmgs.gimbal_time_constant_s)
+    add_servos(spec, model, GIMBAL, cmgs.gimbal_time_constant_s)
     for joint in joints(spec, ROTOR):
         if cmgs.rotor_torque_limit_nm:
-            add_motor(
-                spec,
-                joint.name,
-                mujoco.mjtTrn.mjTRN_JOINT,
-                joint.name,
-                cmgs.rotor_torque_limit_nm,
-            )
+            add_motor(spec, joint.name, cmgs.rotor_torque_limit_nm)
 
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:

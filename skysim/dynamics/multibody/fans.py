@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -11,13 +11,12 @@ import numpy as np
 
 from skysim.core.types import Floats, Ints
 from skysim.dynamics.multibody.actuator_kind import (
-    RANK_TOLERANCE,
     ActuatorKind,
     Actuators,
     ControlInput,
-    MomentumFree,
     add_motor,
     all_names,
+    inverse,
     scale_to_limit,
     sites,
 )
@@ -25,6 +24,8 @@ from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
 
 FAN = "fan_"
+
+NO_MOTORS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +54,7 @@ class Fans:
         """The sites whose name begins with prefix and that have an actuator."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        names = sorted(
-            name for name in all_names(model.actuator, model.nu) if name.startswith(prefix)
-        )
+        names = sorted(all_names(model.actuator, model.nu, prefix))
         sites = [model.site(name).id for name in names]
         # z axes of the sites; at zero joint angles lab and body axes coincide.
         axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
@@ -66,11 +65,12 @@ class Fans:
         return len(self.names)
 
 
-@dataclass(slots=True)
-class FanSet:
-    """A set of n fans, whose thrust has a lever arm about the bearing's center: T = sum position x axis thrust.
+class FanSet(Actuators):
+    """Actuators of the flight computer: n fans, commanded as if they had no lag.
 
-    Attributes
+    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust.
+
+    Parameters
     ----------
     force_axes
         (3, n) unit vectors along which a positive thrust pushes the body, in body axes
@@ -78,25 +78,19 @@ class FanSet:
         (3, n) positions from the center of rotation, in body axes
     thrust_limit_n
         Greatest thrust of each fan
-    torque_per_thrust_m, thrust_from_torque
-        (3, n) lever arms in N m per N, and their pseudo-inverse (n, 3)
+    motor
+        Numbers of the motors; none without a model
     """
 
-    force_axes: Floats
-    positions_m: Floats
-    thrust_limit_n: float
-    torque_per_thrust_m: Floats = field(init=False, repr=False)
-    thrust_from_torque: Floats = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self.torque_per_thrust_m = np.cross(self.positions_m, self.force_axes, axis=0)
-        self.thrust_from_torque = np.asarray(
-            np.linalg.pinv(self.torque_per_thrust_m, rcond=RANK_TOLERANCE), np.float64
-        )
-
-    def torque(self, thrust_n: Floats) -> Floats:
-        """Torque (3,) on the body of thrusts (n,)."""
-        return self.torque_per_thrust_m @ thrust_n
+    def __init__(
+        self,
+        force_axes: Floats,
+        positions_m: Floats,
+        thrust_limit_n: float,
+        motor: Ints = NO_MOTORS,
+    ) -> None:
+        lever_m = np.cross(positions_m, force_axes, axis=0)
+        super().__init__(motor, lever_m, inverse(lever_m), thrust_limit_n)
 
     def drive(self, torque_nm: Floats) -> Floats:
         """The smallest thrusts (n,) that give the torque (3,), or the nearest to it in least squares.
@@ -104,28 +98,16 @@ class FanSet:
         One factor scales all thrusts to the limit, which keeps the direction of the torque. Each fan can blow either
         way. The bearing takes the net force.
         """
-        return scale_to_limit(self.thrust_from_torque @ torque_nm, self.thrust_limit_n)
-
-
-class FanActuator(MomentumFree):
-    """Actuators of the flight computer: fans, commanded as if they had no lag; see `FanSet`."""
-
-    def __init__(self, model: Any, config: FansConfig) -> None:
-        fans = Fans.from_model(model)
-        self.motor = fans.motor
-        self.lag_s = config.time_constant_s
-        self.model = FanSet(fans.axes, fans.positions_m, config.thrust_limit_n)
+        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, self.model.drive(torque_nm), inputs)
+        return self.command(control, self.drive(torque_nm), inputs)
 
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        limit_n = self.model.thrust_limit_n
-        control[self.motor] = thrust = np.clip(commands, -limit_n, limit_n)
-        return self.model.torque(thrust)
 
-    def command_map(self) -> tuple[Floats, float]:
-        return self.model.thrust_from_torque, self.model.thrust_limit_n
+def fan_actuators(model: Any, config: FansConfig) -> FanSet:
+    """The fans of a compiled model."""
+    fans = Fans.from_model(model)
+    return FanSet(fans.axes, fans.positions_m, config.thrust_limit_n, fans.motor)
 
 
 @dataclass(slots=True)
@@ -154,10 +136,10 @@ class Desaturator:
 class MomentumDump:
     """Momentum dumping by fans, with a model of their lag."""
 
-    def __init__(self, fans: Actuators, desaturator: Desaturator) -> None:
-        assert isinstance(fans, FanActuator)
+    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
         self.fans = fans
-        self.desaturator = desaturator
+        self.lag_s = lag_s
+        self.desaturator = Desaturator(config)
         self.fan_torque_nm = np.zeros(3)
 
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
@@ -169,15 +151,14 @@ class MomentumDump:
         # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
         # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
-            -inputs.period_s / self.fans.lag_s
+            -inputs.period_s / self.lag_s
         )
         return present_nm
 
 
 def add_force(spec: Any, site: str, limit_n: float) -> Any:
     """Add a force along z of a site."""
-    site_type = mujoco.mjtTrn.mjTRN_SITE
-    return add_motor(spec, site, site_type, site, limit_n, [0, 0, 1, 0, 0, 0])
+    return add_motor(spec, site, limit_n, [0, 0, 1, 0, 0, 0], mujoco.mjtTrn.mjTRN_SITE)
 
 
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
@@ -189,4 +170,4 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
         fan.dynprm[0] = config.time_constant_s
 
 
-FANS = ActuatorKind("fans", add_fans, FanActuator, sites=(FAN,))
+FANS = ActuatorKind("fans", add_fans, fan_actuators, sites=(FAN,))

@@ -26,7 +26,6 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     ControlInput,
-    MomentumFree,
     scale_to_limit,
     sites,
 )
@@ -40,7 +39,7 @@ SHARING = 1e-4
 SHORTEST_LAG_S = 1e-15  # stands for no lag
 
 
-class ThrusterActuator(MomentumFree):
+class ThrusterActuator(FanSet):
     """Actuators of the flight computer: one-sided thrusters, commanded as if their thrust were continuous.
 
     Parameters
@@ -53,12 +52,22 @@ class ThrusterActuator(MomentumFree):
 
     def __init__(self, model: Any, config: ThrustersConfig) -> None:
         thrusters = Fans.from_model(model, THRUSTER)
-        self.motor = thrusters.motor
-        self.model = FanSet(thrusters.axes, thrusters.positions_m, config.thrust_n)
-        lever_m = self.model.torque_per_thrust_m
+        super().__init__(
+            thrusters.axes, thrusters.positions_m, config.thrust_n, thrusters.motor
+        )
+        lever_m = self.torque_from_command
         self.weighted_m = np.vstack(
             (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(thrusters)))
         )
+        # The map is that of thrusters that push both ways, scaled to the greatest thrust of one-sided ones. The scale
+        # is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
+        both_ways = self.command_from_torque
+        scales = [
+            self.thrusts(torque).max() / np.abs(both_ways @ torque).max()
+            for torque in map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=3))
+            if (both_ways @ torque).any()
+        ]
+        self.command_from_torque = both_ways * max(scales, default=1.0)
 
     def thrusts(self, torque_nm: Floats) -> Floats:
         """The smallest thrusts (n,) f >= 0 that give the torque (3,) T, or the nearest to it, without a limit.
@@ -68,26 +77,12 @@ class ThrusterActuator(MomentumFree):
         """
         return nnls(self.weighted_m, np.append(torque_nm, np.zeros(len(self.motor))))[0]
 
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        thrust = scale_to_limit(self.thrusts(torque_nm), self.model.thrust_limit_n)
-        return self.command(control, thrust, inputs)
+    def drive(self, torque_nm: Floats) -> Floats:
+        """The thrusts, scaled to the limit by one factor."""
+        return scale_to_limit(self.thrusts(torque_nm), self.limit)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        control[self.motor] = thrust = np.clip(commands, 0.0, self.model.thrust_limit_n)
-        return self.model.torque(thrust)
-
-    def command_map(self) -> tuple[Floats, float]:
-        """As of thrusters that pushed both ways, scaled so that the greatest thrust is that of one-sided ones.
-
-        The scale is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
-        """
-        both_ways = self.model.thrust_from_torque
-        scales = [
-            self.thrusts(torque).max() / np.abs(both_ways @ torque).max()
-            for torque in map(np.array, itertools.product((-1.0, 0.0, 1.0), repeat=3))
-            if (both_ways @ torque).any()
-        ]
-        return both_ways * max(scales, default=1.0), self.model.thrust_limit_n
+        return super().command(control, np.maximum(commands, 0.0), inputs)
 
 
 def propellant_kg(impulse_ns: Floats, config: ThrustersConfig) -> Floats:

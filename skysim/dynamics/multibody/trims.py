@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
-    RANK_TOLERANCE,
     ActuatorKind,
+    Actuators,
     ControlInput,
     Hinges,
-    MomentumFree,
-    add_servo,
-    joints,
+    add_servos,
+    inverse,
 )
 from skysim.scene.sections.vehicle import TrimsConfig
 
@@ -57,7 +56,7 @@ class TrimMotors:
         self.config = config
         self.slides = Hinges.from_model(model, TRIM)
         self.motor = self.slides.motor
-        self.start_m = model.qpos0[self.slides.qpos].copy()
+        self.start_m = model.qpos0[self.slides.qpos]
         self.position_m = self.start_m
 
     def moved(self, displacement_m: Floats, times_s: Floats) -> Floats:
@@ -69,33 +68,33 @@ class TrimMotors:
         return self.position_m + np.clip(wanted_m - self.position_m, -reach_m, reach_m)
 
 
-class TrimActuator(TrimMotors, MomentumFree):
+class TrimActuator(TrimMotors, Actuators):
     """Actuators of the flight computer: trim masses. A command is a displacement from the position at the start.
 
     The computer measures the vertical as an inclinometer without errors would.
     """
 
-    def levers_n(self, angles_rad: Floats) -> tuple[Floats, Floats]:
-        """(3, n) torque on the body for each displacement, m a x g, at a full qpos, and its pseudo-inverse (n, 3)."""
+    def __init__(self, model: Any, config: TrimsConfig) -> None:
+        TrimMotors.__init__(self, model, config)
+        lever_n = self.levers_n(model.qpos0)
+        Actuators.__init__(self, self.motor, lever_n, inverse(lever_n), config.travel_m)
+
+    def levers_n(self, angles_rad: Floats) -> Floats:
+        """(3, n) torque on the body for each displacement, m a x g, at a full qpos."""
         gravity = gravity_body_m_s2(self.model, angles_rad)
         # The inertia of a slide is its mass.
-        lever_n = np.cross(self.slides.axes.T, gravity).T * self.slides.inertia_kg_m2
-        return lever_n, np.asarray(np.linalg.pinv(lever_n, rcond=RANK_TOLERANCE), np.float64)
+        return np.cross(self.slides.axes.T, gravity).T * self.slides.inertia_kg_m2
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Command the smallest displacements that give the torque, or the nearest to it in least squares."""
-        _, displacement_from_torque = self.levers_n(inputs.angles_rad)
-        return self.command(control, displacement_from_torque @ torque_nm, inputs)
+        displacement_m = inverse(self.levers_n(inputs.angles_rad)) @ torque_nm
+        return self.command(control, displacement_m, inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The torque returned is that of the displacements in reach of a period."""
         control[self.motor] = commands
         self.position_m = self.moved(commands, np.array(inputs.period_s))
-        lever_n, _ = self.levers_n(inputs.angles_rad)
-        return np.asarray(lever_n @ (self.position_m - self.start_m))
-
-    def command_map(self) -> tuple[Floats, float]:
-        return self.levers_n(self.model.qpos0)[1], self.config.travel_m
+        return self.levers_n(inputs.angles_rad) @ (self.position_m - self.start_m)
 
 
 class TrimDrive(TrimMotors):
@@ -132,10 +131,8 @@ class TrimDrive(TrimMotors):
 
 
 def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
-    """Add a servo at each slide, critically damped, whose set-point is the integral of its control."""
-    masses_kg = Hinges.from_model(model, TRIM).inertia_kg_m2
-    for joint, mass_kg in zip(joints(spec, TRIM), masses_kg, strict=True):
-        add_servo(spec, joint.name, mass_kg, SERVO_S)
+    """Add a servo at each slide."""
+    add_servos(spec, model, TRIM, SERVO_S)
 
 
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:

@@ -15,17 +15,17 @@ A wheel at rest, or whose speed crosses zero, sticks while the torque on its bea
 from dataclasses import dataclass, field
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
-    RANK_TOLERANCE,
     ActuatorKind,
+    Actuators,
     ControlInput,
     Hinges,
     add_motor,
+    inverse,
     joints,
     member_values,
     scale_to_limit,
@@ -65,9 +65,7 @@ class WheelSet:
 
     def __post_init__(self) -> None:
         # T = -axes u, solved for u.
-        self.motor_from_torque = np.asarray(
-            -np.linalg.pinv(self.axes, rcond=RANK_TOLERANCE), np.float64
-        )
+        self.motor_from_torque = -inverse(self.axes)
 
     def momentum(self, speed_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of wheels at speeds (n,) relative to the body: h = sum axis inertia speed."""
@@ -85,44 +83,35 @@ class WheelSet:
         return self.within_limits(motor, speed_rad_s, period_s)
 
     def within_limits(self, motor_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
-        """Motor torques (n,), each clipped to its limit and to what just reaches the speed limit within period_s.
+        """Motor torques (n,), each clipped to what just reaches the speed limit within period_s.
 
         By inertia d(speed)/dt = u, without the body's own acceleration. A wheel at its limit can only be braked.
         """
-        motor = np.clip(motor_nm, -self.torque_limit_nm, self.torque_limit_nm)
         torque_per_speed = self.inertia_kg_m2 / period_s
         upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speed_rad_s), 0.0)
         lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speed_rad_s), 0.0)
-        return np.minimum(np.maximum(motor, lower), upper)
+        return np.clip(motor_nm, lower, upper)
 
 
-class WheelActuator:
+class WheelActuator(Actuators):
     """Actuators of the flight computer: reaction wheels, see `WheelSet`."""
 
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.joints = hinges = Hinges.from_model(model, WHEEL)
-        self.motor = hinges.motor
+        limit_nm = config.torque_limit_nm
         limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
-        self.model = WheelSet(
-            hinges.axes, hinges.inertia_kg_m2, config.torque_limit_nm, limit_rad_s
-        )
+        self.model = WheelSet(hinges.axes, hinges.inertia_kg_m2, limit_nm, limit_rad_s)
+        super().__init__(hinges.motor, -hinges.axes, self.model.motor_from_torque, limit_nm)
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        motor = self.model.drive(
-            torque_nm, inputs.speeds_rad_s[self.joints.dof], inputs.period_s
-        )
-        control[self.joints.motor] = motor
-        return -self.model.axes @ motor
+        speeds = inputs.speeds_rad_s[self.joints.dof]
+        motor = self.model.drive(torque_nm, speeds, inputs.period_s)
+        return super().command(control, motor, inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         speeds = inputs.speeds_rad_s[self.joints.dof]
-        control[self.joints.motor] = motor = self.model.within_limits(
-            commands, speeds, inputs.period_s
-        )
-        return -self.model.axes @ motor
-
-    def command_map(self) -> tuple[Floats, float]:
-        return self.model.motor_from_torque, self.model.torque_limit_nm
+        motor = self.model.within_limits(commands, speeds, inputs.period_s)
+        return super().command(control, motor, inputs)
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         return self.model.momentum(speeds_rad_s[self.joints.dof])
@@ -169,7 +158,7 @@ class Stiction:
         # A wheel comes to rest where its speed changes sign, or by friction alone, which lets it creep to zero.
         rests = self.sticks | (np.abs(speed) < REST_RAD_S) | (speed * self.before_rad_s < 0)
         self.sticks = rests & (np.abs(load_nm) <= self.config.stiction_nm)
-        self.before_rad_s = speed.copy()
+        self.before_rad_s = speed
         self.model.dof_frictionloss[self.joints.dof] = np.where(
             self.sticks, self.config.stiction_nm, self.config.coulomb_nm
         )
@@ -183,9 +172,7 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
         if wheels.stiction_nm:
             joint.solref_friction, joint.solimp_friction = HARD_FRICTION
-        add_motor(
-            spec, joint.name, mujoco.mjtTrn.mjTRN_JOINT, joint.name, wheels.torque_limit_nm
-        )
+        add_motor(spec, joint.name, wheels.torque_limit_nm)
 
 
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
