@@ -175,13 +175,17 @@ class Bundle:
             loss += float(np.sum(self.assumed.weight * self.assumed.less(self) ** 2))
         return loss, weight
 
+    def equations(self, sightings: Sightings, weight: Floats) -> NormalEquations:
+        """Return the `normal_equations`; the lights are the unknowns in separate blocks."""
+        return normal_equations(self, sightings, weight)
+
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """Return the bundle after a step.
 
         Parameters
         ----------
         led
-            (3 N,) changes of the positions, m
+            (3 N,) changes of the positions, m; (3,) of all alike
         rest
             (R,) 3 F components of small rotations in body axes (rad), 3 changes of the lever (m),
             changes of the free lens elements
@@ -317,9 +321,8 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     by_rest = _append_dense(by_rotation, shared)
     residual = (terms.residual * root[:, 0]).ravel()
     # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
-    blocks = np.zeros((lights, 3, 3))
     products = np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
-    np.add.at(blocks, sightings.led, products)
+    blocks = summed(products, sightings.led, lights)
     rest = (by_rest.T @ by_rest).toarray()
     rhs_rest = by_rest.T @ residual
     # Prior of the map
@@ -332,6 +335,13 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
         rhs_rest[known] += bundle.assumed.weight * bundle.assumed.less(bundle)
     coupling = csr_array(by_rest.T @ by_led)
     return NormalEquations(blocks, coupling, rest, by_led.T @ residual + from_map, rhs_rest)
+
+
+def summed(parts: Floats, row: Ints, count: int) -> Floats:
+    """Return the (count, ...) sums of the (M, ...) parts that belong to each row."""
+    total = np.zeros((count, *parts.shape[1:]))
+    np.add.at(total, row, parts)
+    return total
 
 
 def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:
@@ -454,7 +464,7 @@ def adjust(
     damping = 1e-4
     cost, weight = bundle.cost(sightings, width)
     # 1. and 2. Linearize, and sum the normal equations.
-    terms = normal_equations(bundle, sightings, weight)
+    terms = bundle.equations(sightings, weight)
     for _ in range(STEPS):
         # 3. and 4. Eliminate the lights, solve, and substitute back. More damping makes a matrix regular.
         try:
@@ -475,12 +485,26 @@ def adjust(
             # 6. Convergence
             if slope < decrement:
                 return bundle, True
-            terms = normal_equations(bundle, sightings, new_weight)
+            terms = bundle.equations(sightings, new_weight)
         else:
             damping *= 10
             if damping > 1e12:
                 break
     return bundle, False
+
+
+def attitude_equations(
+    terms: Linearization, sightings: Sightings, weight: Floats, frames: int
+) -> tuple[Floats, Floats]:
+    """Return the normal equations of each frame's attitude: (F, 3, 3) matrices and (F, 3) right-hand sides.
+
+    A frame without sightings has the identity, which gives it a step of zero.
+    """
+    weighted = weight[:, None, None] * terms.by_rotation
+    matrix = summed(terms.by_rotation.mT @ weighted, sightings.frame, frames)
+    matrix[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(3)
+    gradients = np.einsum("mai,ma->mi", weighted, terms.residual)
+    return matrix, summed(gradients, sightings.frame, frames)
 
 
 def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
@@ -489,21 +513,13 @@ def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
     The weights are Cauchy's, with the median residual (at least 1 sigma) as width.
     """
     frames = len(bundle.R_body_from_lab)
-    no_step = np.zeros(3 * len(bundle.position_m))
-    rest = np.zeros(3 * frames + 3 + bundle.free_lens)
+    others = np.zeros(3 + bundle.free_lens)
     for _ in range(rounds):
         terms = linearize(bundle, sightings)
         squared = np.sum(terms.residual**2, axis=1)
         width = max(1.0, float(np.sqrt(np.median(squared))))
         _, weight = cauchy(squared, width)
-        # Normal equations of each frame: 3 x 3
-        by = terms.by_rotation
-        matrix = np.zeros((frames, 3, 3))
-        products = weight[:, None, None] * np.einsum("mai,maj->mij", by, by)
-        np.add.at(matrix, sightings.frame, products)
-        rhs = np.zeros((frames, 3))
-        gradients = weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual)
-        np.add.at(rhs, sightings.frame, gradients)
-        rest[: 3 * frames] = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
-        bundle = bundle.apply_step(no_step, rest)
+        matrix, rhs = attitude_equations(terms, sightings, weight, frames)
+        turn = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
+        bundle = Bundle.apply_step(bundle, np.zeros(3), np.append(turn, others))
     return bundle

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
+from estimator.calibration.bundle_adjustment import summed
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints
@@ -289,8 +290,8 @@ def _covariance(value: Floats, group: Ints) -> Floats:
     # Deviations from each group's mean
     mean = np.array([np.bincount(group, column) for column in value.T]) / np.maximum(count, 1)
     difference = value - mean.T[group]
-    covariance = np.zeros((len(count), *2 * value.shape[1:]))
-    np.add.at(covariance, group, np.einsum("si,sj->sij", difference, difference))
+    products = np.einsum("si,sj->sij", difference, difference)
+    covariance = summed(products, group, len(count))
     covariance[count < 2] = np.nan
     return covariance / np.maximum(count - 1, 1)[:, None, None]
 
