@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array, csr_array, hstack
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -318,7 +318,7 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
     by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
-    by_rest = _append_dense(by_rotation, shared)
+    by_rest = hstack([by_rotation, csr_array(shared)], format="csr")
     residual = (terms.residual * root[:, 0]).ravel()
     # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
     products = np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
@@ -348,20 +348,6 @@ def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:
     """Return a sparse (2 M, width) matrix of (M, 2, 3) blocks: block m begins at row 2 m, column 3 column[m]."""
     start = np.arange(len(blocks) + 1)
     return csr_array(bsr_array((blocks, column, start), shape=(2 * len(blocks), width)))
-
-
-def _append_dense(left: csr_array, right: Floats) -> csr_array:
-    """Return the sparse matrix [left, right] of a sparse and a dense one; all rows of `left` hold equal numbers."""
-    count, width = right.shape
-    per_row = np.diff(left.indptr)[0]
-    # Data and column numbers of each row, one after the other.
-    data = np.hstack([left.data.reshape(count, per_row), right])
-    columns = np.tile(np.arange(width) + left.shape[1], (count, 1))
-    index = np.hstack([left.indices.reshape(count, per_row), columns])
-    start = np.arange(count + 1) * (per_row + width)
-    return csr_array(
-        (data.ravel(), index.ravel(), start), shape=(count, left.shape[1] + width)
-    )
 
 
 class ReducedSystem(NamedTuple):

@@ -216,19 +216,18 @@ def _lab_positions(
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
         _check(index, sighting)
-    body_m = []
-    lab_m = []
-    for sighting in sightings:
-        point_body = body_positions(sighting.xy_px, camera, surface, lever)
-        body_m.append(point_body)
-        lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
-    all_ids = np.concatenate([sighting.led for sighting in sightings])
-    id_, led = np.unique(all_ids, return_inverse=True)
     frame = np.repeat(np.arange(len(sightings)), lights)
     stop = np.repeat([sighting.stop for sighting in sightings], lights)
-    brightness = np.concatenate([sighting.brightness for sighting in sightings])
-    return id_, _Samples(led, frame, stop, np.vstack(body_m), np.vstack(lab_m), brightness)
+    ids, xy_px, brightness = (
+        np.concatenate([getattr(sighting, name) for sighting in sightings])
+        for name in ("led", "xy_px", "brightness")
+    )
+    id_, led = np.unique(ids, return_inverse=True)
+    body_m = body_positions(xy_px, camera, surface, lever)
+    attitudes = Rotation.concatenate([sighting.body_from_lab for sighting in sightings])
+    lab_m = attitudes[frame].inv().apply(body_m)
+    return id_, _Samples(led, frame, stop, body_m, lab_m, brightness)
 
 
 def _check(index: int, sighting: Sighting) -> None:

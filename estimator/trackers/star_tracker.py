@@ -35,13 +35,10 @@ from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of
 from estimator.identification import star_evidence, star_quads, star_search
-from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import (
     BUDGET,
     FALSE_LIGHTS,
-    NO_LIGHTS,
     NO_MATCH,
-    NO_STARS,
     WRONG_SCALE,
     advice,
 )
@@ -322,8 +319,6 @@ class StarTracker(FrameTracker):
                 True,
             )
         clock = clock or Clock()
-        if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lights = Lights(
             self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
