@@ -85,15 +85,15 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     """
     excess = lights.misfit - lights.misfit.min(axis=1, keepdims=True)
     # 1. Two lights.
-    first, second = _best_pair(lights.ray, excess)
+    pair = _best_pair(lights.ray, excess)
     # 2. and 3. Their names, and the attitudes.
-    names, R_cam_from_lab = _hypotheses(lights, sphere, excess, (first, second))
+    names, R_cam_from_lab = _hypotheses(lights, sphere, excess, pair)
     if not len(names):
         return CONTRADICTED
     if len(names) >= MAX_HYPOTHESES:
         return UNDECIDED
     # 4. The names of the other lights.
-    total, star = _evaluate(lights, sphere, excess, R_cam_from_lab, (first, second), names)
+    total, star = _evaluate(lights, sphere, excess, R_cam_from_lab, pair, names)
     # 5. Refuse unless one hypothesis is clearly the best, and agrees with the codes and with most of the lights.
     order = np.argsort(total)
     best = order[0]
