@@ -107,7 +107,7 @@ def with_rivals(
                 center_px=lens.center_px,
                 distortion=lens.distortion,
                 aspect=lens.aspect,
-                zero_point_mag=np.mean(zero_mag),
+                zero_point_mag=float(np.mean(zero_mag)),
                 magnitude_sigma=hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
             )
             detections = chosen(detections_of(lights, view, 0.0), rest)
