@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array, csr_array, hstack
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -175,13 +175,17 @@ class Bundle:
             loss += float(np.sum(self.assumed.weight * self.assumed.less(self) ** 2))
         return loss, weight
 
+    def equations(self, sightings: Sightings, weight: Floats) -> NormalEquations:
+        """Return the `normal_equations`; the lights are the unknowns in separate blocks."""
+        return normal_equations(self, sightings, weight)
+
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """Return the bundle after a step.
 
         Parameters
         ----------
         led
-            (3 N,) changes of the positions, m
+            (3 N,) changes of the positions, m; (3,) of all alike
         rest
             (R,) 3 F components of small rotations in body axes (rad), 3 changes of the lever (m),
             changes of the free lens elements
@@ -314,12 +318,11 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
     by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
     shared = (terms.by_shared * root).reshape(2 * count, -1)
-    by_rest = _append_dense(by_rotation, shared)
+    by_rest = hstack([by_rotation, csr_array(shared)], format="csr")
     residual = (terms.residual * root[:, 0]).ravel()
     # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
-    blocks = np.zeros((lights, 3, 3))
     products = np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
-    np.add.at(blocks, sightings.led, products)
+    blocks = summed(products, sightings.led, lights)
     rest = (by_rest.T @ by_rest).toarray()
     rhs_rest = by_rest.T @ residual
     # Prior of the map
@@ -334,24 +337,17 @@ def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> No
     return NormalEquations(blocks, coupling, rest, by_led.T @ residual + from_map, rhs_rest)
 
 
+def summed(parts: Floats, row: Ints, count: int) -> Floats:
+    """Return the (count, ...) sums of the (M, ...) parts that belong to each row."""
+    total = np.zeros((count, *parts.shape[1:]))
+    np.add.at(total, row, parts)
+    return total
+
+
 def _block_matrix(blocks: Floats, column: Ints, width: int) -> csr_array:
     """Return a sparse (2 M, width) matrix of (M, 2, 3) blocks: block m begins at row 2 m, column 3 column[m]."""
     start = np.arange(len(blocks) + 1)
     return csr_array(bsr_array((blocks, column, start), shape=(2 * len(blocks), width)))
-
-
-def _append_dense(left: csr_array, right: Floats) -> csr_array:
-    """Return the sparse matrix [left, right] of a sparse and a dense one; all rows of `left` hold equal numbers."""
-    count, width = right.shape
-    per_row = np.diff(left.indptr)[0]
-    # Data and column numbers of each row, one after the other.
-    data = np.hstack([left.data.reshape(count, per_row), right])
-    columns = np.tile(np.arange(width) + left.shape[1], (count, 1))
-    index = np.hstack([left.indices.reshape(count, per_row), columns])
-    start = np.arange(count + 1) * (per_row + width)
-    return csr_array(
-        (data.ravel(), index.ravel(), start), shape=(count, left.shape[1] + width)
-    )
 
 
 class ReducedSystem(NamedTuple):
@@ -454,7 +450,7 @@ def adjust(
     damping = 1e-4
     cost, weight = bundle.cost(sightings, width)
     # 1. and 2. Linearize, and sum the normal equations.
-    terms = normal_equations(bundle, sightings, weight)
+    terms = bundle.equations(sightings, weight)
     for _ in range(STEPS):
         # 3. and 4. Eliminate the lights, solve, and substitute back. More damping makes a matrix regular.
         try:
@@ -475,12 +471,26 @@ def adjust(
             # 6. Convergence
             if slope < decrement:
                 return bundle, True
-            terms = normal_equations(bundle, sightings, new_weight)
+            terms = bundle.equations(sightings, new_weight)
         else:
             damping *= 10
             if damping > 1e12:
                 break
     return bundle, False
+
+
+def attitude_equations(
+    terms: Linearization, sightings: Sightings, weight: Floats, frames: int
+) -> tuple[Floats, Floats]:
+    """Return the normal equations of each frame's attitude: (F, 3, 3) matrices and (F, 3) right-hand sides.
+
+    A frame without sightings has the identity, which gives it a step of zero.
+    """
+    weighted = weight[:, None, None] * terms.by_rotation
+    matrix = summed(terms.by_rotation.mT @ weighted, sightings.frame, frames)
+    matrix[np.bincount(sightings.frame, minlength=frames) == 0] = np.eye(3)
+    gradients = np.einsum("mai,ma->mi", weighted, terms.residual)
+    return matrix, summed(gradients, sightings.frame, frames)
 
 
 def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
@@ -489,21 +499,13 @@ def fit_attitudes(bundle: Bundle, sightings: Sightings, rounds: int) -> Bundle:
     The weights are Cauchy's, with the median residual (at least 1 sigma) as width.
     """
     frames = len(bundle.R_body_from_lab)
-    no_step = np.zeros(3 * len(bundle.position_m))
-    rest = np.zeros(3 * frames + 3 + bundle.free_lens)
+    others = np.zeros(3 + bundle.free_lens)
     for _ in range(rounds):
         terms = linearize(bundle, sightings)
         squared = np.sum(terms.residual**2, axis=1)
         width = max(1.0, float(np.sqrt(np.median(squared))))
         _, weight = cauchy(squared, width)
-        # Normal equations of each frame: 3 x 3
-        by = terms.by_rotation
-        matrix = np.zeros((frames, 3, 3))
-        products = weight[:, None, None] * np.einsum("mai,maj->mij", by, by)
-        np.add.at(matrix, sightings.frame, products)
-        rhs = np.zeros((frames, 3))
-        gradients = weight[:, None] * np.einsum("mai,ma->mi", by, terms.residual)
-        np.add.at(rhs, sightings.frame, gradients)
-        rest[: 3 * frames] = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
-        bundle = bundle.apply_step(no_step, rest)
+        matrix, rhs = attitude_equations(terms, sightings, weight, frames)
+        turn = np.linalg.solve(matrix, rhs[:, :, None]).ravel()
+        bundle = Bundle.apply_step(bundle, np.zeros(3), np.append(turn, others))
     return bundle

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, on_surface
 from estimator.attitude.nearfield import thesis_points
+from estimator.calibration.bundle_adjustment import summed
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints
@@ -215,19 +216,18 @@ def _lab_positions(
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
         _check(index, sighting)
-    body_m = []
-    lab_m = []
-    for sighting in sightings:
-        point_body = body_positions(sighting.xy_px, camera, surface, lever)
-        body_m.append(point_body)
-        lab_m.append(sighting.body_from_lab.inv().apply(point_body))
     lights = [len(sighting.led) for sighting in sightings]
-    all_ids = np.concatenate([sighting.led for sighting in sightings])
-    id_, led = np.unique(all_ids, return_inverse=True)
     frame = np.repeat(np.arange(len(sightings)), lights)
     stop = np.repeat([sighting.stop for sighting in sightings], lights)
-    brightness = np.concatenate([sighting.brightness for sighting in sightings])
-    return id_, _Samples(led, frame, stop, np.vstack(body_m), np.vstack(lab_m), brightness)
+    ids, xy_px, brightness = (
+        np.concatenate([getattr(sighting, name) for sighting in sightings])
+        for name in ("led", "xy_px", "brightness")
+    )
+    id_, led = np.unique(ids, return_inverse=True)
+    body_m = body_positions(xy_px, camera, surface, lever)
+    attitudes = Rotation.concatenate([sighting.body_from_lab for sighting in sightings])
+    lab_m = attitudes[frame].inv().apply(body_m)
+    return id_, _Samples(led, frame, stop, body_m, lab_m, brightness)
 
 
 def _check(index: int, sighting: Sighting) -> None:
@@ -289,8 +289,8 @@ def _covariance(value: Floats, group: Ints) -> Floats:
     # Deviations from each group's mean
     mean = np.array([np.bincount(group, column) for column in value.T]) / np.maximum(count, 1)
     difference = value - mean.T[group]
-    covariance = np.zeros((len(count), *2 * value.shape[1:]))
-    np.add.at(covariance, group, np.einsum("si,sj->sij", difference, difference))
+    products = np.einsum("si,sj->sij", difference, difference)
+    covariance = summed(products, group, len(count))
     covariance[count < 2] = np.nan
     return covariance / np.maximum(count - 1, 1)[:, None, None]
 

@@ -385,12 +385,13 @@ class EquationsOfMotion:
             c = self.slope(t_s + h / 2, moved_on(now, b, h / 2))
             d = self.slope(t_s + h, moved_on(now, c, h))
             # y + h / 6 (a + 2 b + 2 c + d); the quaternion is normalized.
-            q, momentum = (
-                old + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-                for old, k1, k2, k3, k4 in zip(
-                    now[:2], a[:2], b[:2], c[:2], d[:2], strict=True
+            slope = States(
+                *(
+                    (k1 + 2 * k2 + 2 * k3 + k4) / 6
+                    for k1, k2, k3, k4 in zip(a, b, c, d, strict=True)
                 )
             )
+            q, momentum, _ = moved_on(now, slope, h)
             states = States(q / np.sqrt(np.sum(q * q, axis=0)), momentum, decay * last)
         return states
 

@@ -386,14 +386,19 @@ def filter_mass(
 
 def cut(record: BearingRecord, which: slice) -> BearingRecord:
     """Return the record with some of its attitudes."""
-    names = ("covariance_rad2", "systematic_rad2", "constant_rad2", "lights")
+    names = (
+        "t_s",
+        "lab_from_body",
+        "covariance_rad2",
+        "systematic_rad2",
+        "constant_rad2",
+        "lights",
+    )
     parts: dict[str, Any] = {
         name: None if (part := getattr(record, name)) is None else part[which]
         for name in names
     }
-    return replace(
-        record, t_s=record.t_s[which], lab_from_body=record.lab_from_body[which], **parts
-    )
+    return replace(record, **parts)
 
 
 def filter_from(

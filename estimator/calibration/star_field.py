@@ -8,10 +8,10 @@ and no lever. `calibrate` takes these steps:
 2. Fit the attitudes alone with Cauchy's loss.
 3. Fit lens and attitudes with Cauchy's loss, whose width shrinks with the median residual.
 4. Reject residuals beyond 5 sigma as wrong identifications.
-5. Fit the rest by least squares (`_minimize`).
+5. Fit the rest by least squares (`bundle_adjustment.adjust`).
 6. Compute the covariance and the diagnostics (`_report`).
 
-The fits minimize the weighted residuals by Levenberg-Marquardt. They eliminate the attitudes (Schur complement), so
+The fits are those of `bundle_adjustment`, with the attitudes eliminated in place of the lights (Schur complement), so
 that each step solves an 8 x 8 system whatever the number of frames. `self_calibrate` alternates identification and
 calibration.
 
@@ -25,13 +25,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
+from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration.bundle_adjustment import Bundle, Sightings
+from estimator.calibration import bundle_covariance
+from estimator.calibration.bundle_adjustment import Bundle, NormalEquations, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
@@ -173,32 +175,39 @@ def calibrate(
     counts = np.array([len(frame.xy_px) for frame in frames])
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
     # 1. Start attitudes
-    problem = _start_problem(sightings, vectors, camera_start, prior, len(frames))
-    # 2. Attitudes alone, in frames with enough stars
+    fit = _start(sightings, vectors, camera_start, prior, len(frames))
     enough = counts[sightings.frame] >= LEAST_STARS
     used = sightings.take(enough)
     _check_enough(used)
-    problem = problem._replace(bundle=_fit_attitudes(problem.bundle, used))
-    # 3. Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
-    previous = np.inf
-    while (current := CAUCHY * ba.robust_scale(problem.bundle, used)) < 0.9 * previous:
-        problem, _ = _minimize(problem, used, current)
-        previous = current
-    # 4. Wrong identifications
-    distance = np.linalg.norm(ba.residuals(problem.bundle, sightings), axis=1)
-    keep = enough & (distance < GATE * ba.robust_scale(problem.bundle, used))
-    outliers = np.column_stack([sightings.frame, row])[~keep & enough]
-    tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
-    keep &= tied[sightings.frame]
-    # 5. Least squares
-    used = sightings.take(keep)
-    _check_enough(used)
-    problem, converged = _minimize(problem, used, np.inf)
-    # 6. Covariance and diagnostics
-    status = (
-        "converged" if converged else f"stopped after {ba.STEPS} steps without convergence"
-    )
-    return _report(status, problem, used, tied, outliers, keep, frames, camera_start)
+    try:
+        # 2. Attitudes alone, in frames with enough stars
+        fit = ba.fit_attitudes(fit, used, 12)
+        # 3. Graduated robust fit: each round shrinks the width with the residuals, until it shrinks by less than 10 %.
+        previous = np.inf
+        while (current := CAUCHY * ba.robust_scale(fit, used)) < 0.9 * previous:
+            fit, _ = ba.adjust(fit, used, current)
+            previous = current
+        # 4. Wrong identifications
+        distance = np.linalg.norm(ba.residuals(fit, sightings), axis=1)
+        keep = enough & (distance < GATE * ba.robust_scale(fit, used))
+        outliers = np.column_stack([sightings.frame, row])[~keep & enough]
+        tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
+        keep &= tied[sightings.frame]
+        # 5. Least squares
+        used = sightings.take(keep)
+        _check_enough(used)
+        fit, converged = ba.adjust(fit, used, np.inf)
+        # 6. Covariance and diagnostics
+        status = (
+            "converged"
+            if converged
+            else f"stopped after {ba.STEPS} steps without convergence"
+        )
+        return _report(status, fit, used, tied, outliers, keep, frames, camera_start)
+    except LinAlgError:
+        raise ValueError(
+            "calibrate: the frames do not determine the lens; take more stars over the field"
+        ) from None
 
 
 class IdentifyingTracker(Protocol):
@@ -271,30 +280,45 @@ def self_calibrate(
     return best
 
 
-class _Problem(NamedTuple):
-    """Bundle with the stars as lights at distance 1, and the (8,) prior lens with its standard deviations."""
+@dataclass(frozen=True, slots=True)
+class _StarBundle(Bundle):
+    """Bundle with the stars as lights at distance 1, whose unknowns in separate blocks are the attitudes.
 
-    bundle: Bundle
-    prior_lens: Floats
-    sigma: Floats
+    The lever and the stars are fixed, so that the lens is the only other unknown.
+
+    Attributes
+    ----------
+    prior_lens, lens_sigma
+        (8,) prior lens and its standard deviations
+    """
+
+    prior_lens: Floats | float = 0.0
+    lens_sigma: Floats | float = np.inf
 
     def cost(self, sightings: Sightings, width: float) -> tuple[float, Floats]:
         """Return the total loss of the pixels and the prior, and the (M,) robust weights of the sightings."""
-        loss, weight = ba.cauchy(
-            np.sum(ba.residuals(self.bundle, sightings) ** 2, axis=1), width
-        )
-        from_prior = np.sum(((self.bundle.lens - self.prior_lens) / self.sigma) ** 2)
+        loss, weight = Bundle.cost(self, sightings, width)
+        from_prior = np.sum(((self.lens - self.prior_lens) / self.lens_sigma) ** 2)
         return loss + float(from_prior), weight
 
+    def equations(self, sightings: Sightings, weight: Floats) -> NormalEquations:
+        """Return the normal equations J^T W J and J^T W e, with the prior on the lens added."""
+        terms = ba.linearize(self, sightings)
+        frames = len(self.R_body_from_lab)
+        blocks, rhs = ba.attitude_equations(terms, sightings, weight, frames)
+        by_lens = terms.by_shared[:, :, 3:]  # without the lever, which is fixed at zero
+        weighted = weight[:, None, None] * by_lens
+        coupling = ba.summed(terms.by_rotation.mT @ weighted, sightings.frame, frames)
+        lens = np.einsum("mai,maj->ij", weighted, by_lens) + np.diag(self.lens_sigma**-2.0)
+        prior_rhs = (self.prior_lens - self.lens) / self.lens_sigma**2
+        lens_rhs = np.einsum("mai,ma->i", weighted, terms.residual) + prior_rhs
+        between = csr_array(coupling.reshape(-1, LENS).T)
+        return NormalEquations(blocks, between, lens, rhs.ravel(), lens_rhs)
 
-class _NormalEquations(NamedTuple):
-    """Normal equations: (F, 3, 3) of rotations, (F, 3, 8) coupling, (8, 8) of the lens, and right-hand sides."""
-
-    rotation_blocks: Floats
-    coupling: Floats
-    lens: Floats
-    rhs_rotation: Floats
-    rhs_lens: Floats
+    def apply_step(self, led: Floats, rest: Floats) -> Bundle:
+        """Return the bundle after (3 F,) small rotations and an (8,) step of the lens."""
+        fixed = np.zeros(3)
+        return Bundle.apply_step(self, fixed, np.concatenate([led, fixed, rest]))
 
 
 def _collect(frames: Sequence[StarFrame]) -> Sightings:
@@ -334,9 +358,9 @@ def _check_enough(sightings: Sightings) -> None:
         )
 
 
-def _start_problem(
+def _start(
     sightings: Sightings, vectors: Floats, camera: Camera, prior: LensPrior, count: int
-) -> _Problem:
+) -> Bundle:
     """Return the start values: the start camera, and each frame's robust attitude with it."""
     lens = camera.lens
     rays = camera.rays(sightings.xy_px)
@@ -345,8 +369,17 @@ def _start_problem(
         selected = sightings.frame == k
         if selected.sum() >= LEAST_STARS:
             R_cam_from_ref[k] = _robust_attitude(rays[selected], vectors[selected])
-    bundle = Bundle(vectors, R_cam_from_ref, np.zeros(3), np.eye(3), lens, LENS, vectors)
-    return _Problem(bundle, lens, prior.sigma(camera))
+    return _StarBundle(
+        vectors,
+        R_cam_from_ref,
+        np.zeros(3),
+        np.eye(3),
+        lens,
+        LENS,
+        vectors,
+        prior_lens=lens,
+        lens_sigma=prior.sigma(camera),
+    )
 
 
 def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
@@ -369,127 +402,9 @@ def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
     return R_cam_from_ref
 
 
-def _fit_attitudes(bundle: Bundle, sightings: Sightings) -> Bundle:
-    """Return the bundle with every frame's attitude fitted under Cauchy's loss, the lens fixed."""
-    frames = np.unique(sightings.frame)
-    selected = replace(bundle, R_body_from_lab=bundle.R_body_from_lab[frames])
-    numbered = replace(sightings, frame=np.searchsorted(frames, sightings.frame))
-    R = bundle.R_body_from_lab.copy()
-    R[frames] = ba.fit_attitudes(selected, numbered, 12).R_body_from_lab
-    return replace(bundle, R_body_from_lab=R)
-
-
-def _normal_equations(
-    problem: _Problem, sightings: Sightings, weight: Floats
-) -> _NormalEquations:
-    """Return the normal equations J^T W J and J^T W e, with one weight per sighting and the prior on the lens added."""
-    terms = ba.linearize(problem.bundle, sightings)
-    frames = len(problem.bundle.R_body_from_lab)
-    by_rotation = terms.by_rotation
-    by_lens = terms.by_shared[:, :, 3:]  # without the lever, which is fixed at zero
-    weighted_rotation = weight[:, None, None] * by_rotation
-    weighted_lens = weight[:, None, None] * by_lens
-    # Each frame's attitude, and its coupling with the lens
-    rotation_blocks = np.zeros((frames, 3, 3))
-    coupling = np.zeros((frames, 3, LENS))
-    rhs = np.zeros((frames, 3))
-    np.add.at(rotation_blocks, sightings.frame, by_rotation.mT @ weighted_rotation)
-    np.add.at(coupling, sightings.frame, by_rotation.mT @ weighted_lens)
-    np.add.at(
-        rhs, sightings.frame, np.einsum("mai,ma->mi", weighted_rotation, terms.residual)
-    )
-    # The identity gives an unused frame a step of zero.
-    unused = np.bincount(sightings.frame, minlength=frames) == 0
-    rotation_blocks[unused] = np.eye(3)
-    # The lens, with its prior
-    lens = np.einsum("mai,maj->ij", weighted_lens, by_lens) + np.diag(problem.sigma**-2)
-    prior_rhs = (problem.prior_lens - problem.bundle.lens) / problem.sigma**2
-    lens_rhs = np.einsum("mai,ma->i", weighted_lens, terms.residual) + prior_rhs
-    return _NormalEquations(rotation_blocks, coupling, lens, rhs, lens_rhs)
-
-
-def _eliminate_attitudes(
-    terms: _NormalEquations, damping: float
-) -> tuple[Floats, Floats, Floats]:
-    """Eliminate the attitudes: (F, 3, 8) A^-1 C, (F, 3) A^-1 a, and the (8, 8) Schur complement D - sum(C^T A^-1 C).
-
-    A are the blocks of the attitudes, C their coupling with the lens, D the block of the lens, and a the right-hand
-    sides of the attitudes. Damping multiplies the diagonals of A and D by 1 + damping (Marquardt).
-    """
-    blocks = terms.rotation_blocks * np.where(np.eye(3, dtype=bool), 1 + damping, 1.0)
-    right_sides = np.concatenate([terms.coupling, terms.rhs_rotation[:, :, None]], axis=2)
-    solved = np.asarray(np.linalg.solve(blocks, right_sides), dtype=np.float64)
-    through = solved[:, :, :LENS]
-    uncoupled = solved[:, :, LENS]
-    matrix = terms.lens - np.einsum("fij,fik->jk", terms.coupling, through)
-    matrix[np.diag_indices(LENS)] += damping * terms.lens.diagonal()
-    return through, uncoupled, matrix
-
-
-def _minimize(problem: _Problem, sightings: Sightings, width: float) -> tuple[_Problem, bool]:
-    """Minimize over lens and attitudes by Levenberg-Marquardt; return the problem and whether it converged.
-
-    Each step:
-
-    1. Eliminate the attitudes, and solve for the lens.
-    2. Substitute back for the attitudes.
-    3. Accept the step and reduce the damping if the loss falls; otherwise increase the damping.
-    4. Stop when the Newton decrement is negligible.
-
-    Parameters
-    ----------
-    width
-        Width of Cauchy's loss in sigmas; inf for least squares
-
-    Raises
-    ------
-    ValueError
-        If the lens is undetermined.
-    """
-    damping = 1e-4
-    cost, weight = problem.cost(sightings, width)
-    terms = _normal_equations(problem, sightings, weight)
-    no_step = np.zeros(3 * len(problem.bundle.position_m))
-    for _ in range(ba.STEPS):
-        # 1. Lens
-        through, uncoupled, matrix = _eliminate_attitudes(terms, damping)
-        reduced_rhs = terms.rhs_lens - np.einsum("fij,fi->j", terms.coupling, uncoupled)
-        lens = _solve_scaled(matrix, reduced_rhs)
-        # 2. Attitudes
-        rotation = uncoupled - through @ lens
-        slope = float(np.sum(terms.rhs_rotation * rotation) + terms.rhs_lens @ lens)
-        step = np.concatenate([rotation.ravel(), np.zeros(3), lens])
-        trial = problem._replace(bundle=problem.bundle.apply_step(no_step, step))
-        new_cost, new_weight = trial.cost(sightings, width)
-        # 3. Near the minimum the costs differ only by rounding: a step is accepted within that.
-        if new_cost <= cost * (1 + 1e-13) + 1e-20:
-            problem = trial
-            cost = new_cost
-            damping = max(damping / 10, 1e-12)
-            # 4. Convergence
-            if slope < ba.DECREMENT:
-                return problem, True
-            terms = _normal_equations(problem, sightings, new_weight)
-        else:
-            damping *= 10
-    return problem, False
-
-
-def _solve_scaled(matrix: Floats, right: Floats) -> Floats:
-    """Return matrix^-1 right, with the matrix scaled to a unit diagonal. Raises ValueError if it is not positive."""
-    try:
-        scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-300))
-        factor = cho_factor(matrix * scale * scale[:, None], lower=True)
-    except LinAlgError:
-        raise ValueError(
-            "calibrate: the frames do not determine the lens; take more stars over the field"
-        ) from None
-    return (scale * cho_solve(factor, (scale * right.T)).T).T
-
-
 def _report(
     status: str,
-    problem: _Problem,
+    bundle: Bundle,
     sightings: Sightings,
     tied: np.ndarray,
     outliers: Ints,
@@ -502,17 +417,16 @@ def _report(
     The lens has the covariance S^-1 with the Schur complement S, the attitudes A^-1 + A^-1 C S^-1 C^T A^-1.
     """
     # Covariances of the lens and of the attitudes
-    terms = _normal_equations(problem, sightings, np.ones(len(sightings.frame)))
-    through, _, matrix = _eliminate_attitudes(terms, 0.0)
-    covariance = _solve_scaled(matrix, np.eye(LENS))
-    by_lens = through @ covariance @ through.mT
-    attitude_covariance = np.linalg.inv(terms.rotation_blocks) + by_lens
+    terms = bundle.equations(sightings, np.ones(len(sightings.frame)))
+    R = bundle.R_body_from_lab
+    # No rotation is among the unknowns that are not eliminated.
+    covariance = bundle_covariance.covariance(terms, replace(bundle, R_body_from_lab=R[:0]))
+    attitude_covariance = covariance.by_led
     attitude_covariance[~tied] = np.nan
     # Residuals
-    residual = ba.residuals(problem.bundle, sightings)
+    residual = ba.residuals(bundle, sightings)
     residual_px = residual * sightings.sigma_px[:, None]
     freedom = 2 * len(sightings.frame) - 3 * tied.sum() - LENS
-    R = problem.bundle.R_body_from_lab
     attitudes = [rotation(R[k]) if tied[k] else Rotation.identity() for k in range(len(R))]
     report = FieldReport(
         status,
@@ -523,12 +437,14 @@ def _report(
         len(sightings.frame),
         rms_px=float(np.sqrt(np.mean(residual_px**2))),
         misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
-        magnitude=_magnitude(frames, keep),
+        magnitude=_magnitude(frames, keep, bundle.position_m[keep]),
     )
-    return Calibration(camera.with_lens(problem.bundle.lens), covariance, report)
+    return Calibration(camera.with_lens(bundle.lens), covariance.shared, report)
 
 
-def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero | None:
+def _magnitude(
+    frames: Sequence[StarFrame], keep: np.ndarray, vectors_ref: Floats
+) -> MagnitudeZero | None:
     """Return the magnitude zero point from the stars that were kept; None unless every frame has flux and magnitude."""
     flux = [frame.flux for frame in frames if frame.flux is not None]
     v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
@@ -538,8 +454,7 @@ def _magnitude(frames: Sequence[StarFrame], keep: np.ndarray) -> MagnitudeZero |
         [np.full(len(frame.xy_px), frame.exposure_s) for frame in frames]
     )
     instrumental = -2.5 * np.log10(np.concatenate(flux) / exposure_s)
-    vectors = np.concatenate([frame.vectors_ref for frame in frames])
-    return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors[keep])
+    return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors_ref)
 
 
 def _identified(

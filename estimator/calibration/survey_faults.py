@@ -242,8 +242,6 @@ def _meeting_point(
     1. Select the rays within three times the median angle of the last round from x, or within GATE if that is larger.
     2. Solve for x.
     """
-    if len(points) < MIN_FRAMES:
-        return None
     distance_m = np.linalg.norm(points - origins, axis=1)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     at = np.median(points, axis=0)
@@ -354,7 +352,7 @@ def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
     least = np.log(max(count, 2) ** 2 / 2 / FALSE_ALARMS) / 2
     suspects = np.flatnonzero(likelihood.max(axis=1, initial=-np.inf) - own > least)
     tested = np.isfinite(table.light).sum(axis=0) >= MIN_FRAMES
-    observable = _observable(table, likelihood, tested, least)
+    observable = _observable(likelihood, tested, least)
     if len(suspects) < 2:
         return [], observable
     # 3. Permutation
@@ -473,9 +471,7 @@ def _log_likelihood(table: LightTable) -> Floats:
     return out
 
 
-def _observable(
-    table: LightTable, likelihood: Floats, tested: Bools, least: float
-) -> float | None:
+def _observable(likelihood: Floats, tested: Bools, least: float) -> float | None:
     """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
 
     An exchange would be found if each of the two LEDs explains the other's light worse by `least`.

@@ -8,6 +8,7 @@ that each attitude shows. `choose` selects attitudes one after another by what e
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -135,8 +136,7 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyA
             "survey: the attitudes do not determine the unknowns; take more of them"
         ) from None
     check_redundancy(subset, covariance)
-    measured = np.zeros(len(bundle.position_m), dtype=bool)
-    measured[subset.led] = True
+    measured = np.isin(np.arange(len(bundle.position_m)), subset.led)
     led_sigma_m = np.full(len(measured), model.leds_sigma_m)
     led_sigma_m[subset.led] = np.sqrt(np.einsum("nii->n", covariance.by_led) / 3)
     shared = np.sqrt(np.diag(covariance.shared))
@@ -149,13 +149,10 @@ def measurable(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> Bool
     `body_from_lab` and `seen` are those of `predict`; all False where the attitudes do not determine the unknowns.
     """
     bundle, sightings = _bundle(model, body_from_lab, seen)
-    measured = np.zeros(len(bundle.position_m), dtype=bool)
-    try:
-        subset = connected_subset(bundle, sightings)
-        measured[subset.led] = True
-    except ValueError:
-        pass
-    return measured
+    led = np.empty(0, int)
+    with suppress(ValueError):
+        led = connected_subset(bundle, sightings).led
+    return np.isin(np.arange(len(bundle.position_m)), led)
 
 
 def _bundle(
@@ -174,7 +171,7 @@ def _bundle(
         frame, led, np.zeros((len(led), 2)), np.full(len(led), model.sigma_px)
     )
     xy_px = -ba.residuals(bundle, sightings) * model.sigma_px
-    return bundle, Sightings(frame, led, xy_px, sightings.sigma_px)
+    return bundle, replace(sightings, xy_px=xy_px)
 
 
 def choose(

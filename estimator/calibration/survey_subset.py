@@ -139,9 +139,8 @@ def ray_angles(
     """
     ray = normalized(position_m[led] - camera_m[frame])
     lights = len(position_m)
-    scatter = np.zeros((lights, 3, 3))
     count = np.bincount(led, minlength=lights)
-    np.add.at(scatter, led, ray[:, :, None] * ray[:, None, :])
+    scatter = ba.summed(ray[:, :, None] * ray[:, None, :], led, lights)
     largest = np.linalg.eigvalsh(scatter / np.maximum(count, 1)[:, None, None])[:, 2]
     return np.sqrt(np.where(count > 0, np.maximum(1 - largest, 0.0), 0.0))
 

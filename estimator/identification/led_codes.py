@@ -150,20 +150,17 @@ def misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> 
     arrays = (
         np.ascontiguousarray(one, dtype=float) for one in (light, sigma, templates, spread)
     )
-    out = np.empty((len(light), len(templates)))
-    _misfits(*arrays, out)
-    return out
+    return _misfits(*arrays)
 
 
 @jit
-def _misfits(
-    light: Floats, sigma: Floats, templates: Floats, spread: Floats, out: Floats
-) -> None:
-    """Write the misfits to `out`.
+def _misfits(light: Floats, sigma: Floats, templates: Floats, spread: Floats) -> Floats:
+    """Return the (T, W) misfits of `misfits`, from arrays in row order.
 
     The brightness is fitted twice, as gross errors make the least-squares fit depend on its start: from the fit to all
     frames, and from the brightest frame. The better fit counts.
     """
+    out = np.empty((len(light), len(templates)))
     weight = np.empty(light.shape[1])
     for t in range(len(light)):
         top = 0.0
@@ -183,6 +180,7 @@ def _misfits(
                 fitted = _brightness(light[t], weight, templates[w], start, True)
                 least = min(least, _misfit(light[t], weight, templates[w], fitted))
             out[t, w] = least
+    return out
 
 
 @jit

@@ -187,8 +187,13 @@ def _match(
     # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
     for entry in range(first[center] - 1, first[center + 1]):
         s = center if entry < first[center] else dome.pairs.neighbor[entry]
-        x, y, near_field = _predicted_place(dome, R_cam_from_lab, focal_ratio, s)
-        if not near_field:
+        qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
+        if qz <= 0:
+            continue
+        x = focal_ratio * qx / qz
+        y = focal_ratio * qy / qz
+        # A field widened by a tenth.
+        if not (1.1 * left < x < 1.1 * right and 1.1 * top < y < 1.1 * bottom):
             continue
         offset2 = (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
         gate2 = GATE_SIGMA**2 * (base_variance + direction_variance * offset2)
@@ -212,23 +217,6 @@ def _match(
         distances2[slot] = distance2
         count = max(count, slot + 1)
     return observed[:count], star[:count], missing
-
-
-@jit
-def _predicted_place(
-    dome: DomeIndex, R_cam_from_lab: Floats, focal_ratio: float, star: int
-) -> tuple[float, float, bool]:
-    """Tangents of an LED, and whether it is before the camera, in a field widened by a tenth."""
-    left, right, top, bottom = dome.field_tan
-    qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, star)
-    qx = focal_ratio * qx
-    qy = focal_ratio * qy
-    near_field = (
-        qz > 0
-        and 1.1 * left * qz < qx < 1.1 * right * qz
-        and 1.1 * top * qz < qy < 1.1 * bottom * qz
-    )
-    return qx / qz, qy / qz, near_field
 
 
 @jit

@@ -3,8 +3,8 @@
 A name is the LED that a light is taken for. Codes alone leave several names for a light; the places decide.
 
 1. Choose two lights with few names that are far apart (`_best_pair`).
-2. List the pairs of their names with the same angle about the bearing, likeliest codes first (`_pair_names`).
-3. Each pair of names gives an attitude (`_attitudes`).
+2. List the pairs of their names with the same angle about the bearing, likeliest codes first (`_hypotheses`).
+3. Each pair of names gives an attitude.
 4. The attitude predicts the places of all LEDs, and each other light takes its best name (`_evaluate`). The misfit of
    the hypothesis is that of the two codes plus, for each other light, the least sum of a code's misfit and half the
    squared distance; at most STRANGER.
@@ -18,10 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.solvers import rotation
-from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
-from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification.chance import GATE_SIGMA
@@ -86,16 +85,15 @@ def identify(lights: NamedLights, sphere: Sphere) -> StarMatch | str:
     """
     excess = lights.misfit - lights.misfit.min(axis=1, keepdims=True)
     # 1. Two lights.
-    first, second = _best_pair(lights.ray, excess)
-    # 2. Their names.
-    names = _pair_names(lights, sphere, excess, first, second)
+    pair = _best_pair(lights.ray, excess)
+    # 2. and 3. Their names, and the attitudes.
+    names, R_cam_from_lab = _hypotheses(lights, sphere, excess, pair)
     if not len(names):
         return CONTRADICTED
     if len(names) >= MAX_HYPOTHESES:
         return UNDECIDED
-    # 3. and 4. Attitudes, and the names of the other lights.
-    R_cam_from_lab = _attitudes(lights, sphere, first, second, names)
-    total, star = _evaluate(lights, sphere, excess, R_cam_from_lab, (first, second), names)
+    # 4. The names of the other lights.
+    total, star = _evaluate(lights, sphere, excess, R_cam_from_lab, pair, names)
     # 5. Refuse unless one hypothesis is clearly the best, and agrees with the codes and with most of the lights.
     order = np.argsort(total)
     best = order[0]
@@ -154,81 +152,40 @@ def _best_pair(ray: Floats, excess: Floats) -> tuple[int, int]:
     return int(first), int(second)
 
 
-def _pair_names(
-    lights: NamedLights, sphere: Sphere, excess: Floats, first: int, second: int
-) -> Ints:
-    """Step 2: names of two lights whose angle about the bearing is that of the lights, the likeliest ones.
-
-    Returns
-    -------
-    Ints
-        (M, 2) rows of LEDs, at most MAX_HYPOTHESES
-    """
-    first_rows = np.flatnonzero(excess[first] <= REACH)
-    second_rows = np.flatnonzero(excess[second] <= REACH)
-    seen_first = _seen_directions(lights.ray[first], sphere, first_rows)
-    seen_second = _seen_directions(lights.ray[second], sphere, second_rows)
-    known = sphere.direction[first_rows], sphere.direction[second_rows]
-    gate = float(GATE_SIGMA * np.hypot(lights.sigma[first], lights.sigma[second]))
-    # Count the pairs, then store them.
-    count = _alike(seen_first, seen_second, *known, gate, np.empty((0, 2), np.int64))
-    pairs = np.empty((count, 2), np.int64)
-    _alike(seen_first, seen_second, *known, gate, pairs)
-    names = np.column_stack([first_rows[pairs[:, 0]], second_rows[pairs[:, 1]]])
-    # One LED cannot be both lights.
-    names = names[names[:, 0] != names[:, 1]]
-    cost = excess[first, names[:, 0]] + excess[second, names[:, 1]]
-    order = np.argsort(cost, kind="stable")
-    return names[order[:MAX_HYPOTHESES]] if len(order) else names
-
-
-@jit
-def _alike(
-    u: Floats, v: Floats, known_u: Floats, known_v: Floats, gate: float, pairs: Ints
-) -> int:
-    """Find the pairs of directions u (K, 3) and v (L, 3) that are as far apart as their known directions.
+def _hypotheses(
+    lights: NamedLights, sphere: Sphere, excess: Floats, pair: tuple[int, int]
+) -> tuple[Ints, Floats]:
+    """Steps 2 and 3: names of two lights whose angle about the bearing is that of the lights, the likeliest ones.
 
     The cosines of two angles differ by the difference of the angles times the sine, if that difference is small.
 
     Returns
     -------
-    int
-        Number of pairs; the first len(pairs) of them are written to `pairs`
+    names
+        (M, 2) rows of LEDs, at most MAX_HYPOTHESES
+    R_cam_from_lab
+        (M, 3, 3) attitudes
     """
-    found = 0
-    for a in range(len(u)):
-        for b in range(len(v)):
-            # Cosine of the angle that is seen, and of the angle that is known.
-            cosine = vectors.dot(vectors.row(u, a), vectors.row(v, b))
-            known = vectors.dot(vectors.row(known_u, a), vectors.row(known_v, b))
-            # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
-            if (cosine - known) ** 2 < gate**2 * max(1 - cosine**2, gate**2):
-                if found < len(pairs):
-                    pairs[found] = a, b
-                found += 1
-    return found
-
-
-def _seen_directions(ray: Floats, sphere: Sphere, rows: Ints) -> Floats:
-    """(K, 3) directions from the bearing to the points where a ray meets the spheres of these LEDs' radii."""
-    radius = sphere.radius_m[rows]
-    along = float(ray @ sphere.pupil_m)
-    reach = -along + np.sqrt(
-        np.maximum(along**2 - sphere.pupil_m @ sphere.pupil_m + radius**2, 0)
+    # Directions from the bearing to the points where each ray meets the spheres of its LEDs' radii
+    rows = [np.flatnonzero(excess[light] <= REACH) for light in pair]
+    u, v = (
+        normalized(on_sphere(lights.ray[light], sphere.pupil_m, sphere.radius_m[leds]))
+        for light, leds in zip(pair, rows, strict=True)
     )
-    return (sphere.pupil_m + reach[:, None] * ray) / radius[:, None]
-
-
-def _attitudes(
-    lights: NamedLights, sphere: Sphere, first: int, second: int, names: Ints
-) -> Floats:
-    """Step 3: (M, 3, 3) R_cam_from_lab of each pair of names."""
-    seen_first = _seen_directions(lights.ray[first], sphere, names[:, 0])
-    seen_second = _seen_directions(lights.ray[second], sphere, names[:, 1])
+    known_u, known_v = (sphere.direction[leds] for leds in rows)
+    # (difference of the cosines / sine)^2 < gate^2; the sine has a floor for coincident lights.
+    gate2 = GATE_SIGMA**2 * np.sum(lights.sigma[list(pair)] ** 2)
+    cosine = u @ v.T
+    alike = (cosine - known_u @ known_v.T) ** 2 < gate2 * np.maximum(1 - cosine**2, gate2)
+    # One LED cannot be both lights.
+    a, b = np.nonzero(alike & (rows[0][:, None] != rows[1]))
+    cost = excess[pair[0], rows[0][a]] + excess[pair[1], rows[1][b]]
+    order = np.argsort(cost, kind="stable")[:MAX_HYPOTHESES]
+    a = a[order]
+    b = b[order]
     # R = sum over the axes of (axis in camera axes) (axis in the lab frame)^T.
-    seen = _frames(seen_first, seen_second)
-    known = _frames(sphere.direction[names[:, 0]], sphere.direction[names[:, 1]])
-    return np.einsum("mia,mib->mab", seen, known)
+    axes = _frames(u[a], v[b]).mT @ _frames(known_u[a], known_v[b])
+    return np.column_stack([rows[0][a], rows[1][b]]), axes
 
 
 def _frames(u: Floats, v: Floats) -> Floats:

@@ -404,8 +404,7 @@ def _count_missing(
     star
         (K,) rows of the matched stars
     """
-    field = detections.field * (INNER_FRACTION / focal_ratio)
-    left, right, top, bottom = field
+    left, right, top, bottom = detections.field * (INNER_FRACTION / focal_ratio)
     # Stars are sorted by brightness: the row of the faintest detectable star bounds them all.
     matched = 0
     faintest = np.int64(0)
@@ -415,21 +414,6 @@ def _count_missing(
         x, y = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
         faintest = max(faintest, s)
-    return _count_inside(sky, R, field, faintest) - matched
-
-
-@jit
-def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int:
-    """Number of stars inside a field, down to a row: the stars are sorted by brightness.
-
-    Parameters
-    ----------
-    field
-        (4,) tangents left, right, top, bottom
-    faintest
-        Last row that counts
-    """
-    left, right, top, bottom = field
     # Chord of the angle from the boresight to the farthest corner.
     corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
     # A hair longer, so that rounding excludes no star in a corner.
@@ -445,7 +429,7 @@ def _count_inside(sky: SkyIndex, R: Floats, field: Floats, faintest: int) -> int
             continue
         x, y, z = vectors.rotate(R, vectors.row(sky.vectors, s))
         inside += left * z < x < right * z and top * z < y < bottom * z
-    return inside
+    return inside - matched
 
 
 @jit

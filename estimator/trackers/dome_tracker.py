@@ -44,7 +44,7 @@ from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.led_index import build_dome_index, inner_field
-from estimator.identification.refusals import NO_LIGHTS, NO_MATCH, NO_STARS, advice
+from estimator.identification.refusals import NO_MATCH, advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
@@ -247,8 +247,6 @@ class DomeTracker(FrameTracker):
         checks.of_type("centroids", centroids, Centroids)
         centroids.check_values()
         clock = clock or Clock()
-        if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lever_cam_m = self.lever.pupil_cam_m
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)

@@ -45,9 +45,9 @@ from estimator.identification.chance import (
 )
 from estimator.identification.refusals import AMBIGUOUS
 from estimator.identification.star_detections import (
-    Detections,
     FlatCentroids,
     Sensor,
+    chosen,
     detections_of,
     flat_centroids,
 )
@@ -97,22 +97,28 @@ def with_rivals(
         return attitude
     skies = [(match, attitude)]
     lights = flat_centroids(centroids, errors_px(centroids))
+    # The matches give the zero point.
+    zero_mag = sky.mag[match.star] + 2.5 * np.log10(lights.flux[matched])
     # A lens that is fitted to a distorted reflection does not fit the stars.
     cameras = (camera,) if camera == matcher.camera else (camera, matcher.camera)
     while len(skies) <= MOST_RIVALS and len(centroids) - len(matched) >= MIN_MATCHES:
         # 2. Search
+        rest = np.delete(np.arange(len(centroids)), matched)
         for lens in cameras:
             view = sensor._replace(
                 focal_px=lens.focal_px,
                 center_px=lens.center_px,
                 distortion=lens.distortion,
                 aspect=lens.aspect,
+                zero_point_mag=float(np.mean(zero_mag)),
+                magnitude_sigma=hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
             )
-            found = find(lights, view, sky, matched, match.star)
+            found = _find(lights, view, sky, rest)
             if len(found.star):
                 break
         if not len(found.star):
             break
+        found.observed[:] = rest[found.observed]
         matched = np.concatenate([matched, found.observed])
         # 3. Second sky, or misfit
         if not _is_second_sky(found, match, covariance_rad2):
@@ -162,50 +168,7 @@ def _is_comparable(matches: int, fewer: int, share: float) -> bool:
 
 
 @jit
-def find(
-    lights: FlatCentroids, sensor: Sensor, sky: SkyIndex, matched: NDArray, star: NDArray
-) -> Solution:
-    """Search unmatched lights for a second sky: step 2 of the module.
-
-    Parameters
-    ----------
-    lights
-        All lights, brightest first
-    matched
-        (M,) rows of matched lights, the first K those of the first sky
-    star
-        (K,) rows of the stars of the first sky
-
-    Returns
-    -------
-    Solution
-        Empty below ACCEPT_DEX
-    """
-    # The matches give the zero point.
-    zero_mag = sky.mag[star] + 2.5 * np.log10(lights.flux[matched[: len(star)]])
-    detections, rest = _unmatched(lights, sensor, matched, zero_mag)
-    solution = star_search.lost_in_space(detections, sky, MOST_LIGHTS, MAX_CHECKS)
-    solution.observed[:] = rest[solution.observed]
-    return solution
-
-
-@jit
-def _unmatched(
-    lights: FlatCentroids, sensor: Sensor, matched: NDArray, zero_mag: Floats
-) -> tuple[Detections, NDArray]:
-    """The unmatched detections, and their rows, with magnitudes by the zero points (K,) of the matched stars."""
-    is_left = np.ones(len(lights.flux), np.bool_)
-    is_left[matched] = False
-    rest = np.flatnonzero(is_left)
-    every = detections_of(lights, sensor, 0.0)
-    detections = Detections(
-        every.tangent[rest],
-        every.sigma[rest],
-        every.weight[rest],
-        np.mean(zero_mag) - 2.5 * np.log10(lights.flux[rest]),
-        hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
-        every.field,
-        0.0,
-        np.nan,
-    )
-    return detections, rest
+def _find(lights: FlatCentroids, sensor: Sensor, sky: SkyIndex, rest: NDArray) -> Solution:
+    """Search some rows of the lights for a second sky: step 2 of the module; one call of compiled code is faster."""
+    detections = chosen(detections_of(lights, sensor, 0.0), rest)
+    return star_search.lost_in_space(detections, sky, MOST_LIGHTS, MAX_CHECKS)

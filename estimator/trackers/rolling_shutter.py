@@ -33,6 +33,8 @@ from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.identification.chance import MIN_EVIDENCE_MATCHES
+from estimator.identification.refusals import NO_LIGHTS, NO_STARS
 
 SHORT_STREAK_PX = 1.5  # standard deviation of a streak that is too short to be measured
 # Standard deviation of a rate without streaks, if the exposure is unknown.
@@ -80,7 +82,9 @@ def solve_lights(
     rate: RateEstimate | None,
     exposure_s: float | None,
 ) -> Attitude:
-    """Return attitude and rate by either shutter; parameters as of `solve_rolling`."""
+    """Return attitude and rate by either shutter, or the refusal of too few lights; see `solve_rolling`."""
+    if len(centroids) < MIN_EVIDENCE_MATCHES:
+        return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
     if camera.row_time_s:
         return solve_rolling(camera, lights, centroids, solve_global, rate, exposure_s)
     return with_streak_rate(solve_global(centroids), centroids, exposure_s, rate, lights)

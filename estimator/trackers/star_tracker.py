@@ -35,13 +35,10 @@ from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of
 from estimator.identification import star_evidence, star_quads, star_search
-from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import (
     BUDGET,
     FALSE_LIGHTS,
-    NO_LIGHTS,
     NO_MATCH,
-    NO_STARS,
     WRONG_SCALE,
     advice,
 )
@@ -322,8 +319,6 @@ class StarTracker(FrameTracker):
                 True,
             )
         clock = clock or Clock()
-        if len(centroids) < MIN_EVIDENCE_MATCHES:
-            return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
         lights = Lights(
             self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
         )
@@ -341,11 +336,11 @@ class StarTracker(FrameTracker):
         self, centroids: Centroids, clock: Clock, effort: int | None
     ) -> Attitude:
         """Identify and solve centroids of one time."""
-        compared = np.zeros(1, np.int64)
         if self.index is None:
             searches = self.searches if effort is None else self.searches[effort : effort + 1]
             return self._identify_lights(centroids, searches, clock, effort is None)
-        attitude = self._identify_by_paper(centroids, clock, compared)
+        compared = np.zeros(1, np.int64)
+        attitude = self._identify_by_paper(centroids, clock, self.index, compared)
         attitude = replace(attitude, angles_compared=int(compared[0]) or None)
         return self._with_rivals(attitude, centroids, clock)
 
@@ -360,7 +355,7 @@ class StarTracker(FrameTracker):
         return attitude
 
     def _identify_by_paper(
-        self, centroids: Centroids, clock: Clock, compared: Ints
+        self, centroids: Centroids, clock: Clock, index: pair_index.PairIndex, compared: Ints
     ) -> Attitude:
         """Solve by the published identifier of the settings; `compared` counts the angles that it compares."""
         from estimator.identification.registry import candidates  # several compiled modules
@@ -375,7 +370,7 @@ class StarTracker(FrameTracker):
             settings.identifier,
             bright,
             self.camera,
-            self.index,
+            index,
             self.focal_uncertainty,
             settings.searched_sigma_px,
             settings.acceptance,
@@ -393,8 +388,7 @@ class StarTracker(FrameTracker):
             if attitude.solved:
                 return attitude
         clock.lap("identify")
-        assert self.index is not None
-        in_field = len(self.index.vectors) * self._field_sr / (4 * np.pi)
+        in_field = len(index.vectors) * self._field_sr / (4 * np.pi)
         why = advice(
             settings.identifier,
             len(bright),

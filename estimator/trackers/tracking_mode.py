@@ -20,7 +20,7 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
-from estimator.core.checks import Floats, Step
+from estimator.core.checks import Allowed, Floats, Step
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.background import cleaned
@@ -49,6 +49,13 @@ ENDS_PX = 8.0  # length of a streak, of stars 0.7 px wide, whose middle is off b
 ROUGH = 3.0  # reduced chi-square above which a solution is flagged
 # Least share of the expected stars in a tracked solution: a few may be right where the prediction is wrong.
 LEAST_SHARE = 1 / 3
+ALLOWED = {
+    "reach_px": Allowed(1.0, 1e4, "1 to 10,000 pixels"),
+    "max_windows": Allowed(
+        MIN_EVIDENCE_MATCHES, 1e6, f"{MIN_EVIDENCE_MATCHES} or more", True
+    ),
+    "max_age_s": Allowed(0.0, np.inf, "0 or more"),
+}
 
 
 class Health(IntFlag):
@@ -111,6 +118,7 @@ class LastSolution:
     step_s: float = 0.0
 
 
+@dataclass(eq=False)
 class TrackingMode:
     """Star tracker with memory: tracks the predicted stars, and solves lost in space if that fails.
 
@@ -124,6 +132,8 @@ class TrackingMode:
         Largest number of windows, for the brightest stars
     max_age_s
         Largest age of the last attitude for a prediction
+    last
+        Last attitude; None before the first
 
     Raises
     ------
@@ -131,30 +141,19 @@ class TrackingMode:
         For another tracker or for unusable numbers.
     """
 
-    def __init__(
-        self,
-        tracker: StarTracker,
-        reach_px: float = 8.0,
-        max_windows: int = 25,
-        max_age_s: float = 5.0,
-    ) -> None:
-        checks.of_type("TrackingMode: tracker", tracker, StarTracker)
-        if tracker.focal_uncertainty:
+    tracker: StarTracker
+    reach_px: float = 8.0
+    max_windows: int = 25
+    max_age_s: float = 5.0
+    last: LastSolution | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        checks.of_type("TrackingMode: tracker", self.tracker, StarTracker)
+        if self.tracker.focal_uncertainty:
             raise ImageError(
-                f"TrackingMode: focal_uncertainty is {tracker.focal_uncertainty}; allowed: 0"
+                f"TrackingMode: focal_uncertainty is {self.tracker.focal_uncertainty}; allowed: 0"
             )
-        self.tracker = tracker
-        self.reach_px = checks.number(
-            "TrackingMode: reach_px", reach_px, 1.0, 1e4, "1 to 10,000 pixels"
-        )
-        least = MIN_EVIDENCE_MATCHES
-        self.max_windows = checks.number(
-            "TrackingMode: max_windows", max_windows, least, 1e6, f"{least} or more", True
-        )
-        self.max_age_s = checks.number(
-            "TrackingMode: max_age_s", max_age_s, 0.0, np.inf, "0 or more"
-        )
-        self.last: LastSolution | None = None
+        checks.store_numbers(self, "TrackingMode: ", ALLOWED)
 
     def solve(
         self,

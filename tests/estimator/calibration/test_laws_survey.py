@@ -147,6 +147,37 @@ def test_eliminating_the_lights_solves_the_whole_system(
     )
 
 
+@law(ba.summed, ba.attitude_equations, Bundle.equations)
+@given(rng=SEEDS, rows=some.integers(1, FRAMES * LIGHTS))
+def test_the_equations_of_an_attitude_are_those_of_its_own_sightings(
+    rng: np.random.Generator, rows: int
+) -> None:
+    """Each is J^T W J and J^T W e, as of its frame alone; it is a block of the whole bundle's equations."""
+    true, seen = dome(rng, 0.1)
+    seen = seen.take(rng.permutation(len(seen.led))[:rows])
+    weight = rng.uniform(0.1, 1, rows)
+    terms = ba.linearize(true, seen)
+    matrix, pull = ba.attitude_equations(terms, seen, weight, FRAMES)
+    whole = true.equations(seen, weight)
+    for frame in range(FRAMES):
+        own = seen.frame == frame
+        slopes = terms.by_rotation[own].reshape(-1, 3)
+        weighted = np.repeat(weight[own], 2)[:, None] * slopes
+        unknowns = slice(3 * frame, 3 * frame + 3)
+        expected = weighted.T @ slopes
+        fall = weighted.T @ terms.residual[own].ravel()
+        for found, known in (
+            (matrix[frame], expected if own.any() else np.eye(3)),
+            (whole.rest[unknowns, unknowns], expected),
+            (pull[frame], fall),
+            (whole.rhs_rest[unknowns], fall),
+        ):
+            size = 1e-9 * np.abs(known).max()
+            np.testing.assert_allclose(found, known, rtol=0, atol=size)
+    counts = ba.summed(np.ones((rows, 2)), seen.led, LIGHTS)
+    assert (counts == np.bincount(seen.led, minlength=LIGHTS)[:, None]).all()
+
+
 @law(Assumed.less, Assumed.weight, Bundle.cost, ba.normal_equations)
 @given(
     rng=SEEDS,
