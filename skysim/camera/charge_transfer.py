@@ -212,6 +212,7 @@ def _delay_columns(electrons: NDArray, fraction: NDArray) -> None:
         row[:] = gathered
 
 
+@jit(parallel=True)
 def smear(light_e: NDArray, exposure_s: float, row_time_s: float, leak: float = 1.0) -> None:
     """Smear of a frame-transfer chip, or of an interline chip whose covered register lets the fraction `leak` through.
 
@@ -229,12 +230,7 @@ def smear(light_e: NDArray, exposure_s: float, row_time_s: float, leak: float = 
         (H, W) light of the exposure; the smear is added in place. Dark current is the same in every row, so it is not
         affected.
     """
-    _smear(light_e, leak * row_time_s / exposure_s)
-
-
-@jit(parallel=True)
-def _smear(light_e: NDArray, fraction: float) -> None:
-    """Add to every pixel a fraction of the sum of the other pixels in its column."""
+    fraction = leak * row_time_s / exposure_s
     height, width = light_e.shape
     for block in numba.prange((width + BLOCK - 1) // BLOCK):
         first = block * BLOCK

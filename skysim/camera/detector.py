@@ -170,32 +170,24 @@ def expose(
     read_seeds = noise.seeds(rng, len(light_e))
     constants = readout_constants(config, exposure_s)
     guide = noise.guide()
-    pattern = (detector.sensitivity, detector.dark_e_s)
+    pattern = (detector.sensitivity, detector.dark_e_s, detector.column_offset_e)
     frame = np.empty(light_e.shape, np.uint16)
-    # With no step between counting and read-out, one fused loop does both, with the same numbers.
+    rows = (light_e, *pattern, constants, count_seeds, read_seeds, guide, frame)
+    # With no step between counting and read-out, one pass does both, with the same numbers.
     if not (
         config.particles
         or config.blooming == "column"
         or config.cti_parallel
         or config.cti_serial
     ):
-        _count_and_read(
-            light_e,
-            *pattern,
-            detector.column_offset_e,
-            constants,
-            count_seeds,
-            read_seeds,
-            guide,
-            frame,
-        )
+        _convert(*rows, True, True)
         return frame
     # 2. Counting.
-    _count(light_e, *pattern, constants, count_seeds, guide)
+    _convert(*rows, True, False)
     # 3. to 5.
     collect_charge(light_e, exposure_s, detector, rng, added)
     # 6. Read-out.
-    _read_out(light_e, detector.column_offset_e, constants, read_seeds, frame)
+    _convert(*rows, False, True)
     return frame
 
 
@@ -334,39 +326,8 @@ def _read_row(
 
 
 @jit(parallel=True)
-def _count(
-    light_e: Any,
-    sensitivity: Any,
-    dark_e_s: Any,
-    constants: ReadoutConstants,
-    seeds: Any,
-    guide: Any,
-) -> None:
-    """Convert a frame's light to electrons, in place, blocks of rows in parallel; see `_count_row`."""
-    height, width = light_e.shape
-    for block in numba.prange((height + ROWS - 1) // ROWS):
-        memory = noise.scratch(width)
-        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            _count_row(
-                light_e[y], sensitivity[y], dark_e_s[y], constants, seeds[y], guide, memory
-            )
-
-
-@jit(parallel=True)
-def _read_out(
-    electrons: Any, offset_e: Any, constants: ReadoutConstants, seeds: Any, frame: Any
-) -> None:
-    """Convert a frame's electrons to digital numbers, blocks of rows in parallel; see `_read_row`."""
-    height, width = electrons.shape
-    for block in numba.prange((height + ROWS - 1) // ROWS):
-        memory = noise.scratch(width)
-        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            _read_row(electrons[y], offset_e, constants, seeds[y], memory, frame[y])
-
-
-@jit(parallel=True)
-def _count_and_read(
-    light_e: Any,
+def _convert(
+    electrons: Any,
     sensitivity: Any,
     dark_e_s: Any,
     offset_e: Any,
@@ -375,25 +336,25 @@ def _count_and_read(
     read_seeds: Any,
     guide: Any,
     frame: Any,
+    counts: bool,
+    reads: bool,
 ) -> None:
-    """`_count` and `_read_out` in one pass over the rows: the same numbers, faster.
+    """Count a frame's electrons in place, or read them to digital numbers, blocks of rows in parallel; or both at once.
 
-    Only for chips on which no charge leaves its row in between.
+    Both at once is faster, but only for chips on which no charge leaves its row in between. See `_count_row` and
+    `_read_row`.
     """
-    height, width = light_e.shape
+    height, width = electrons.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
         for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            _count_row(
-                light_e[y],
-                sensitivity[y],
-                dark_e_s[y],
-                constants,
-                count_seeds[y],
-                guide,
-                memory,
-            )
-            _read_row(light_e[y], offset_e, constants, read_seeds[y], memory, frame[y])
+            row = electrons[y]
+            if counts:
+                _count_row(
+                    row, sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory
+                )
+            if reads:
+                _read_row(row, offset_e, constants, read_seeds[y], memory, frame[y])
 
 
 def saturation_dn(config: DetectorConfig) -> float:

@@ -1,6 +1,6 @@
 """Draw the Sun, the Moon and the planets: points, small discs of a few points, and large discs by convolution.
 
-A large disc (`disc_image`) is a star's image convolved with a map of the disc's light:
+A large disc (`render_disc`) is a star's image convolved with a map of the disc's light:
 
 1. A lattice of 1 / s pixels covers the disc. All its points with the same sub-pixel phase have the same image,
    displaced by whole pixels. s is chosen so that the rim's frequencies that the lattice folds back are those that the
@@ -181,31 +181,10 @@ def star_kernels(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Ker
     )
 
 
-class DiscImage(NamedTuple):
-    """The image of a disc, also beyond the chip.
-
-    Attributes
-    ----------
-    electrons
-        (h, w) mean photo-electrons
-    corner_px
-        (2,) chip pixel (x, y) of the first one
-    streak_px
-        Path length of the image during the exposure
-    streak_xy_px
-        (2,) displacement during the exposure at the velocity of mid-exposure
-    """
-
-    electrons: Floats
-    corner_px: Ints
-    streak_px: float
-    streak_xy_px: Floats
-
-
-def disc_image(
-    body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
-) -> DiscImage:
-    """The mean photo-electrons of a disc, also those beyond the chip, by the module's steps.
+def render_disc(
+    image: NDArray, body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
+) -> list[SourceTruth]:
+    """Draw a large disc by the module's steps; return its truth, or an empty list if it misses the chip.
 
     In a rolling shutter a point d rows below the center is exposed d row_time later, when the image has moved by
     v row_time d: the map is sheared by the inverse of I - v row_time e_y^T. The rotation of the disc about its center
@@ -213,16 +192,26 @@ def disc_image(
     """
     # 1. and 2. The star's image at the phases of the lattice.
     star = star_images(body, disc, exposed)
-    steps = len(star.patches)
     # 3. The map of the light, on a lattice that the whole disc fits on.
     sheared = np.eye(2) - np.outer(star.speed_px_s * exposed.window.row_time_s, [0.0, 1.0])
     radius_from_px = np.asarray(np.linalg.inv(disc.px_from_radius) @ sheared, float)
     reach_px = math.ceil(float(np.linalg.norm(np.linalg.inv(radius_from_px), 2))) + 4
-    light = light_on_lattice(body, radius_from_px, reach_px, steps, hidden)
-    # 4. The convolution begins that much up and left.
+    light = light_on_lattice(body, radius_from_px, reach_px, len(star.patches), hidden)
+    # 4. The convolution, also beyond the chip, begins that much up and left.
+    electrons = convolved(light, star.patches)
     corner_px = star.corner_px - reach_px
+    # The part that is on the chip.
+    limit = np.array(image.shape[::-1])
+    low = np.clip(corner_px, 0, limit)
+    high = np.clip(corner_px + electrons.shape[::-1], 0, limit)
+    (x0, y0), (x1, y1) = low - corner_px, high - corner_px
+    own = electrons[y0:y1, x0:x1]
+    if not own.size or own.max() <= 0:
+        return []
+    image[low[1] : high[1], low[0] : high[0]] += own
+    # The displacement is that at the velocity of mid-exposure.
     streak_xy_px = star.speed_px_s * exposed.window.exposure_s
-    return DiscImage(convolved(light, star.patches), corner_px, star.streak_px, streak_xy_px)
+    return [whole(own, low, body, disc.center_px, star.streak_px, streak_xy_px)]
 
 
 def convolved(light: Floats, patches: Floats) -> Floats:
@@ -278,7 +267,7 @@ def render_bodies(
 ) -> list[SourceTruth]:
     """Add the light of the bodies, farthest first, to the (H, W) image, in place.
 
-    Returns the truth of each body in view. Lens, motion and shutter act on a disc as on a star (`disc_image`). Light
+    Returns the truth of each body in view. Lens, motion and shutter act on a disc as on a star (`render_disc`). Light
     that a nearer body hides is left out.
     """
     few_poses = exposed.few_poses()
@@ -295,8 +284,8 @@ def render_bodies(
         # The bodies come farthest first, so those after it are nearer.
         nearer = bodies[n + 1 :]
         if diameter_px > SMALL_PX:
-            drawn = disc_image(body, disc, exposed, hidden_points(body, nearer, occluded))
-            truths += add_disc(image, drawn, body, disc.center_px)
+            points = hidden_points(body, nearer, occluded)
+            truths += render_disc(image, body, disc, exposed, points)
         else:
             hidden = behind(nearer, occluded)
             truths += render_points(
@@ -333,23 +322,6 @@ def render_points(
     image += own
     streak = (float(truth.streak_px.mean()), truth.streak_xy_px.mean(axis=0))
     return [whole(own, np.zeros(2, np.int64), body, center_px, *streak)]
-
-
-def add_disc(
-    image: NDArray, disc: DiscImage, body: BodyLight, center_px: Floats
-) -> list[SourceTruth]:
-    """Add a disc's image to the chip's; return its truth, or an empty list if it misses the chip."""
-    size = np.array(disc.electrons.shape[::-1])
-    limit = np.array(image.shape[::-1])
-    # The part of the disc's image that is on the chip.
-    low = np.clip(disc.corner_px, 0, limit)
-    high = np.clip(disc.corner_px + size, 0, limit)
-    (x0, y0), (x1, y1) = low - disc.corner_px, high - disc.corner_px
-    own = disc.electrons[y0:y1, x0:x1]
-    if not own.size or own.max() <= 0:
-        return []
-    image[low[1] : high[1], low[0] : high[0]] += own
-    return [whole(own, low, body, center_px, disc.streak_px, disc.streak_xy_px)]
 
 
 def whole(

@@ -269,11 +269,9 @@ def _directions_each(
             cam_from_lab[k : k + 1],
             camera_m[k : k + 1],
         )
-        for n in range(a, b):
-            distance[n] = own[1][0, n - a]
-            cosine[n] = own[2][0, n - a]
-            for i in range(3):
-                direction[n, i] = own[0][0, n - a, i]
+        direction[a:b] = own[0][0]
+        distance[a:b] = own[1][0]
+        cosine[a:b] = own[2][0]
     return direction, distance, cosine
 
 
@@ -286,7 +284,11 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
     field and not in the catalog.
     """
     boresight = np.ascontiguousarray(poses.cam_from_lab[:, 2])
-    rotation_rad, span_rad = _rotations_rad(boresight)
+    # The greatest angles between successive boresights, and between any boresight and the first.
+    cosines = (np.vecdot(boresight[1:], boresight[:-1]), boresight @ boresight[0])
+    rotation_rad, span_rad = (
+        math.acos(min(max(cosine.min(initial=1.0), -1.0), 1.0)) for cosine in cosines
+    )
     half_rad = (1 + reach) * optics.field_rad + 0.02 + rotation_rad / 2
     cos_limit = math.cos(min(half_rad, math.pi))
     cos_any = math.cos(min(half_rad + span_rad, math.pi))
@@ -298,22 +300,6 @@ def in_view(sources: Sources, optics: Optics, poses: Poses, reach: float = 0.25)
         near = sources.within(boresight[0], half_rad + span_rad)
         return near[_in_cone(place[near], boresight, camera_m, cos_limit, cos_any)]
     return np.flatnonzero(_in_cone(place, boresight, camera_m, cos_limit, cos_any))
-
-
-@jit
-def _rotations_rad(boresight: Floats) -> tuple[float, float]:
-    """The greatest angles between successive boresights (K, 3), and between any boresight and the first."""
-    next_rad = 0.0
-    first_rad = 0.0
-    for k in range(1, len(boresight)):
-        to_last = 0.0
-        to_first = 0.0
-        for i in range(3):
-            to_last += boresight[k, i] * boresight[k - 1, i]
-            to_first += boresight[k, i] * boresight[0, i]
-        next_rad = max(next_rad, math.acos(min(max(to_last, -1.0), 1.0)))
-        first_rad = max(first_rad, math.acos(min(max(to_first, -1.0), 1.0)))
-    return next_rad, first_rad
 
 
 @jit

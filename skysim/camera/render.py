@@ -35,8 +35,8 @@ from skysim.camera.projection import (
     sample_times,
 )
 from skysim.camera.psf.ellipse import EllipseDisk, add_ellipse, ellipse_table, sharpest_px
-from skysim.camera.psf.kernel import DiskImages, disk_images
-from skysim.camera.psf.kernel_cache import ELLIPSE, GAUSS, ROUND, Kernels, source_kernels
+from skysim.camera.psf.kernel import ELLIPSE, GAUSS, ROUND, DiskImages, disk_images
+from skysim.camera.psf.kernel_cache import Kernels, source_kernels
 from skysim.camera.psf.splat import add_gaussian, add_grid, add_round
 from skysim.core.jit import jit
 from skysim.core.types import (
@@ -278,7 +278,7 @@ def _draw(
                 window,
                 out[first + i],
             )
-            _patch_statistics(patch, x0, y0, out[first + i])
+            _patch_statistics(patch, x0, y0, window.row_time_s != 0, out[first + i])
 
 
 @jit
@@ -295,7 +295,7 @@ def _expose_source(
 ) -> None:
     """Integrate one source on its patch, whose first pixel is (x0, y0).
 
-    Writes the light's mean position and the path length into row[2:4] and row[5].
+    Writes the path length into row[5] and, without a rolling shutter, the light's mean position into row[2:4].
     """
     end_s = window.open_s + window.exposure_s
     # The table of an ellipse is made for this source alone; other kinds share tables.
@@ -323,10 +323,8 @@ def _expose_source(
             begin_s,
             end_s + delay_s,
         )
-    # Mean position: of the light itself where all rows share one interval, without the chip's cut.
-    if rolling:
-        row[2], row[3] = _centroid(patch, x0, y0)
-    elif sums[0] > 0:
+    # Mean position of the light itself where all rows share one interval, without the chip's cut.
+    if not rolling and sums[0] > 0:
         row[2] = sums[1] / sums[0] + kernels.disk[n, 2]
         row[3] = sums[2] / sums[0] + kernels.disk[n, 3]
 
@@ -489,32 +487,27 @@ def _length(tracks: Tracks, n: int, begin_s: float, end_s: float) -> float:
 
 
 @jit
-def _patch_statistics(patch: Any, x0: int, y0: int, row: Any) -> None:
-    """Write a finished patch's sum, peak, sum of squares and brightest pixel into row[0, 1, 4, 6, 7]."""
-    for j in range(patch.shape[0]):
-        for i in range(patch.shape[1]):
-            e = patch[j, i]
-            row[0] += e
-            row[4] += e * e
-            if e > row[1]:
-                row[1] = e
-                row[6] = x0 + i
-                row[7] = y0 + j
+def _patch_statistics(patch: Any, x0: int, y0: int, rolling: bool, row: Any) -> None:
+    """Write a finished patch's sum, peak, sum of squares and brightest pixel into row[0, 1, 4, 6, 7].
 
-
-@jit
-def _centroid(patch: Any, x0: int, y0: int) -> Any:
-    """Center of gravity of a patch in chip pixels, (sum e x, sum e y) / sum e; its corner if it is empty."""
-    total = 0.0
+    Of a rolling shutter also the patch's center of gravity, (sum e x, sum e y) / sum e, into row[2, 3].
+    """
     x = 0.0
     y = 0.0
     for j in range(patch.shape[0]):
         for i in range(patch.shape[1]):
             e = patch[j, i]
-            total = total + e
+            row[0] += e
+            row[4] += e * e
             x = x + e * i
             y = y + e * j
-    return (x0 + x / total, y0 + y / total) if total > 0 else (float(x0), float(y0))
+            if e > row[1]:
+                row[1] = e
+                row[6] = x0 + i
+                row[7] = y0 + j
+    if rolling and row[0] > 0:
+        row[2] = x0 + x / row[0]
+        row[3] = y0 + y / row[0]
 
 
 @jit

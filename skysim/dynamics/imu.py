@@ -183,9 +183,8 @@ def inertial_knots(
         # w x (w x r) - g_body; a unit at rest feels +g upwards.
         centripetal = quaternion.cross(rate, quaternion.cross(rate, position_m))
         weight = quaternion.apply(body_from_lab, up)
-        for i in range(3):
-            knots[k, i] = rate[i]
-            knots[k, 3 + i] = centripetal[i] + weight[i]
+        knots[k, :3] = rate
+        knots[k, 3:] = centripetal + weight
     return knots
 
 
@@ -221,10 +220,8 @@ def integrate_intervals(
                 break
         add_cubic(t_s, knots, k, end, 1.0, change)
         # The tangential part of the specific force, int dw/dt x r dt.
-        turned = quaternion.cross(change[:3], position_m)
-        for i in range(3):
-            angle[n, i] = total[i]
-            velocity[n, i] = total[3 + i] + turned[i]
+        angle[n] = total[:3]
+        velocity[n] = total[3:] + quaternion.cross(change[:3], position_m)
     return angle, velocity
 
 
@@ -513,9 +510,7 @@ def integrate_attitude(
             quaternion.multiply(attitude, quaternion.from_rotvec(angle_rad[n])),
         )
         # Normalization prevents a drift of the norm.
-        attitude = attitude / math.sqrt(
-            attitude[0] ** 2 + attitude[1] ** 2 + attitude[2] ** 2 + attitude[3] ** 2
-        )
+        attitude = attitude / math.sqrt((attitude**2).sum())
     return attitude
 
 

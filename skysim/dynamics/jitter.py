@@ -342,29 +342,16 @@ def evaluate_sines(
     t_s: Floats, omega_rad_s: Floats, sine_rad: Floats, cosine_rad: Floats
 ) -> tuple[Floats, Floats]:
     """(N, 3) phi of `Sines` and (N, 3) its derivative at (N,) times."""
-    phi = np.empty((len(t_s), 3))
-    rate = np.empty((len(t_s), 3))
+    phi = np.zeros((len(t_s), 3))
+    rate = np.zeros((len(t_s), 3))
     for n in numba.prange(len(t_s)):
-        # phi is (x, y, z), its derivative (u, v, w).
-        x = y = z = u = v = w = 0.0
         for k in range(len(omega_rad_s)):
             omega = omega_rad_s[k]
-            a = sine_rad[k]
-            b = cosine_rad[k]
             s = np.sin(omega * t_s[n])
             c = np.cos(omega * t_s[n])
-            x = x + a[0] * s + b[0] * c
-            y = y + a[1] * s + b[1] * c
-            z = z + a[2] * s + b[2] * c
-            s = omega * s
-            c = omega * c
-            u = u + a[0] * c - b[0] * s
-            v = v + a[1] * c - b[1] * s
-            w = w + a[2] * c - b[2] * s
-        phi[n, 0] = x
-        phi[n, 1] = y
-        phi[n, 2] = z
-        rate[n, 0] = u
-        rate[n, 1] = v
-        rate[n, 2] = w
+            for i in range(3):
+                a = sine_rad[k, i]
+                b = cosine_rad[k, i]
+                phi[n, i] = phi[n, i] + a * s + b * c
+                rate[n, i] = rate[n, i] + a * (omega * c) - b * (omega * s)
     return phi, rate

@@ -105,13 +105,13 @@ class Summary(NamedTuple):
     """
 
     value: float
-    low: float
-    high: float
-    trials: int
+    low: float = math.nan
+    high: float = math.nan
+    trials: int = 0
     needs: int = 0
 
 
-NO_VALUE = Summary(math.nan, math.nan, math.nan, 0)
+NO_VALUE = Summary(math.nan)
 
 
 def proportion(hits: Any, total: Any) -> Summary:
@@ -189,7 +189,7 @@ def without_resampling(values: Floats, value: float) -> Summary:
     """The summary of fewer than two values, or of equal ones."""
     count = len(values)
     return (
-        Summary(value, math.nan, math.nan, count, 2 - count)
+        Summary(value, trials=count, needs=2 - count)
         if count < 2
         else Summary(value, value, value, count)
     )
@@ -270,7 +270,7 @@ def quantile(values: Floats, probability: float) -> Summary:
     ranks = quantile_ranks(count, probability)
     if ranks is None:
         needs = values_for_quantile(probability) - count
-        return Summary(value, math.nan, math.nan, count, needs)
+        return Summary(value, trials=count, needs=needs)
     low, high = np.partition(values, ranks)[list(ranks)].tolist()
     return Summary(value, low, high, count)
 
@@ -328,7 +328,7 @@ def tolerance_limit(values: Floats, probability: float) -> Summary:
     rank = int(scipy.stats.binom.ppf(CONFIDENCE, count, probability))  # s - 1
     limit = float(np.sort(np.append(values, np.nan))[rank])  # NaN is the last
     needs = max(trials_needed(1 - probability) - count, 0)
-    return Summary(limit, math.nan, math.nan, count, needs)
+    return Summary(limit, trials=count, needs=needs)
 
 
 def rms(values: Floats) -> Any:
@@ -357,8 +357,8 @@ STATISTICS: dict[str, Callable[[Floats], Summary]] = {
     "sd": lambda values: resampled(values, sample_std),
     **{name: partial(quantile, probability=share) for name, share in QUANTILES.items()},
     "tol95": partial(tolerance_limit, probability=0.95),
-    "worst": lambda values: Summary(float(np.max(values)), math.nan, math.nan, len(values)),
-    "least": lambda values: Summary(float(np.min(values)), math.nan, math.nan, len(values)),
+    "worst": lambda values: Summary(float(np.max(values)), trials=len(values)),
+    "least": lambda values: Summary(float(np.min(values)), trials=len(values)),
 }
 # Quantities that only flights have.
 FLIGHT_QUANTITIES = (
@@ -474,7 +474,7 @@ def mismatched(c: Columns) -> Summary:
     if not matches:
         return NO_VALUE
     share = float(np.sum(c["wrong_matches"][known]) / matches)
-    return Summary(share, math.nan, math.nan, round(matches))
+    return Summary(share, trials=round(matches))
 
 
 PROPORTIONS: dict[str, Response] = {

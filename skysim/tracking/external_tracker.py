@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.camera import Camera
 from estimator.core.types import Attitude, Centroids
-from estimator.trackers.pipeline import Report, Settings
+from estimator.trackers.pipeline import Report
 from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.core.plugins import ProgramError, describe_error, host_command
@@ -27,10 +26,8 @@ from skysim.tracking.tracker_interface import (
     FAILED,
     TRACKERS,
     Answer,
-    Leds,
     Picture,
     Setup,
-    Stars,
     check_answer,
 )
 
@@ -91,27 +88,6 @@ class ExternalTracker(FrameTracker):
 def picture_of(frame: Frame, streak_px: tuple[float, float] | None) -> Picture:
     """What a tracker gets of a frame."""
     return Picture(frame.image_dn, frame.index, frame.t_mid_s, frame.exposure_s, streak_px)
-
-
-def build_setup(
-    scene: scenes.Scene, camera: Camera, settings: Settings, lights: Stars | Leds
-) -> Setup:
-    """The set-up that is sent to the tracker: the hardware that skysim's own tracker would assume."""
-    return Setup(
-        "icrs" if scene.stars else "lab",
-        scene.start_time.isoformat(),
-        camera.width_px,
-        camera.height_px,
-        camera.focal_px,
-        camera.center_px,
-        camera.distortion,
-        settings.gain_e_dn,
-        settings.saturation,
-        scene.seed,
-        lights if isinstance(lights, Stars) else None,
-        lights if isinstance(lights, Leds) else None,
-        dict(scene.tracker.options),
-    )
 
 
 def to_report(answer: Answer) -> Report:

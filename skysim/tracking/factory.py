@@ -39,7 +39,6 @@ from skysim.scene.sections.tracker import OWN
 from skysim.tracking.external_tracker import (
     ExternalTracker,
     FunctionTracker,
-    build_setup,
     takes_setup,
 )
 from skysim.tracking.onboard_model import (
@@ -145,16 +144,32 @@ def tracker_of(name: str, given: Any) -> Estimator:
 
 def setup_of(scene: Scene, mount: Mount, sources: Sources) -> Setup:
     """The set-up that a tracker of one's own gets: camera, catalog or map, and settings that skysim's would assume."""
-    lights: Stars | Leds
+    stars: Stars | None = None
+    leds: Leds | None = None
     if dome := scene.dome:
-        camera, leds, lever = onboard_dome(scene, dome, mount, sources)
+        camera, led_map, lever = onboard_dome(scene, dome, mount, sources)
         axes_xyzw = lever.cam_from_body.as_quat()
-        lights = Leds(leds.id, leds.position_m, lever.camera_body_m, axes_xyzw)
+        leds = Leds(led_map.id, led_map.position_m, lever.camera_body_m, axes_xyzw)
     else:
         camera = assumed_camera(scene)
-        stars, directions = assumed_stars(scene, assumed_orbit(scene))
-        lights = Stars(stars.id, directions, stars.v_mag)
-    return build_setup(scene, camera, assumed_settings(scene), lights)
+        catalog, directions = assumed_stars(scene, assumed_orbit(scene))
+        stars = Stars(catalog.id, directions, catalog.v_mag)
+    settings = assumed_settings(scene)
+    return Setup(
+        "icrs" if scene.stars else "lab",
+        scene.start_time.isoformat(),
+        camera.width_px,
+        camera.height_px,
+        camera.focal_px,
+        camera.center_px,
+        camera.distortion,
+        settings.gain_e_dn,
+        settings.saturation,
+        scene.seed,
+        stars,
+        leds,
+        dict(scene.tracker.options),
+    )
 
 
 def build_tracker(

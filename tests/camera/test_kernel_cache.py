@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.camera.psf.kernel import Kernel, build_kernel
-from skysim.camera.psf.kernel_cache import GAUSS, GRID, ROUND, sharpness_px, source_kernels
+from skysim.camera.psf.kernel import GAUSS, GRID, ROUND, build_kernel, gaussian_kernel
+from skysim.camera.psf.kernel_cache import source_kernels
 from skysim.core.errors import InputError
 from skysim.scene.sections.camera import CameraConfig
 
@@ -65,10 +65,10 @@ def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
 
 
 def test_sharpness_is_the_sigma_of_a_gaussian_and_of_an_edge() -> None:
-    assert sharpness_px(build_kernel(camera().psf, camera())) == pytest.approx(
+    assert build_kernel(camera().psf, camera()).sharp_px == pytest.approx(
         np.sqrt(0.49 + 1 / 12), rel=1e-12
     )
-    edge = sharpness_px(build_kernel(camera().psf, camera(), emitter_radius_px=12.0))
+    edge = build_kernel(camera().psf, camera(), emitter_radius_px=12.0).sharp_px
     assert edge == pytest.approx(1.25 * np.sqrt(0.49 + 1 / 12), rel=0.03)
 
 
@@ -81,7 +81,7 @@ def test_sharpness_of_a_grid_equals_that_of_its_table(tmp_path: Any) -> None:
         psf={"kind": "measured", "file": str(tmp_path / "psf.csv"), "oversampling": 4},
     )
     wanted = np.sqrt(np.e) / 2 * np.sqrt(1 + 1 / 12)
-    assert sharpness_px(build_kernel(lens.psf, lens)) == pytest.approx(wanted, rel=0.02)
+    assert build_kernel(lens.psf, lens).sharp_px == pytest.approx(wanted, rel=0.02)
 
 
 def test_a_measured_image_is_a_grid(tmp_path: Any) -> None:
@@ -110,7 +110,6 @@ def test_a_lamp_far_out_of_focus_is_refused_in_one_line() -> None:
 
 def test_a_kernel_s_peak_is_the_brightest_pixel_of_a_centered_image() -> None:
     """A Gaussian's: the integral over a pixel of 1 px, here by the midpoint rule."""
-    empty = np.empty((0, 3), np.float32), np.empty((0, 0, 0, 0), np.float32)
     x = (np.arange(2000) + 0.5) / 2000 - 0.5
     wanted = (np.mean(np.exp(-(x**2) / 2 / 0.7**2)) / np.sqrt(2 * np.pi) / 0.7) ** 2
-    assert Kernel(0.7, *empty).peak == pytest.approx(wanted, rel=1e-6)
+    assert gaussian_kernel(0.7).peak == pytest.approx(wanted, rel=1e-6)

@@ -12,7 +12,9 @@ from scipy import special
 from scipy.signal import fftconvolve
 
 from skysim.camera.psf.kernel import (
+    GRID,
     HARMONIC_FLOOR,
+    ROUND,
     Kernel,
     PsfModel,
     bandwidth,
@@ -304,8 +306,8 @@ def test_nearly_equal_sizes_share_a_kernel() -> None:
 def test_sharp_images_use_a_grid_and_blurred_ones_tables() -> None:
     lens = camera(f_number=1.4, pixel="9.9 um")
     assert round_kernel(PsfModel(AiryPsfConfig(kind="airy"), lens, 0.0, ())) is None
-    assert len(build_kernel(AiryPsfConfig(kind="airy"), lens).grid)
-    assert len(build_kernel(AiryPsfConfig(kind="airy", sigma_px=0.6), lens).radial)
+    assert build_kernel(AiryPsfConfig(kind="airy"), lens).kind == GRID
+    assert build_kernel(AiryPsfConfig(kind="airy", sigma_px=0.6), lens).kind == ROUND
 
 
 # --- a measured lens ---
@@ -347,7 +349,7 @@ def test_a_measured_gaussian_is_that_gaussian(
     # As few sub-pixel positions, in powers of two, as are more than seven times the highest frequency.
     assert (
         7 * bandwidth(PsfModel(psf, camera(), 0.0, ()), 1e-3)
-        < len(image.grid) - 3
+        < len(image.table) - 3
         <= 14 * bandwidth(PsfModel(psf, camera(), 0.0, ()), 1e-3)
     )
 

@@ -8,7 +8,16 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from skysim.camera.psf import splat
-from skysim.camera.psf.kernel import Kernel, PsfModel, build_kernel, grid_kernel, round_kernel
+from skysim.camera.psf.kernel import (
+    GAUSS,
+    GRID,
+    ROUND,
+    Kernel,
+    PsfModel,
+    build_kernel,
+    grid_kernel,
+    round_kernel,
+)
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig, GaussianPsfConfig, MoffatPsfConfig, Psf
 from tests.helpers.splatting import add_kernel
@@ -68,10 +77,8 @@ every_kernel = pytest.mark.parametrize("image", KERNELS.values(), ids=KERNELS)
 
 
 def test_the_test_kernels_cover_every_kind() -> None:
-    shapes = [
-        (k.radial.shape[1] if len(k.radial) else 0, len(k.grid) > 0) for k in KERNELS.values()
-    ]
-    assert shapes == [(0, False), (3, False), (5, False), (7, False), (0, True)]
+    kinds = [(k.kind, k.table.shape[1] if k.kind == ROUND else 0) for k in KERNELS.values()]
+    assert kinds == [(GAUSS, 0), (ROUND, 3), (ROUND, 5), (ROUND, 7), (GRID, 0)]
 
 
 @every_kernel
@@ -134,7 +141,7 @@ def test_light_beyond_the_patch_is_left_out(
         draw(image, x, y),
         wide[40:-40, 40:-40],
         rtol=0,
-        atol=1e-6 * KERNELS["grid"].grid.max(),
+        atol=1e-6 * KERNELS["grid"].peak,
     )
 
 

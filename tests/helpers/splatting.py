@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skysim.camera.psf import splat
-from skysim.camera.psf.kernel import Kernel
+from skysim.camera.psf.kernel import GRID, ROUND, Kernel
 from skysim.core.types import Floats
 
 
@@ -11,9 +11,9 @@ def add_kernel(
     patch: Floats, row0: int, row1: int, x: float, y: float, electrons: float, image: Kernel
 ) -> None:
     """Add `electrons` spread as the kernel's image about (x, y) to the rows row0 <= j < row1."""
-    if len(image.grid):
-        splat.add_grid(patch, row0, row1, x, y, electrons, image.grid)
-    elif len(image.radial):
-        splat.add_round(patch, row0, row1, x, y, electrons, image.radial)
+    if image.kind == GRID:
+        splat.add_grid(patch, row0, row1, x, y, electrons, image.table)
+    elif image.kind == ROUND:
+        splat.add_round(patch, row0, row1, x, y, electrons, image.table)
     else:
         splat.add_gaussian(patch, row0, row1, x, y, electrons, image.sigma_px)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.glow.background import (
     even_grid_px,
     fill,
-    nodes_px,
     pixel_directions,
     viewing_geometry,
 )
@@ -44,7 +43,8 @@ def black_glow(
     """(H, W) electrons s^-1 px^-1 of a display's black pixels; None without such a display.
 
     A camera pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
-    exposure and the row times of a rolling shutter are left out.
+    exposure and the row times of a rolling shutter are left out. A projector's picture on the wall varies smoothly
+    except at its edges: it is computed at nodes at most NODE_SPACING_PX apart and interpolated between them.
 
     Parameters
     ----------
@@ -54,46 +54,29 @@ def black_glow(
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
         return None
-    if isinstance(screen, layouts.ProjectorConfig):
-        assert isinstance(config, light.DomeConfig)  # the screen is its layout
-        return projector_glow(config, optics, cam_from_lab, camera_m, band)
-    view = viewing_geometry(*chip_directions(optics), optics, cam_from_lab, band)
+    camera = optics.camera
+    size_px = (camera.width_px, camera.height_px)
+    projected = isinstance(screen, layouts.ProjectorConfig)
+    w, h = (size // NODE_SPACING_PX + 2 for size in size_px) if projected else size_px
+    view = viewing_geometry(*node_views(optics, w, h), optics, cam_from_lab, band)
     if isinstance(config, light.CollimatedDisplayConfig):
         white = collimated_radiance_e_s_m2_sr(config, view.toward_lab, band)
     else:
         assert isinstance(config, light.DomeConfig)  # the screen is its layout
-        white = panel_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
-    glow = black_transmission(screen) * white * view.etendue_m2_sr()
-    return glow.reshape(optics.camera.height_px, optics.camera.width_px)
-
-
-def projector_glow(
-    config: light.DomeConfig,
-    optics: Optics,
-    cam_from_lab: Rotation,
-    camera_m: Floats,
-    band: Band,
-) -> Floats:
-    """`black_glow` of a projector's picture on the wall, which varies smoothly except at its edges.
-
-    It is computed at nodes at most NODE_SPACING_PX apart and interpolated between them.
-    """
-    assert isinstance(config.layout, layouts.ProjectorConfig)
-    camera = optics.camera
-    w, h = (size // NODE_SPACING_PX + 2 for size in (camera.width_px, camera.height_px))
-    nodes = pixel_directions(even_grid_px(camera, w, h), optics)
-    view = viewing_geometry(*nodes, optics, cam_from_lab, band)
-    white = projected_radiance_e_s_m2_sr(config, view.toward_lab, camera_m, band)
-    glow = (black_transmission(config.layout) * white * view.etendue_m2_sr()).reshape(h, w)
+        radiance = projected_radiance_e_s_m2_sr if projected else panel_radiance_e_s_m2_sr
+        white = radiance(config, view.toward_lab, camera_m, band)
+    glow = (black_transmission(screen) * white * view.etendue_m2_sr()).reshape(h, w)
+    if not projected:
+        return glow
     out = np.empty((camera.height_px, camera.width_px))
     fill(out, glow, 1.0)
     return out
 
 
 @lru_cache(maxsize=2)
-def chip_directions(optics: Optics) -> tuple[Floats, Floats]:
-    """Viewing directions of all pixels of the chip, (H * W, 3) in camera axes, and their solid angles."""
-    return pixel_directions(nodes_px(optics.camera, 1.0)[0], optics)
+def node_views(optics: Optics, columns: int, rows: int) -> tuple[Floats, Floats]:
+    """Viewing directions of an even grid of pixels, (rows * columns, 3) in camera axes, and their solid angles."""
+    return pixel_directions(even_grid_px(optics.camera, columns, rows), optics)
 
 
 def panel_radiance_e_s_m2_sr(

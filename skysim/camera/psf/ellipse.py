@@ -335,7 +335,7 @@ def fade(table: Singles, reach_px: float) -> None:
 
 @jit(fastmath=True)
 def sharpest_px(table: Singles) -> float:
-    """Half the peak over the steepest slope, like `kernel_cache.sharpness_px`, by differences of samples."""
+    """Half the peak over the steepest slope, like `Kernel.sharp_px`, by differences of samples."""
     samples = table.shape[0]
     size = table.shape[1]
     peak = np.float32(0)

@@ -11,7 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.camera.psf import ellipse
-from skysim.camera.psf.kernel import QUANTUM_PX, DiskImages, Kernel, build_kernel, reach_px
+from skysim.camera.psf.kernel import (
+    ELLIPSE,
+    GAUSS,
+    GRID,
+    QUANTUM_PX,
+    DiskImages,
+    build_kernel,
+    reach_px,
+)
 from skysim.camera.psf.otf import (
     NOT_ROUND,
     WINGED,
@@ -19,16 +27,10 @@ from skysim.camera.psf.otf import (
     chromatic_sigma_px,
     field_sigma_px,
 )
-from skysim.camera.psf.splat import PER_PX
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 
-# Kinds of kernel.
-GAUSS = 0
-ROUND = 1
-GRID = 2
-ELLIPSE = 3
 BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
 # Error, in units of the peak, below which a disk is drawn by its round image.
 MAX_ROUND_ERROR = 1e-4
@@ -48,7 +50,7 @@ class Kernels(NamedTuple):
     reach_px
         (N,) distance in x or in y beyond which there is no light
     sharp_px
-        (N,) size of the sharpest feature (`sharpness_px`); 1 for an ellipse, whose table is built later
+        (N,) size of the sharpest feature (as of `Kernel`); 1 for an ellipse, whose table is built later
     table
         (N, 4) begin and end of the source's table in `tables`, and two sizes of its shape
     tables
@@ -70,20 +72,17 @@ class Kernels(NamedTuple):
 
 
 class KernelCache(NamedTuple):
-    """A camera's kernels, laid end to end in the order of first use.
+    """A camera's kernels, their tables laid end to end in the order of first use.
 
     Attributes
     ----------
-    rows
-        Row of each key in the lists that follow
     kernels
-        Kind, sigma_px, reach_px and sharp_px of each kernel, and its row of `Kernels.table`
+        Kind, sigma_px, reach_px and sharp_px of each key's kernel, and its row of `Kernels.table`
     tables
         One element: all tables joined
     """
 
-    rows: dict[tuple[int, ...], int]
-    kernels: list[tuple[float, ...]]
+    kernels: dict[tuple[int, ...], tuple[float, ...]]
     tables: list[Singles]
 
 
@@ -95,7 +94,23 @@ MAX_RADIUS_PX = 500.0
 @lru_cache(maxsize=16)
 def kernel_cache(camera: CameraConfig) -> KernelCache:
     """The kernel cache of a camera, empty at first."""
-    return KernelCache({}, [], [np.empty(0, np.float32)])
+    return KernelCache({}, [np.empty(0, np.float32)])
+
+
+class SourceSizes(NamedTuple):
+    """Sizes of N images, px: (N,) each.
+
+    Attributes
+    ----------
+    sigma_px
+        Standard deviations of the Gaussian blurs in addition to the lens's
+    emitter_px, defocus_px
+        Radii of the emitters' disks and of the defocus disks; 0 for sources far outside the frame
+    """
+
+    sigma_px: Floats
+    emitter_px: Floats
+    defocus_px: Floats
 
 
 def source_kernels(
@@ -137,10 +152,22 @@ def source_kernels(
     InputError
         For a source too far out of focus.
     """
-    # 1.
-    sizes = source_sizes(
-        camera, xy_px, radius_m, is_led, distance_m, cos_field, blur_px, chromatic
-    )
+    # 1. Gaussian blurs add in squares.
+    position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
+    sigma = np.hypot(field_sigma_px(camera.psf, camera, position), blur_px)
+    shift_m: Floats | float = 0.0
+    if chromatic is not None:
+        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
+        shift_m = chromatic[:, 0]
+    emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
+    # Defocus depends on the distance along the boresight.
+    axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
+    defocus = blur_radius_px(camera, axial_m, shift_m)
+    size = np.array([camera.width_px, camera.height_px])
+    outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
+    # Sources far outside the frame have no image.
+    near = outside_px < MAX_RADIUS_PX
+    sizes = SourceSizes(sigma, np.where(near, emitter, 0.0), np.where(near, defocus, 0.0))
     axes_px = np.column_stack([sizes.emitter_px] * 2)
     if disks is not None:
         axes_px = disks.semi_axes_px()
@@ -157,53 +184,6 @@ def source_kernels(
     if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
         kernels = widened(kernels, sizes.sigma_px)
     return kernels
-
-
-class SourceSizes(NamedTuple):
-    """Sizes of N images, px: (N,) each.
-
-    Attributes
-    ----------
-    sigma_px
-        Standard deviations of the Gaussian blurs in addition to the lens's
-    emitter_px, defocus_px
-        Radii of the emitters' disks and of the defocus disks; 0 for sources far outside the frame
-    """
-
-    sigma_px: Floats
-    emitter_px: Floats
-    defocus_px: Floats
-
-
-def source_sizes(
-    camera: CameraConfig,
-    xy_px: Floats,
-    radius_m: Floats,
-    is_led: Bools,
-    distance_m: Floats,
-    cos_field: Floats,
-    blur_px: float,
-    chromatic: Floats | None,
-) -> SourceSizes:
-    """The sizes of N sources' images, with the arguments of `source_kernels`."""
-    # Gaussian blurs add in squares.
-    position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
-    sigma = field_sigma_px(camera.psf, camera, position)
-    if blur_px:
-        sigma = np.hypot(sigma, blur_px)
-    shift_m: Floats | float = 0.0
-    if chromatic is not None:
-        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
-        shift_m = chromatic[:, 0]
-    emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
-    # Defocus depends on the distance along the boresight.
-    axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
-    defocus = blur_radius_px(camera, axial_m, shift_m)
-    size = np.array([camera.width_px, camera.height_px])
-    outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
-    # Sources far outside the frame have no image.
-    near = outside_px < MAX_RADIUS_PX
-    return SourceSizes(sigma, np.where(near, emitter, 0.0), np.where(near, defocus, 0.0))
 
 
 def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
@@ -255,9 +235,8 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
         _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
     used = [tuple(key) for key in keys[first].tolist()]
     add_kernels(cache, camera, used)
-    rows = np.array([cache.rows[key] for key in used], dtype=np.int64)[inverse]
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
-    properties = np.array(cache.kernels).reshape(-1, 8)[rows]
+    properties = np.array([cache.kernels[key] for key in used]).reshape(-1, 8)[inverse]
     kind, sigma, reach, sharp = np.ascontiguousarray(properties[:, :4].T)
     spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
@@ -378,10 +357,9 @@ def add_kernels(
     tables = [cache.tables[0]]
     begin = len(cache.tables[0])
     # Each missing key once, in order.
-    for key in dict.fromkeys(key for key in keys if key not in cache.rows):
+    for key in dict.fromkeys(key for key in keys if key not in cache.kernels):
         properties, sizes, table = make_kernel(camera, key)
-        cache.rows[key] = len(cache.kernels)
-        cache.kernels.append((*properties, begin, begin + table.size, *sizes))
+        cache.kernels[key] = (*properties, begin, begin + table.size, *sizes)
         tables.append(table.ravel())
         begin += table.size
         if 4 * begin > 2 * CACHE_BYTES:
@@ -402,25 +380,7 @@ def make_kernel(
         box = ellipse.ellipse_box(camera.psf, camera, key[1])
         return (ELLIPSE, 0.0, key[1] + 0.5, 1.0), (box.waves, box.samples), box.table
     kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
-    kind = GRID if len(kernel.grid) else ROUND if len(kernel.radial) else GAUSS
-    table = kernel.grid if kind == GRID else kernel.radial
-    sizes = {GAUSS: (0, 0), ROUND: kernel.radial.shape[:2], GRID: kernel.grid.shape[1:3]}[
-        kind
-    ]
-    return (kind, kernel.sigma_px, kernel.reach_px, sharpness_px(kernel)), sizes, table
-
-
-def sharpness_px(kernel: Kernel) -> float:
-    """Motion of an image that changes its pixels little: half its peak over its steepest slope.
-
-    For the table of a Gaussian that is 0.82 sigma. For a soft edge it is 1.25 sigma, which is still safe: two nodes in
-    1.6 sigma leave a ripple of 0.5 exp(-2 pi^2 / 1.6^2) = 2e-4, and the ends' fraction falls with the disk's width.
-    For a Gaussian drawn by formula it is sigma with the pixel's own variance, 1/12, added.
-    """
-    if len(kernel.grid):
-        steps = kernel.grid.shape[0] - 3
-        slope = max(np.abs(np.diff(kernel.grid, axis=axis)).max() for axis in (0, 1)) * steps
-        return float(0.5 * kernel.grid.max() / slope)
-    if len(kernel.radial):
-        return float(0.5 * kernel.radial[0, 0] / (np.abs(kernel.radial[:, 1]).max() * PER_PX))
-    return float(np.sqrt(kernel.sigma_px**2 + 1 / 12))
+    # A grid's first two sides are equal.
+    sizes = kernel.table.shape[1:3] if kernel.kind == GRID else kernel.table.shape
+    properties = (kernel.kind, kernel.sigma_px, kernel.reach_px, kernel.sharp_px)
+    return properties, sizes, kernel.table

@@ -196,7 +196,6 @@ def number(cell: dict[str, str], key: str, default: float) -> float:
 
 
 SHELLS = {"cylinder": "shell_bent", "flat": "shell_flat"}  # all others are doubly curved
-COLUMNS = ("part", "quantity", "unit", "price", "fixed", "sum", "what")
 
 Quantities = dict[str, float]
 
@@ -213,6 +212,9 @@ class PartLine(NamedTuple):
     what: str
 
 
+COLUMNS = PartLine._fields
+
+
 class PartsList(NamedTuple):
     """The parts of a dome; the total is the sum of the lines, each rounded to a hundredth."""
 
@@ -222,6 +224,10 @@ class PartsList(NamedTuple):
     def total(self) -> float:
         """Sum of all lines."""
         return round(sum(line.sum for line in self.lines), 2)
+
+    def rows(self) -> list[list[str]]:
+        """The lines as texts, the total below them."""
+        return [*map(cells, self.lines), ["total", "", "", "", "", f"{self.total:.2f}", ""]]
 
     def groups(self) -> dict[str, float]:
         """The sums of shell, survey and all else; they add up to the total."""
@@ -372,9 +378,7 @@ def to_csv(parts: PartsList, name: str) -> str:
     text = io.StringIO()
     text.write(f"# Parts of {name}; the prices are those of the table that was given\n")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(cells(line) for line in parts.lines)
-    writer.writerow(["total", "", "", "", "", f"{parts.total:.2f}", ""])
+    writer.writerows([COLUMNS, *parts.rows()])
     return text.getvalue()
 
 

@@ -127,15 +127,11 @@ def scenes_parts(
         lines = [line._asdict() for line in found.lines]
         print_json({"parts": lines, "groups": found.groups(), "total": found.total})
         return
-    rows = [
-        *map(parts.cells, found.lines),
-        ["total", "", "", "", "", f"{found.total:.2f}", ""],
-    ]
     columns = [
         Column(head, kind="text" if head in ("part", "what") else "number")
         for head in parts.COLUMNS
     ]
-    print_table(Table(columns, rows), f"Parts of {loaded.name}, prices: {prices}")
+    print_table(Table(columns, found.rows()), f"Parts of {loaded.name}, prices: {prices}")
     shares = [
         f"{name} {cost:.2f} ({cost / max(found.total, 0.01):.0%})"
         for name, cost in found.groups().items()
