@@ -101,8 +101,7 @@ def interval_text(low: float, high: float) -> str:
 
 def slopes(function: Callable[[Floats], Any], at: Floats, step: Floats) -> Floats:
     """(K, ...) derivatives by K parameters, by central differences; 0 for a parameter without a step."""
-    moved = (np.diag(step)[n] for n in range(len(at)))
-    rises = [function(at + one) - function(at - one) for one in moved]
+    rises = [function(at + one) - function(at - one) for one in np.diag(step)]
     return np.array([rise / (2 * one or 1.0) for rise, one in zip(rises, step, strict=True)])
 
 
