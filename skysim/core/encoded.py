@@ -74,9 +74,9 @@ class Tiff:
         return "<" if self.data.startswith(b"II") else ">"
 
     @property
-    def kinds(self) -> str:
+    def kinds(self) -> tuple[str, str]:
         """Format characters of the number of entries and of an offset: a BigTIFF has both of 64 bits."""
-        return "QQ" if self.number("H", 2) == 43 else "HI"
+        return ("Q", "Q") if self.number("H", 2) == 43 else ("H", "I")
 
     def number(self, kind: str, at: int) -> int:
         """The integer at an offset; `kind` is its format character in the module struct."""

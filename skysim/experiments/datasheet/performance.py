@@ -2,7 +2,7 @@
 
 import math
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -57,8 +57,8 @@ def counts(sheet: MeasuredFrames, rows: CellRows, by_field: bool = False) -> Cou
     by_field
         Whether the frames of a field, one in each of the cells, count as one
     """
-    right = sheet.right(rows)
-    false = sheet.false(rows)
+    right: Any = sheet.right(rows)
+    false: Any = sheet.false(rows)
     if by_field:
         right = right.all(axis=0)
         false = false.any(axis=0)
