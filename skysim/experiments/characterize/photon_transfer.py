@@ -120,6 +120,12 @@ def median_and_spread(values: Floats) -> tuple[float, float]:
     return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
+def blocks(image: NDArray, side: int) -> NDArray:
+    """(rows, side, columns, side) square blocks of an image; incomplete ones at the right and below are cut off."""
+    rows, columns = (size // side for size in image.shape)
+    return image[: rows * side, : columns * side].reshape(rows, side, columns, side)
+
+
 # Frames of one exposure, reduced to two mean frames and the temporal variance of every pixel.
 
 
