@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
+from struct import calcsize
 from typing import Any, NamedTuple
 
 import cv2
@@ -73,9 +74,9 @@ class Tiff:
         return "<" if self.data.startswith(b"II") else ">"
 
     @property
-    def is_big(self) -> bool:
-        """Whether it is a BigTIFF, with offsets of 64 bits."""
-        return self.number("H", 2) == 43
+    def kinds(self) -> tuple[str, str]:
+        """Format characters of the number of entries and of an offset: a BigTIFF has both of 64 bits."""
+        return ("Q", "Q") if self.number("H", 2) == 43 else ("H", "I")
 
     def number(self, kind: str, at: int) -> int:
         """The integer at an offset; `kind` is its format character in the module struct."""
@@ -83,30 +84,28 @@ class Tiff:
 
     def directories(self) -> Iterator[int]:
         """Yield the offsets of the first MAX_DIRECTORIES directories, one for each image."""
-        offset, size, head = ("Q", 20, 8) if self.is_big else ("I", 12, 2)
-        place = 8 if self.is_big else 4
+        count, offset = self.kinds
+        place = calcsize(offset)
+        size = 4 + 2 * place  # of an entry: tag, type, number of values, value field
         for _ in range(MAX_DIRECTORIES):
             at = self.number(offset, place)
             if not at:
                 return
             yield at
-            place = at + head + size * self.number("Q" if self.is_big else "H", at)
+            place = at + calcsize(count) + size * self.number(count, at)
 
     def entries(self, at: int | None = None) -> Iterator[TiffEntry]:
         """Yield the entries of the directory at an offset, or of the first directory."""
-        big = self.is_big
+        count, offset = self.kinds
         if at is None:
             at = next(self.directories(), 0)
-        count = self.number("Q" if big else "H", at)
-        # Bytes of an entry, of the count before the first one, and offset of the value field in an entry.
-        size, head, value = (20, 8, 12) if big else (12, 2, 8)
-        for n in range(min(count, MAX_ENTRIES)):
-            begin = at + head + n * size
+        value = 4 + calcsize(offset)  # offset of the value field in an entry
+        begin = at + calcsize(count)
+        for _ in range(min(self.number(count, at), MAX_ENTRIES)):
             tag = self.number("H", begin)
             kind = self.number("H", begin + 2)
-            yield TiffEntry(
-                tag, kind, self.number("Q" if big else "I", begin + 4), begin + value
-            )
+            yield TiffEntry(tag, kind, self.number(offset, begin + 4), begin + value)
+            begin += value + calcsize(offset)
 
     def value(self, entry: TiffEntry) -> int | None:
         """The first value of an entry, if it is an integer in the entry itself; else None."""
@@ -129,8 +128,9 @@ def image_size(data: bytes, at: int | None = None) -> tuple[int, int, int, int, 
             values[entry.tag] = max(values[entry.tag], tiff.value(entry) or 0)
         elif entry.tag == BITS_TAG:
             # The values are in the entry itself, or at an offset in it.
-            inside = entry.values * 2 <= (8 if tiff.is_big else 4)
-            place = entry.at if inside else tiff.number("Q" if tiff.is_big else "I", entry.at)
+            offset = tiff.kinds[1]
+            inside = entry.values * 2 <= calcsize(offset)
+            place = entry.at if inside else tiff.number(offset, entry.at)
             bits = max(bits, tiff.number("H", place))
     width, height, samples, planar = values.values()
     return (

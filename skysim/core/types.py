@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.jit import jit
 from skysim.core.quaternion import interpolate
 
 Floats = NDArray[np.float64]
@@ -322,24 +321,9 @@ class StarSources(Sources):
         first, last = np.searchsorted(
             sorted_place[:, 2], (ends[0] - ROUNDING, ends[1] + ROUNDING)
         )
-        # An angle a is a chord 2 sin(a / 2) of the unit sphere.
-        chord = 2.0 * math.sin(min(angle_rad, math.pi) / 2.0)
-        near = _closer(sorted_place[first:last], np.asarray(direction), chord)
-        return np.sort(order[first + near])
-
-
-@jit
-def _closer(place: Floats, direction: Floats, chord: float) -> Ints:
-    """Rows of the unit vectors (N, 3) whose distance from another one is at most a chord."""
-    found = np.empty(len(place), np.int64)
-    count = 0
-    for n in range(len(place)):
-        x = place[n, 0] - direction[0]
-        y = place[n, 1] - direction[1]
-        z = place[n, 2] - direction[2]
-        found[count] = n
-        count += x * x + y * y + z * z <= chord * chord
-    return found[:count]
+        cosine = math.cos(min(angle_rad, math.pi))
+        near = sorted_place[first:last] @ direction >= cosine - ROUNDING
+        return np.sort(order[first:last][near])
 
 
 @dataclass(frozen=True, slots=True)

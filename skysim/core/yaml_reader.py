@@ -304,16 +304,14 @@ def set_key(tree: Tree, key: str, value: str) -> None:
     for depth, parent in enumerate(parents):
         if isinstance(node, dict):
             node.setdefault(parent, {})
-        node = node[parent if isinstance(node, dict) else list_index(node, parent, key)]
+        node = node[index_in(node, parent, key)]
         if not isinstance(node, dict | list):
             section = excerpt(".".join(parents[: depth + 1]))
             raise InputError(
                 excerpt(key), f"{section} holds a value, not keys", where=OVERRIDES
             )
     try:
-        node[last if isinstance(node, dict) else list_index(node, last, key)] = parse_yaml(
-            value
-        )[1]
+        node[index_in(node, last, key)] = parse_yaml(value)[1]
     except yaml.YAMLError as error:
         raise InputError(
             excerpt(key), f"{excerpt(repr(value))} is not YAML", where=OVERRIDES
@@ -337,8 +335,10 @@ def opened_sections(before: list[str], sections: list[str]) -> list[str]:
     ]
 
 
-def list_index(values: list[Any], component: str, key: str) -> int:
-    """A component of a dotted key as a list index. Raises InputError if it is none."""
+def index_in(values: Any, component: str, key: str) -> Any:
+    """A component of a dotted key as the key of a mapping or the index of a list. Raises InputError if it is none."""
+    if isinstance(values, dict):
+        return component
     digits = component.isascii() and component.isdigit() and len(component) < 10
     if not digits or int(component) >= len(values):
         raise InputError(

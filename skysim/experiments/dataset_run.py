@@ -254,14 +254,13 @@ class ShardQueue:
     """The missing shards, one per chunk."""
 
     def __init__(self, missing: list[int]) -> None:
-        self.missing = list(reversed(missing))
+        self.chunks = (
+            (Segment(shard, {}, shard, range(shard, shard + 1)),) for shard in missing
+        )
 
     def next(self) -> Chunk:
         """The next shard as a chunk; empty if nothing is left."""
-        if not self.missing:
-            return ()
-        shard = self.missing.pop()
-        return (Segment(shard, {}, shard, range(shard, shard + 1)),)
+        return next(self.chunks, ())
 
     def report_time(self, chunk: Chunk, seconds: float) -> None:
         """Do nothing: the size of a shard is fixed by the plan."""

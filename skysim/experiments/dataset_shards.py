@@ -180,20 +180,16 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
         "exposure_s": frame.exposure_s,
         "saturation_dn": frame.saturation_dn,
     }
-    for name in ATTITUDES:
-        quaternion = getattr(truth, name).as_quat()
-        labels |= {
-            f"{name}_q{end}": float(q) for end, q in zip("xyzw", quaternion, strict=True)
-        }
-    labels |= {
-        f"rate_cam_{end}_rad_s": float(rate)
-        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
+    vectors = {
+        tuple(f"{name}_q{end}" for end in "xyzw"): getattr(truth, name).as_quat()
+        for name in ATTITUDES
     }
+    vectors[tuple(f"rate_cam_{end}_rad_s" for end in "xyz")] = truth.rate_cam_rad_s
     if isinstance(scene.light, StarsConfig):
-        angles = np.degrees(ra_dec_roll_rad(truth.mean_cam_from_lab))
-        labels |= dict(
-            zip(("ra_deg", "dec_deg", "roll_deg"), map(float, angles), strict=True)
-        )
+        angles_rad = ra_dec_roll_rad(truth.mean_cam_from_lab)
+        vectors["ra_deg", "dec_deg", "roll_deg"] = np.degrees(angles_rad)
+    for names, values in vectors.items():
+        labels |= zip(names, values.tolist(), strict=True)
     labels |= {"sources": len(one.sources), "detected": int(one.sources["detected"].sum())}
     labels["unmatched"] = len(one.unmatched_px)
     return labels | {f"{name}_pixels": sum(one.masks.get(name, [])[1::2]) for name in MASKS}

@@ -6,7 +6,6 @@ view. Such a solution only shows the cause; it is never the answer.
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -252,7 +251,7 @@ def unknown_cause(refusal: Refusal) -> str:
     return f"{text}; {field}{deeper_catalog(solver, share)}"
 
 
-CAUSES: tuple[Callable[[Refusal], str], ...] = (
+CAUSES = (
     shallow_catalog,
     mirrored,
     other_field,

@@ -26,6 +26,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
     Transfer,
+    blocks,
     exposures_s,
     median_and_spread,
     slopes,
@@ -310,23 +311,16 @@ def prnu(
 
 def smooth(image: Floats, usable: Bools) -> Floats:
     """The polynomial in x and y of total order ORDER, fitted to means of blocks of usable pixels."""
-    height, width = image.shape
-    rows = height // SAMPLE * SAMPLE
-    columns = width // SAMPLE * SAMPLE
-    weight = usable[:rows, :columns].astype(np.float64)
-
-    def blocks(plane: Floats) -> Floats:
-        split = plane.reshape(rows // SAMPLE, SAMPLE, columns // SAMPLE, SAMPLE)
-        return split.sum(axis=(1, 3)).ravel()
-
-    count = blocks(weight)
-    y, x = np.mgrid[0:rows:SAMPLE, 0:columns:SAMPLE] + (SAMPLE - 1) / 2
-    mean = blocks(weight * image[:rows, :columns]) / np.maximum(count, 1)
+    count, total = (
+        blocks(plane, SAMPLE).sum(axis=(1, 3)) for plane in (usable, usable * image)
+    )
+    mean = total.ravel() / np.maximum(count.ravel(), 1)
+    middle = np.indices(count.shape).reshape(2, -1) * SAMPLE + (SAMPLE - 1) / 2
     # Powers of y and x, from -1 to 1 over the chip, of total order ORDER at most.
     low = np.add.outer(*[np.arange(ORDER + 1)] * 2) <= ORDER
-    places = (2 * y.ravel() / height - 1, 2 * x.ravel() / width - 1)
-    design = polynomial.polyvander2d(*places, (ORDER, ORDER))[:, low.ravel()]
-    root = np.sqrt(count)
+    y, x = 2 * middle / np.array(image.shape)[:, None] - 1
+    design = polynomial.polyvander2d(y, x, (ORDER, ORDER))[:, low.ravel()]
+    root = np.sqrt(count.ravel())
     matrix = np.zeros(low.shape)
     matrix[low] = np.linalg.lstsq(design * root[:, None], mean * root, rcond=None)[0]
     down, across = (2 * np.arange(size) / size - 1 for size in image.shape)

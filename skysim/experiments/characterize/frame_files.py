@@ -27,6 +27,7 @@ from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
     LevelBuilder,
+    blocks,
     exposures_s,
     median_and_spread,
 )
@@ -430,10 +431,7 @@ def block_side(image: Floats) -> int:
 
 def block_medians(image: Floats) -> Floats:
     """Medians of square blocks, at most BLOCK pixels wide, and small enough that there are at least nine."""
-    side = block_side(image)
-    rows, columns = (size // side for size in image.shape)
-    blocks = image[: rows * side, : columns * side].reshape(rows, side, columns, side)
-    return np.median(blocks, axis=(1, 3))
+    return np.median(blocks(image, block_side(image)), axis=(1, 3))
 
 
 def chance_range(image: Floats, medians: Floats) -> float:

@@ -135,7 +135,7 @@ def fit_images(
     p = np.column_stack([xy_px - corner, flux, sky, start, start])
     damping = np.full(len(p), 1e-3)
     expected, slopes = model(p)
-    chi2 = np.full(len(p), np.inf)
+    limited = [X, Y, LN_SX, LN_SY]
     for _ in range(STEPS):
         weight = 1 / (gain_dn_e * np.maximum(expected, 0.0) + read_dn2 + ROUNDING_DN2)
         residual = pixels - expected
@@ -148,14 +148,13 @@ def fit_images(
             * (damping[:, None] * np.diagonal(normal, axis1=1, axis2=2) + 1e-12)[:, None, :]
         )
         step = np.linalg.solve(damped, gradient[:, :, None])[:, :, 0]
-        limited = np.clip(step[:, [X, Y, LN_SX, LN_SY]], -MAX_STEP, MAX_STEP)
-        step[:, [X, Y, LN_SX, LN_SY]] = limited
+        step[:, limited] = np.clip(step[:, limited], -MAX_STEP, MAX_STEP)
         trial = p + step
         trial_expected, trial_slopes = model(trial)
         better = np.sum(weight * (pixels - trial_expected) ** 2, axis=1) <= chi2 * (1 + 1e-12)
-        p = np.where(better[:, None], trial, p)
-        expected = np.where(better[:, None], trial_expected, expected)
-        slopes = np.where(better[:, None, None], trial_slopes, slopes)
+        p[better] = trial[better]
+        expected[better] = trial_expected[better]
+        slopes[better] = trial_slopes[better]
         damping = np.where(better, damping / 10, damping * 10)
         if np.all(np.einsum("ni,nij,nj->n", step, normal, step) < CONVERGED**2):
             break
@@ -166,30 +165,30 @@ def summary(
     p: Floats, corner: Floats, residual: Floats, normal: Floats, chi2: Floats
 ) -> StarImages:
     """The star images from the parameters of the fits."""
-    covariance = np.linalg.inv(normal)
-    sx2 = np.exp(2 * p[:, LN_SX])
-    sy2 = np.exp(2 * p[:, LN_SY])
-    slope = np.zeros((len(p), 6))
-    # Slope of (s_x^2 + s_y^2) / 2.
-    slope[:, LN_SX] = sx2
-    slope[:, LN_SY] = sy2
-    error = np.sqrt(np.einsum("ni,nij,nj->n", slope, covariance, slope))
+    # (N, 2) s_x^2 and s_y^2, which are also the slopes of their mean by the logarithms of s_x and s_y.
+    variance = np.exp(2 * p[:, LN_SX:])
+    covariance = np.linalg.inv(normal)[:, LN_SX:, LN_SX:]
+    error = np.sqrt(np.einsum("ni,nij,nj->n", variance, covariance, variance))
     # A tilt leaves residuals F c g (x - x0)(y - y0) / (s_x^2 s_y^2), c the covariance, to first order.
     span = np.arange(2 * HALF_PX + 1)
-    u = (span - p[:, X, None]) / sx2[:, None]
-    v = (span - p[:, Y, None]) / sy2[:, None]
-    gx = integrals(p[:, X], p[:, LN_SX])[0]
-    gy = integrals(p[:, Y], p[:, LN_SY])[0]
-    tilt = p[:, FLUX, None] * ((v * gy)[:, :, None] * (u * gx)[:, None, :]).reshape(
-        len(p), -1
+    across, down = (
+        (span - p[:, axis, None])
+        / variance[:, axis, None]
+        * integrals(p[:, axis], p[:, LN_SX + axis])[0]
+        for axis in (X, Y)
     )
-    covariance_px2 = np.sum(tilt * residual, axis=1) / np.maximum(
-        np.sum(tilt**2, axis=1), 1e-300
-    )
-    stretch = np.column_stack([sx2 - sy2, 2 * covariance_px2])
+    tilt = np.einsum("n,ny,nx->nyx", p[:, FLUX], down, across).reshape(len(p), -1)
+    square = np.maximum(np.sum(tilt**2, axis=1), 1e-300)
+    covariance_px2 = np.sum(tilt * residual, axis=1) / square
+    stretch = np.column_stack([-np.diff(variance), 2 * covariance_px2])
     freedom = residual.shape[1] - 6
     return StarImages(
-        corner + p[:, [X, Y]], p[:, FLUX], (sx2 + sy2) / 2, error, stretch, chi2 / freedom
+        corner + p[:, [X, Y]],
+        p[:, FLUX],
+        variance.mean(axis=1),
+        error,
+        stretch,
+        chi2 / freedom,
     )
 
 
@@ -212,9 +211,9 @@ def image_size(
         if kept.sum() < 3:
             return None
         error = relative * expected
-        weight = np.where(kept, 1 / error**2, 0.0)
-        normal = np.linalg.inv((design.T * weight) @ design)
-        found = normal @ ((design.T * weight) @ stars.variance_px2)
+        weighted = design.T * np.where(kept, 1 / error**2, 0.0)
+        normal = np.linalg.inv(weighted @ design)
+        found = normal @ (weighted @ stars.variance_px2)
         expected = np.maximum(design @ found, LEAST_VARIANCE_PX2)
         pull = (stars.variance_px2 - expected) / (relative * expected)
         again = sound & (

@@ -101,8 +101,7 @@ def interval_text(low: float, high: float) -> str:
 
 def slopes(function: Callable[[Floats], Any], at: Floats, step: Floats) -> Floats:
     """(K, ...) derivatives by K parameters, by central differences; 0 for a parameter without a step."""
-    moved = (np.diag(step)[n] for n in range(len(at)))
-    rises = [function(at + one) - function(at - one) for one in moved]
+    rises = [function(at + one) - function(at - one) for one in np.diag(step)]
     return np.array([rise / (2 * one or 1.0) for rise, one in zip(rises, step, strict=True)])
 
 
@@ -119,6 +118,12 @@ def median_and_spread(values: Floats) -> tuple[float, float]:
     """Median and robust standard deviation."""
     median = float(np.median(values))
     return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
+
+
+def blocks(image: NDArray, side: int) -> NDArray:
+    """(rows, side, columns, side) square blocks of an image; incomplete ones at the right and below are cut off."""
+    rows, columns = (size // side for size in image.shape)
+    return image[: rows * side, : columns * side].reshape(rows, side, columns, side)
 
 
 # Frames of one exposure, reduced to two mean frames and the temporal variance of every pixel.

@@ -49,21 +49,21 @@ class Counts(NamedTuple):
         )
 
 
-def counts(sheet: MeasuredFrames, rows: CellRows) -> Counts:
-    """The outcomes of some cells."""
-    return tally(sheet.right(rows), sheet.false(rows))
+def counts(sheet: MeasuredFrames, rows: CellRows, by_field: bool = False) -> Counts:
+    """The outcomes of some cells.
 
-
-def counts_of_fields(sheet: MeasuredFrames, rows: CellRows) -> Counts:
-    """The outcomes of fields with a frame in each of some cells; the frames of a field count as one."""
-    return tally(sheet.right(rows).all(axis=0), sheet.false(rows).any(axis=0))
-
-
-def tally(right: Any, false: Any) -> Counts:
-    """Counts from boolean arrays of right and of false attitudes; all others are refused."""
-    return Counts(
-        right.size, int(right.sum()), int((~right & ~false).sum()), int(false.sum())
-    )
+    Parameters
+    ----------
+    by_field
+        Whether the frames of a field, one in each of the cells, count as one
+    """
+    right: Any = sheet.right(rows)
+    false: Any = sheet.false(rows)
+    if by_field:
+        right = right.all(axis=0)
+        false = false.any(axis=0)
+    refused = ~right & ~false
+    return Counts(right.size, *(int(one.sum()) for one in (right, refused, false)))
 
 
 def claims(found: Counts) -> Rows:
@@ -126,7 +126,7 @@ def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
     first, second = (sheet.errors([row]) for row in rows[:2])
     found: Record = {
-        "counts": counts_of_fields(sheet, rows),
+        "counts": counts(sheet, rows, by_field=True),
         **rms_by_group(sheet, rows),
         "nees": mean_nees(sheet, rows),
         "intervals": {},

@@ -247,21 +247,24 @@ def at_path(result: Any, path: str) -> float:
 
 
 def evaluate(response: str, number: Number) -> Ours:
-    """The value of a response: one term, or two with - or / between them; independent errors add in quadrature."""
+    """The value of a response: one term, or two with - or / between them.
+
+    Independent errors add in quadrature, each times the derivative of the value by its term.
+    """
     if both := BOTH.match(response):
         a = evaluate(both[1], number)
         b = evaluate(both[3], number)
-        if both[2] == "-":
-            return Ours(
-                a.value - b.value,
-                math.hypot(a.error, b.error),
-                math.hypot(a.deviation, b.deviation),
-                max(a.runs, b.runs),
-            )
-        ratio = a.value / b.value
-        relative = math.hypot(a.error / a.value, b.error / b.value) if a.value else 0.0
-        spread = math.hypot(a.deviation / a.value, b.deviation / b.value) if a.value else 0.0
-        return Ours(ratio, abs(ratio) * relative, abs(ratio) * spread, max(a.runs, b.runs))
+        value = a.value - b.value
+        by_a = by_b = 1.0
+        if both[2] == "/":
+            value = a.value / b.value
+            by_a = 1 / b.value
+            by_b = value / b.value
+        error, deviation = (
+            math.hypot(by_a * one, by_b * two)
+            for one, two in ((a.error, b.error), (a.deviation, b.deviation))
+        )
+        return Ours(value, error, deviation, max(a.runs, b.runs))
     term = TERM.fullmatch(response)
     if not term:
         raise ValueError("no response")

@@ -35,7 +35,6 @@ camera's position, so its J_i has three more columns. Errors of star places are 
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -225,7 +224,7 @@ def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Float
     return np.einsum("nij,nj->ni", view.gradient, shift_cam)[:, :, None]
 
 
-CAUSES: dict[str, Callable[[View, Rotation, Context], Floats | None]] = {
+CAUSES = {
     "common survey": common_survey,
     "survey set-up": survey_setup,
     "lever survey": lever_survey,

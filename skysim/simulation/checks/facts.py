@@ -6,7 +6,6 @@ Each function in `FACTS` returns one fact from the plan, or None if the plan doe
 import math
 import re
 from collections import Counter
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -558,7 +557,7 @@ def causes(sampled: Sampled, angle: str) -> dict[str, float]:
     }
 
 
-FACTS: tuple[Callable[[Plan], Fact | None], ...] = (
+FACTS = (
     field_of_view,
     lights_in_field,
     other_lights,

@@ -529,7 +529,7 @@ def image_px(
     return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))
 
 
-FINDINGS: tuple[Callable[[Plan], str], ...] = (
+FINDINGS = (
     bright_background,
     black_level,
     saturation,

@@ -1,7 +1,6 @@
 """Facts and warnings about the vehicle of a plan: mass properties, actuators, and the maneuver beside the exposures."""
 
 import math
-from collections.abc import Callable
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -173,12 +172,12 @@ def ignored_parts(plan: Plan) -> str:
     return f"vehicle.model: {ignored}: not used; those of the scene's section vehicle are; remove them"
 
 
-FACTS: tuple[Callable[[Plan], Fact | None], ...] = (
+FACTS = (
     mass_properties,
     actuators,
     maneuver,
 )
-FINDINGS: tuple[Callable[[Plan], str], ...] = (
+FINDINGS = (
     inherited_vehicle,
     free_joints,
     ignored_parts,

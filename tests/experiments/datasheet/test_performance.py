@@ -97,7 +97,7 @@ def test_frames_of_one_field_count_once():
             for name in outcome
         }
     )
-    assert performance.counts_of_fields(sheet, [0, 1]) == Counts(4, 1, 1, 2)
+    assert performance.counts(sheet, [0, 1], by_field=True) == Counts(4, 1, 1, 2)
 
 
 def sky_sheet(errors_over_sigma: tuple[float, float, float]) -> datasheet_run.MeasuredFrames:
