@@ -48,7 +48,6 @@ TARGETS = {
     "packets": (),
     "commands": (),
     "poses": (),
-    "datagrams": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)
