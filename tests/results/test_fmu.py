@@ -11,15 +11,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Record
+from skysim.dynamics.multibody import actuators
 from skysim.results.files import fmu
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import build_lab
 
 fmpy = pytest.importorskip("fmpy")
+validation = pytest.importorskip("fmpy.validation")
 pythonfmu3 = pytest.importorskip("pythonfmu3")
 
 PERIOD_S = 0.01
@@ -287,17 +290,18 @@ def test_a_process_that_ends_or_cannot_start_is_an_error(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["simsat_cmg", "two_heads"])
+@pytest.mark.parametrize("name", ["simsat_cmg", "two_heads", "simsat_thrusters"])
 def test_descriptions_are_valid(name: str, tmp_path: Path):
     """By fmpy's checks, which include the schema of FMI 3.0; variables are those that the scene has."""
     path = tmp_path / "one.fmu"
     fmu.write_unit(path, skysim.load_scene(name))
-    assert fmpy.validation.validate_fmu(str(path)) == []
+    assert validation.validate_fmu(str(path)) == []
     variables = fmpy.read_model_description(str(path)).modelVariables
     assert all(one.description for one in variables)
     names = [one.name for one in variables]
-    has_motors = name == "simsat_cmg"
-    assert ("cmgs" in names) == ("true.gimbal_rad" in names) == has_motors
+    has_motors = name != "two_heads"
+    assert ("cmgs" in names) == ("true.gimbal_rad" in names) == (name == "simsat_cmg")
+    assert ("thrusters" in names) == ("true.propellant_kg" in names) == ("thrusters" in name)
     # Its motion is prescribed.
     assert ("torque_nm" in names) == has_motors
     assert ("side.solved" in names) != has_motors
@@ -388,3 +392,10 @@ def test_a_host_in_c_runs_the_unit(bump: Path, tmp_path: Path):
             flight.step()
         wanted = flight.state.rate_body_rad_s
     assert [float(one) for one in done.stdout.split()] == pytest.approx(wanted, abs=1e-12)
+
+
+def test_every_kind_of_actuators_has_its_texts() -> None:
+    """A kind that is added without them would end the export of each scene that has it."""
+    texts = yaml.safe_load((fmu.SOURCES / "variables.yaml").read_text(encoding="utf-8"))
+    assert {"ideal", *(kind.key for kind in actuators.KINDS)} <= set(texts["variables"])
+    assert {unit for unit, _ in texts["variables"].values() if unit} <= set(texts["units"])

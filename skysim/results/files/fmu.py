@@ -156,6 +156,7 @@ class LabUnit:
             "true.rate_body_rad_s": state.rate_body_rad_s,
             "true.wheel_rad_s": state.wheel_rad_s,
             "true.gimbal_rad": state.gimbal_rad,
+            **{f"true.{name}": reading for name, reading in state.readings.items()},
         }
         navigation = self.flight.motion.navigation
         if navigation:
