@@ -14,7 +14,7 @@ import pytest
 
 from skysim.core.paths import ROOT
 from tests.fuzz.__main__ import NAMES, seeds
-from tests.fuzz.targets import TARGETS
+from tests.fuzz.targets import TARGETS, commanded_flight
 
 SEEDS = 12  # of each target: its readers are reached by any
 # By its name, if it is public.
@@ -108,6 +108,7 @@ OUT_OF_REACH = {
     "skysim.results.run_report.run_report": "takes a picture of ours into a page",
     "skysim.experiments.study.execution.setups.code_version": SOURCES,
     "skysim.experiments.study.execution.setups.scene_hash": SOURCES,
+    "skysim.experiments.study.execution.dask_engine.decode_chunk": OURS,
     "skysim.tracking.computer_time.fastest_mhz": "the system's own file, /proc/cpuinfo",
     "skysim.tracking.tracker_host.receive_picture": OURS,
     "skysim.tracking.tracker_interface.Setup.of_tree": OURS,
@@ -144,6 +145,7 @@ def functions(tree: ast.AST, above: str) -> Iterator[tuple[str, Any]]:
 def called() -> set[str]:
     """Functions that run while every target reads part of its corpus."""
     codes: set[CodeType] = set()
+    commanded_flight.cache_clear()  # what another test has opened would not be called again
 
     def watch(frame: FrameType, event: str, _: Any) -> None:
         if event == "call":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -97,7 +96,6 @@ def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(
 # A module for workers to import: trials that do nothing, or now and then kill their worker.
 STUBS = """
 import os
-import pickle
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution import engines
 from skysim.experiments.study.execution.outcomes import Outcome
@@ -331,16 +329,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     yield from cluster_of(tmp_path_factory.mktemp("dask"), "--no-nanny", count=2)
 
 
-class Echo:
-    """A job whose rows are the segments of its chunk."""
-
-    def run(self, chunk: engines.Chunk) -> list[trials.Segment]:
-        return list(chunk)
-
-
-def test_a_chunk_travels_as_bytes_and_comes_back_bit_for_bit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
     from skysim.experiments.study.execution import dask_engine
 
     settings = {
@@ -352,9 +341,7 @@ def test_a_chunk_travels_as_bytes_and_comes_back_bit_for_bit(
         trials.Segment(3, settings, 41, range(7, 12)),
         trials.Segment(4, {}, 46, range(0, 1)),
     )
-    monkeypatch.setitem(dask_engine.JOBS, "echo", Echo())
-    rows, _ = dask_engine.run_encoded("echo", pickle.dumps(chunk))
-    assert tuple(rows) == chunk
+    assert dask_engine.decode_chunk(dask_engine.encode_chunk(chunk)) == chunk
 
 
 @pytest.mark.long

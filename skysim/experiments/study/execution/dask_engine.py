@@ -4,8 +4,8 @@ Scheduler and workers need this version of skysim. Each worker should be a proce
 `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 dask worker ADDRESS --nworkers 8 --nthreads 1`
 """
 
+import json
 import logging
-import pickle
 import time
 from collections import deque
 from concurrent.futures import CancelledError
@@ -29,6 +29,7 @@ from skysim.experiments.study.execution.engines import (
     split_chunk,
 )
 from skysim.experiments.study.execution.setups import code_version
+from skysim.experiments.study.execution.trials import Segment
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
@@ -129,10 +130,9 @@ def collect_rows(
         room = (1 if alone else capacity) - len(in_flight)
         new = list(islice(source, max(room, 0)))
         # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
-        # Chunks are bytes, because Dask searches other arguments for its task keys.
         futures = (
             client.map(
-                run_encoded, [name] * len(new), list(map(pickle.dumps, new)), pure=False
+                run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False
             )
             if new
             else []
@@ -161,6 +161,24 @@ def collect_rows(
             yield rows
 
 
+def encode_chunk(chunk: Chunk) -> str:
+    """A chunk as JSON text, because Dask searches other arguments for its task keys. Floats round-trip exactly."""
+    rows = [
+        (one.point, one.settings, one.first, one.replicates.start, one.replicates.stop)
+        for one in chunk
+    ]
+    return json.dumps(rows, default=str)  # YAML dates become text, which scenes accept
+
+
+def decode_chunk(text: str) -> Chunk:
+    """The chunk in a text made by `encode_chunk`."""
+    rows = json.loads(text)
+    return tuple(
+        Segment(point, settings, first, range(*replicates))
+        for point, settings, first, *replicates in rows
+    )
+
+
 # On the workers.
 
 JOBS: dict[str, Job] = {}  # job of each run that this worker serves
@@ -186,16 +204,13 @@ class JobPlugin(WorkerPlugin):
         JOBS.pop(self.name, None)
 
 
-def run_encoded(name: str, data: bytes) -> tuple[list[Any], float]:
-    """`run_timed` of a pickled chunk with the run's job on this worker.
-
-    Raises InputError if `JobPlugin.setup` rejected it.
-    """
+def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
+    """`run_timed` with the run's job on this worker. Raises InputError if `JobPlugin.setup` rejected it."""
     if name not in JOBS:
         raise InputError(
             "scheduler", f"a new worker has skysim {code_version()}", "the version of the run"
         )
-    return run_timed(JOBS[name], pickle.loads(data))
+    return run_timed(JOBS[name], decode_chunk(text))
 
 
 class Dask:
