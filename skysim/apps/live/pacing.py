@@ -9,6 +9,7 @@
 """
 
 import threading
+import gc
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -135,6 +136,8 @@ class Live:
     def run(self) -> None:
         """Fly until the end, or until all outputs have failed."""
         self.warm_up()
+        # A pass over all that a scene has loaded takes longer than a control period.
+        gc.freeze()
         self.pace.start(0.0)
         while not self.flight.is_over and not self.is_abandoned:
             self.advance()
