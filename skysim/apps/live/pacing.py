@@ -8,8 +8,8 @@
    period or more before its rendering starts is dropped.
 """
 
-import threading
 import gc
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
