@@ -26,7 +26,7 @@ extras: $(READY)
 	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
 	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
 
-.PHONY: compile extras baseline bench accept demo test test-slow test-both test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
+.PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
 setup: $(READY)
 
 demo: $(READY)
@@ -46,10 +46,6 @@ test: $(READY)
 
 test-slow: $(READY) $(EXTRA)s3+query
 	$(PYTEST) -m "(slow or compiles) and not long and not browser"
-
-# Those of the two in one run, as CI has them: what both ask for is made once.
-test-both: $(READY) $(EXTRA)s3+query
-	$(PYTEST) -m "not long and not browser"
 
 test-long: $(READY)
 	$(PYTEST) -m long
@@ -107,7 +103,7 @@ figures: $(READY)
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY) $(EXTRA)browser
-	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/docs -rs
+	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/apps/live tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
