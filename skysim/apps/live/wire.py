@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
 import threading
 from collections import Counter
 from collections.abc import Collection
@@ -40,7 +41,6 @@ class WireClient(Sink):
 
     def send(self, packet: Packet) -> None:
         """Send a packet; the truth only to those who take it."""
-        # A packet that is being read slowly must not block the reader's timeout, so both have the same.
         self.connection.sendall(packet.pack(has_truth="truth" in self.channels))
 
     def reply(self, problem: str) -> None:
@@ -73,7 +73,10 @@ class WireClient(Sink):
                 problem = "token missing or wrong; it is in the line that the server printed"
                 raise InputError("", problem)
             self.is_known = True
+            # From now on it may be silent, but must read: a flight as fast as possible waits for it.
             self.connection.settimeout(None)
+            limit = struct.pack("ll", int(SOCKET_TIMEOUT_S), 0)
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
         if "take" in command:
             self.channels = server.checked_channels(command.pop("take"))
             self.offer(Packet({"channel": "hello"} | server.live.greeting), False)

@@ -2,6 +2,7 @@
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skysim.apps.live import wire
 from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.pacing import Live, Pace
-from skysim.apps.live.packets import unpack
+from skysim.apps.live.packets import Packet, unpack
 from skysim.apps.live.wire import WireServer
 from skysim.core.errors import InputError
 from skysim.scene import loader
@@ -234,6 +236,27 @@ def test_lines_and_commands_without_end_are_refused(live: Live) -> None:
     for _ in range(1001):
         inbox.put({}, answers.append)
     assert answers == ["more than 1000 commands in a control period"]
+
+
+@pytest.mark.slow
+def test_a_client_that_does_not_read_is_not_waited_for(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also by a flight as fast as possible, which waits for those that read."""
+    monkeypatch.setattr(wire, "SOCKET_TIMEOUT_S", 1.0)
+    client = Client(server_of(live), token="secret", take=["frame"])
+    client.receive()
+    (served,) = server_of(live).clients
+    large = Packet(
+        {"channel": "frame", "index": 0, "dropped": 0}, np.zeros((4000, 4000), "<u2")
+    )
+    sending = threading.Thread(
+        target=lambda: [server_of(live).offer(large, True) for _ in range(6)], daemon=True
+    )
+    sending.start()
+    sending.join(20)
+    assert not sending.is_alive()
+    assert served.fault
 
 
 def test_a_trigger_exposes_from_now_on_one_after_another() -> None:
