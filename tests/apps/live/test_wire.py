@@ -281,6 +281,34 @@ def test_a_trigger_exposes_from_now_on_one_after_another() -> None:
         live.commands.apply({"trigger": True})
 
 
+def test_an_abort_forgets_the_exposures_that_have_not_ended() -> None:
+    live = live_flight(trigger=True)
+    packets = list[Any]()
+    live.send = packets.append  # type: ignore[method-assign]
+    assert answer_to(live, {"trigger": True}) == ""
+    assert answer_to(live, {"abort": True}) == ""
+    for _ in range(10):
+        live.advance()
+    assert packets == []
+
+
+def test_a_client_switches_between_triggers_and_the_schedule() -> None:
+    """Without frames for a time, then by the schedule again from its next time on."""
+    live = live_flight()
+    packets = list[Any]()
+    live.send = packets.append  # type: ignore[method-assign]
+    assert answer_to(live, {"triggered": True}) == ""
+    for _ in range(130):
+        live.advance()
+    assert packets == []
+    assert answer_to(live, {"triggered": False}) == ""
+    for _ in range(60):
+        live.advance()
+    times_s = [one.header["t_s"] for one in packets if one.channel == "frame"]
+    # The schedule of 2 Hz from 0.5 s on; exposures of 10 ms.
+    assert times_s == pytest.approx([1.505], abs=1e-3)
+
+
 def test_a_client_s_attitudes_update_the_filter() -> None:
     live = live_flight()
     live.solves_itself = False
