@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
+from skysim.core.types import Floats
 from skysim.dynamics.flight_computer import Commands
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import longest_live_s
@@ -86,7 +87,7 @@ class CommandState:
     longest_exposure_s
         Longest exposure time that may be commanded
     held
-        Value and time of each command of actuators, by its key
+        Values and time of each command of actuators, by its key
     received, refused, timeouts
         Numbers of commands that were taken and refused, and that have timed out
     updates
@@ -97,7 +98,7 @@ class CommandState:
     timeout_s: float
     has_triggers: bool
     longest_exposure_s: float = field(init=False)
-    held: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    held: dict[str, tuple[Floats, float]] = field(default_factory=dict)
     received: int = 0
     refused: int = 0
     timeouts: int = 0
@@ -147,8 +148,11 @@ class CommandState:
             raise InputError("trigger", f"{MOST_TRIGGERS} exposures are waiting")
         solution = actuators.pop("attitude", None)
         attitude = None if solution is None else self.solution(solution)
-        self.checked(actuators)
-        self.held |= {key: (value, flight.now_s) for key, value in actuators.items()}
+        commands = flight.commands(actuators.pop("torque_nm", None), actuators)
+        values = dict(commands.motors)
+        if commands.torque_nm is not None:
+            values["torque_nm"] = commands.torque_nm
+        self.held |= {key: (value, flight.now_s) for key, value in values.items()}
         if exposure_s:
             schedule.exposure_control.exposure_s = exposure_s
         self.set_triggered(flags["triggered"])
@@ -159,11 +163,6 @@ class CommandState:
         if attitude and flight.motion.navigation:
             status = flight.motion.navigation.update_filter(solution["t_s"], attitude)
             self.updates[status] += 1
-
-    def checked(self, actuators: dict[str, Any]) -> Commands:
-        """Commands of actuators by key, for a control period. Raises InputError."""
-        motors = dict(actuators)
-        return self.flight.commands(motors.pop("torque_nm", None), motors)
 
     def exposure_s(self, value: Any) -> float:
         """A commanded exposure time, checked."""
@@ -210,4 +209,5 @@ class CommandState:
         kept = {key: held for key, held in self.held.items() if held[1] >= end_s}
         self.timeouts += len(self.held) - len(kept)
         self.held = kept
-        return self.checked({key: value for key, (value, _) in kept.items()})
+        motors = {key: value for key, (value, _) in kept.items()}
+        return Commands(motors.pop("torque_nm", None), motors)

@@ -22,7 +22,6 @@ from skysim.apps.live.packets import (
     PERIODIC,
     Packet,
     frame_packet,
-    period_values,
     plain,
     solution_packet,
 )
@@ -138,10 +137,13 @@ class Live:
         self.warm_up()
         # A pass over all that a scene has loaded takes longer than a control period.
         gc.freeze()
-        self.pace.start(0.0)
-        while not self.flight.is_over and not self.is_abandoned:
-            self.advance()
-        self.send_frames(late=True)
+        try:
+            self.pace.start(0.0)
+            while not self.flight.is_over and not self.is_abandoned:
+                self.advance()
+            self.send_frames(late=True)
+        finally:
+            gc.unfreeze()
 
     @property
     def is_abandoned(self) -> bool:
@@ -181,8 +183,8 @@ class Live:
         # 4. Values.
         wanted = self.wanted
         made_unix_s = time.monotonic() + self.pace.offset_s
-        for channel in PERIODIC:
-            values = period_values(flight, channel, began_s) if channel in wanted else {}
+        for channel, values_of in PERIODIC.items():
+            values = values_of(flight, began_s) if channel in wanted else {}
             if values:
                 head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
                 self.send(Packet(head | plain(values)))

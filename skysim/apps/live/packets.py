@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, BinaryIO, NamedTuple
 
@@ -24,11 +24,9 @@ from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
 from skysim.core.errors import InputError
+from skysim.core.types import Record
 from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
-
-CHANNELS = ("frame", "solution", "imu", "state", "telemetry", "truth")
-PERIODIC = ("imu", "state", "telemetry", "truth")
 
 # Limits for the reader.
 MAX_HEADER_BYTES = 1 << 16
@@ -161,35 +159,38 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
     return Packet(plain(header), attitude=solution)
 
 
-def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any]:
-    """The values of a periodic channel at the end of a control period that began at began_s."""
+# The values of the periodic channels at the end of a control period that began at a time.
+
+
+def imu_values(flight: Flight, began_s: float) -> Record:
+    """The samples of the period. A unit slower than the control has none in most of them."""
+    samples = flight.imu_samples(began_s)
+    # Those of earlier periods were sent.
+    if samples is None or not (new := samples.t_s > began_s + TIME_TOLERANCE_S).any():
+        return {}
+    return {
+        "step_s": samples.step_s,
+        "times_s": samples.t_s[new],
+        "angle_rad": samples.angle_rad[new],
+        "velocity_m_s": samples.velocity_m_s[new],
+    }
+
+
+def state_values(flight: Flight, _: float) -> Record:
+    """The encoders."""
     state = flight.state
-    motion = flight.motion
-    navigation = motion.navigation
-    if channel == "state":
-        return {
-            "wheel_rad_s": state.wheel_rad_s,
-            "gimbal_rad": state.gimbal_rad,
-            **state.readings,
-        }
-    if channel == "truth":
-        return {
-            "lab_from_body_xyzw": state.lab_from_body.as_quat(),
-            "rate_body_rad_s": state.rate_body_rad_s,
-        }
-    if channel == "imu":
-        samples = flight.imu_samples(began_s)
-        # A unit slower than the control has none in most periods; those of earlier periods were sent.
-        if samples is None or not (new := samples.t_s > began_s + TIME_TOLERANCE_S).any():
-            return {}
-        return {
-            "step_s": samples.step_s,
-            "times_s": samples.t_s[new],
-            "angle_rad": samples.angle_rad[new],
-            "velocity_m_s": samples.velocity_m_s[new],
-        }
-    computer = motion.flight_computer
-    values = {
+    return {
+        "wheel_rad_s": state.wheel_rad_s,
+        "gimbal_rad": state.gimbal_rad,
+        **state.readings,
+    }
+
+
+def telemetry_values(flight: Flight, _: float) -> Record:
+    """What the flight computer commands and estimates."""
+    computer = flight.motion.flight_computer
+    navigation = flight.motion.navigation
+    values: Record = {
         "torque_nm": computer.control_torque_nm,
         "loads": dict(zip(computer.names, computer.loads.tolist(), strict=True)),
     }
@@ -200,3 +201,21 @@ def period_values(flight: Flight, channel: str, began_s: float) -> dict[str, Any
             values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1)
             values["bias_rad_s"] = navigation.filter.state.bias_rad_s
     return values
+
+
+def truth_values(flight: Flight, _: float) -> Record:
+    """True attitude and rate."""
+    state = flight.state
+    return {
+        "lab_from_body_xyzw": state.lab_from_body.as_quat(),
+        "rate_body_rad_s": state.rate_body_rad_s,
+    }
+
+
+PERIODIC: dict[str, Callable[[Flight, float], Record]] = {
+    "imu": imu_values,
+    "state": state_values,
+    "telemetry": telemetry_values,
+    "truth": truth_values,
+}
+CHANNELS = ("frame", "solution", *PERIODIC)

@@ -115,9 +115,8 @@ class Sink:
         except OSError as error:
             file = f"{error.filename}: " if error.filename else ""
             return file + (error.strerror or str(error))
-        except (
-            Exception
-        ) as error:  # a dead thread without `fault` would block a patient offer() for ever
+        # A dead thread without `fault` would block a patient offer() for ever.
+        except Exception as error:
             return printable(f"{type(error).__name__}: {error}")
         return ""
 

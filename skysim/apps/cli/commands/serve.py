@@ -145,14 +145,13 @@ def live(
         )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    flight = open_flight(
-        load(scene, frames, seed, set_), endless=endless, keeps_history=False
-    )
-    if client_tracker and not flight.lab.scene.filter:
+    loaded = load(scene, frames, seed, set_)
+    if client_tracker and not loaded.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
+    flight = open_flight(loaded, endless=endless, keeps_history=False)
     flown = (PosedLive if poses else Live)(
         flight,
-        Pace(0.0 if poses else speed, flight.lab.scene.exposure.rate_hz),
+        Pace(0.0 if poses else speed, loaded.exposure.rate_hz),
         [],
         CommandState(flight, command_timeout, trigger),
         has_truth=truth,
