@@ -9,6 +9,7 @@ from skysim.camera.glow.background import (
     LATITUDE_DEG,
     LN_LIGHT,
     SLOPE,
+    PointedCamera,
     faint_starlight_s10,
     galactic_latitude_deg,
     glow_map,
@@ -107,12 +108,11 @@ def test_the_glow_of_a_field_equals_a_sky_of_the_same_magnitude() -> None:
     optics = Optics.from_camera(loader.load("shefex2").camera)
     band = Band.from_efficiency(0.5)
     attitude = cam_from_icrs(266.4, -28.9, 0.0)  # the Galaxy's center
-    glow = glow_map(
-        [FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], optics, attitude, band
-    )
+    camera = PointedCamera(optics, attitude, np.zeros(3), band)
+    glow = glow_map([FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], camera)
     s10 = faint_starlight_s10(np.zeros(1), 8.0)[0]
     mag = 10 + 2.5 * np.log10(3600**2 / s10)
-    even = glow_map([SkyGlowConfig(kind="sky", mag_arcsec2=mag)], optics, attitude, band)
+    even = glow_map([SkyGlowConfig(kind="sky", mag_arcsec2=mag)], camera)
     middle = tuple(n // 2 for n in glow.shape)
     assert glow[middle] == pytest.approx(even[middle], rel=0.03)
     assert 20 < mag < 22.5

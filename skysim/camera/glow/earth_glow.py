@@ -5,15 +5,12 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
+    PointedCamera,
     angular_separation_deg,
-    node_directions,
     transmittance,
-    viewing_geometry,
 )
-from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
@@ -71,23 +68,20 @@ def earth_light(
     config: EarthConfig,
     observer_m: Floats,
     sun_m: Floats,
-    optics: Optics,
-    cam_from_lab: Rotation,
-    band: Band,
+    camera: PointedCamera,
 ) -> Floats | None:
     """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None if it is not in the field."""
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
-    boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    boresight = camera.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
     cosine = float(-boresight @ observer_m) / distance_m
     from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))
     reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
-    if from_nadir_rad > reach_rad + optics.field_rad:
+    if from_nadir_rad > reach_rad + camera.optics.field_rad:
         return None
-    toward, pixel_sr, shape = node_directions(optics, NODE_PX)
-    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
-    radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
-    return (radiance * view.etendue_m2_sr()).reshape(shape)
+    view = camera.nodes(NODE_PX)
+    radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, view.band)
+    return (radiance * view.etendue_m2_sr()).reshape(view.shape)
 
 
 # Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side. A body's irradiance
