@@ -121,15 +121,12 @@ def render(
     # 3. Each source keeps the image K_n that it has at mid-exposure.
     middle_pose = Poses(*(samples[middle] for samples in all_poses))
     kernels = source_kernels(
-        optics.camera,
+        candidates,
+        optics,
         tracks.xy_px[middle],
-        candidates.radius_m,
-        candidates.place[:, 3] > 0,
         distance_m,
         cos_in,
         led_images(candidates, optics, middle_pose, emitter),
-        optics.blur_px,
-        candidates.chromatic,
     )
     # 4. and 5. Integrate and add to the frame.
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
