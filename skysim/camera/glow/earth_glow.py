@@ -17,7 +17,7 @@ from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
 from skysim.sources.camera_orbit import TO_SPHERE
-from skysim.sources.dome.surface import perpendicular
+from skysim.sources.dome.surface import perpendicular, unit_vectors
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over this number of pixels
@@ -166,15 +166,9 @@ def cone_rule(ground: float, top: float) -> tuple[Floats, Floats]:
     """
     rules = [interval_rule(ground, 1.0, GROUND_RINGS), interval_rule(top, ground, AIR_RINGS)]
     cosine, weight = (np.concatenate(column) for column in zip(*rules, strict=True))
-    sine = np.sqrt(1 - cosine**2)
     around = (np.arange(SPOKES) + 0.5) * 2 * np.pi / SPOKES
-    columns = (
-        np.outer(sine, np.cos(around)),
-        np.outer(sine, np.sin(around)),
-        np.outer(cosine, np.ones(SPOKES)),
-    )
     weights_sr = np.repeat(weight * 2 * np.pi / SPOKES, SPOKES)
-    return np.stack([column.ravel() for column in columns], axis=1), weights_sr
+    return unit_vectors(cosine[:, None], around).reshape(-1, 3), weights_sr
 
 
 def interval_rule(low: float, high: float, count: int) -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Floats, around_z, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -201,7 +201,6 @@ def icosahedron() -> Floats:
     z = 1 / np.sqrt(5)
     ring = 2 / np.sqrt(5)
     azimuth = np.arange(5) * (2 * np.pi / 5)
-    upper = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(5, z)])
-    between = azimuth + np.pi / 5
-    lower = np.column_stack([ring * np.cos(between), ring * np.sin(between), np.full(5, -z)])
+    upper = around_z(ring, azimuth, z)
+    lower = around_z(ring, azimuth + np.pi / 5, -z)
     return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])
