@@ -29,7 +29,7 @@ from skysim.camera.psf.otf import (
     field_sigma_px,
 )
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints, Singles, Sources
+from skysim.core.types import Floats, Ints, Singles, Sources, taken
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
@@ -217,7 +217,7 @@ def ellipses(
     error = round_error(disks, axes_px, emitter, variance_px2)
     chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
     own = (part[chosen] for part in (axes_px, defocus, sigma, variance_px2))
-    disk[chosen], keys[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *own)
+    disk[chosen], keys[chosen] = ellipse_disks(camera.psf, camera, taken(disks, chosen), *own)
     return disk
 
 
