@@ -21,7 +21,7 @@ from skysim.scene import loader
 from skysim.scene.sections.surroundings import FaintStarsGlowConfig, SkyGlowConfig
 from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
-from skysim.sources.stars import cam_from_icrs
+from skysim.sources.stars import cam_from_icrs, directions
 
 EDGES_DEG = np.array([0, 2.5, 5, 10, 15, 20, 30, 45, 60, 90])
 SKY_DEG2 = 4 * np.pi * np.degrees(1) ** 2
@@ -46,8 +46,8 @@ def formula_s10(low: float, high: float) -> Floats:
 def shipped_sky() -> tuple[Floats, Floats]:
     """Galactic latitudes and magnitudes of the shipped sky."""
     stars = catalog.read("gaia_v8.0")
-    directions = star_archives.directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
-    return galactic_latitude_deg(directions), stars.v_mag
+    toward = directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
+    return galactic_latitude_deg(toward), stars.v_mag
 
 
 def test_the_shipped_sky_s_starlight_follows_the_law_of_counts() -> None:
@@ -64,7 +64,7 @@ def test_gaia_s_starlight_follows_the_law_of_counts() -> None:
         rows["g"].astype(float),
         np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP),
     )[0]
-    latitude = galactic_latitude_deg(star_archives.directions(rows["ra"], rows["dec"]))
+    latitude = galactic_latitude_deg(directions(rows["ra"], rows["dec"]))
     for low in (8, 9):
         np.testing.assert_allclose(
             formula_s10(low, low + 1), zone_s10(latitude, v_mag, low, low + 1), rtol=0.05
@@ -99,7 +99,7 @@ def test_galactic_latitudes_match_astropy() -> None:
     ra, dec = np.random.default_rng(3).uniform([0, -90], [360, 90], (50, 2)).T
     expected = SkyCoord(ra, dec, unit="deg").galactic.b.deg
     np.testing.assert_allclose(
-        galactic_latitude_deg(star_archives.directions(ra, dec)), expected, atol=1e-5
+        galactic_latitude_deg(directions(ra, dec)), expected, atol=1e-5
     )
 
 

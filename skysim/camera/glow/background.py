@@ -33,7 +33,7 @@ from skysim.scene.sections.surroundings import (
     UniformGlowConfig,
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from skysim.sources.stars import sky_axes
+from skysim.sources.stars import directions
 
 # Starlight: the light of the stars that are too faint to be drawn one by one.
 
@@ -177,7 +177,7 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
 
     The authors give the model an accuracy of 8 to 23 %, which is more than the air mass changes over a camera's field.
     """
-    moon = direction(config.ra_deg, config.dec_deg)
+    moon = directions(config.ra_deg, config.dec_deg)
     to_moon_deg = angular_separation_deg(view.toward_lab, moon)
     nanolamberts = moonlight_nl(
         to_moon_deg,
@@ -243,7 +243,7 @@ def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     The point source transmittance is that of lens and baffle together: irradiance on the chip over irradiance before
     the lens, at the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
-    toward = direction(config.ra_deg, config.dec_deg)
+    toward = directions(config.ra_deg, config.dec_deg)
     angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], toward)[0])
     irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
     pst = float(transmittance(angle_deg, config.angle_deg, config.pst))
@@ -272,11 +272,6 @@ BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "stray": stray_light,
     "faint_stars": faint_star_glow,
 }
-
-
-def direction(ra_deg: float, dec_deg: float) -> Floats:
-    """(3,) unit vector of a right ascension and declination."""
-    return sky_axes(math.radians(ra_deg), math.radians(dec_deg))[2]
 
 
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
