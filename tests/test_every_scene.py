@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
+from skysim.camera.glow.background import PointedCamera
 from skysim.camera.glow.display_glow import black_glow
 from skysim.core.paths import SCENES, shipped_files
 from skysim.dynamics import multibody
@@ -153,7 +154,8 @@ def test_the_light_of_the_sources_is_on_the_frame(flown: Flown) -> None:
     light_e = truth.sources.electrons
     camera_m = truth.lab_from_body.apply(camera.mount.camera_body_m)
     glow_e_s = black_glow(
-        scene.light, camera.optics, truth.cam_from_lab, camera_m, camera.band
+        scene.light,
+        PointedCamera(camera.optics, truth.cam_from_lab, camera_m, camera.band),
     )
     glow_e = 0.0 if glow_e_s is None else float(glow_e_s.sum()) * frame.exposure_s
     read = pixels * (part.read_noise_e**2 + part.reset_noise_e**2 + part.gain_e_dn**2 / 12)

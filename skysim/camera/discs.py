@@ -27,7 +27,7 @@ from skysim.camera.projection import (
     project,
     sample_times,
 )
-from skysim.camera.psf.kernel_cache import Kernels, source_kernels
+from skysim.camera.psf.kernel_cache import source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
 from skysim.core.types import Bools, Floats, Ints, Mount, Sources, SourceTruth, Trajectory
 from skysim.sources.bodies import BodyLight
@@ -138,8 +138,8 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     close_s = exposed.window.close_s(optics.camera.height_px)
     t_s = sample_times(exposed.window.open_s, close_s, exposed.trajectory)
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
-    colors = None if body.chromatic is None else body.chromatic[None]
-    star = star_kernels(optics, disc.center_px[None], colors)
+    center = points_of(body, np.zeros((1, 2)))
+    star = source_kernels(center, optics, disc.center_px[None], *np.ones((2, 1)))
     # 1. Phases (x, y) in pixels, x fastest.
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
     phase = np.arange(steps) / steps
@@ -149,7 +149,7 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     tracks, _, _ = image_tracks(points, optics, all_poses, t_s, Emitter())
     xy_px = tracks.xy_px
     middle = len(t_s) // 2
-    kernels = star_kernels(optics, xy_px[middle], points.chromatic)
+    kernels = source_kernels(points, optics, xy_px[middle], *np.ones((2, len(points))))
     # 3. One size of patch for all phases, in whole pixels of the chip.
     reach_px = kernels.reach_px.max() + 2
     low = np.floor(np.nanmin(xy_px, axis=(0, 1)) - reach_px).astype(np.int64)
@@ -170,15 +170,6 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     patches = strip.reshape(height, steps, steps, width).transpose(1, 2, 0, 3)
     speed = (xy_px[middle + 1, 0] - xy_px[middle - 1, 0]) / (2 * tracks.step_s)
     return DisplacedImages(patches, low, speed, float(drawn[0, 5]))
-
-
-def star_kernels(optics: Optics, xy_px: Floats, chromatic: Floats | None) -> Kernels:
-    """The kernels of points of light at places (N, 2) on the chip, with `chromatic` (N, 4) as in `Sources`."""
-    one = np.ones(len(xy_px))
-    is_led = np.zeros(len(xy_px), bool)
-    return source_kernels(
-        optics.camera, xy_px, 0 * one, is_led, one, one, None, optics.blur_px, chromatic
-    )
 
 
 def render_disc(

@@ -48,6 +48,7 @@ from skysim.core.types import (
     Sources,
     SourceTruth,
     Trajectory,
+    taken,
 )
 from skysim.sources.dome.led import Emitter, lit_moments_s
 
@@ -110,7 +111,7 @@ def render(
     # It knows no motion of sources, so moving sources are all kept.
     candidates = sources
     if sources.motion is None:
-        few_poses = Poses(*(samples[:: len(t_s) // 8] for samples in all_poses))
+        few_poses = taken(all_poses, slice(None, None, len(t_s) // 8))
         candidates = sources.take(in_view(sources, optics, few_poses))
     if occluded:
         candidates = candidates.take(~occluded(candidates.place))
@@ -119,17 +120,14 @@ def render(
     middle = len(t_s) // 2
     tracks, distance_m, cos_in = image_tracks(candidates, optics, all_poses, t_s, emitter)
     # 3. Each source keeps the image K_n that it has at mid-exposure.
-    middle_pose = Poses(*(samples[middle] for samples in all_poses))
+    middle_pose = taken(all_poses, middle)
     kernels = source_kernels(
-        optics.camera,
+        candidates,
+        optics,
         tracks.xy_px[middle],
-        candidates.radius_m,
-        candidates.place[:, 3] > 0,
         distance_m,
         cos_in,
         led_images(candidates, optics, middle_pose, emitter),
-        optics.blur_px,
-        candidates.chromatic,
     )
     # 4. and 5. Integrate and add to the frame.
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)

@@ -24,14 +24,28 @@ def normalized(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
+    """(..., 3) points at distances from the z axis, azimuths from +x toward +y, and heights; these are broadcast."""
+    x = radius * np.cos(azimuth_rad)
+    y = radius * np.sin(azimuth_rad)
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+
+
 Columns = TypeVar("Columns")
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
     """Objects of one class, whose fields are columns of equal length, as one: the rows of all, in their order."""
     kind: Any = type(parts[0])
-    columns = ([getattr(part, name) for part in parts] for name in kind.__slots__)
+    names = getattr(kind, "_fields", kind.__slots__)
+    columns = ([getattr(part, name) for part in parts] for name in names)
     return kind(*map(np.concatenate, columns))
+
+
+def taken(columns: Columns, which: Any) -> Columns:
+    """The rows of a named tuple of columns that a mask, indices, a slice or one index select."""
+    table: Any = columns
+    return table._make(column[which] for column in table)
 
 
 ROUNDING = 1e-12  # greater than the rounding error of a cosine

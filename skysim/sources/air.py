@@ -14,7 +14,7 @@ from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Bools, Floats, Ints, Sources
 from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
-from skysim.sources.bodies import ALBEDO, BodyLight
+from skysim.sources.bodies import BODIES, BodyLight
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
 from skysim.sources.refraction import (
@@ -273,7 +273,7 @@ class Sky:
             direction=direction, toward_sun=along / np.linalg.norm(along)
         )
         # The body's color: the Sun's, and the ratio of its albedos.
-        blue, visual = ALBEDO[body.name][:2]
+        blue, visual = BODIES[body.name].albedo[:2]
         b_v = SUN[0] - 2.5 * np.log10(blue / visual)
         passed = transmission(self.air_mass(direction[None]), self.air.extinction_mag(b_v))
         return replace(body, place=place, flux_e_s_m2=body.flux_e_s_m2 * float(passed[0]))

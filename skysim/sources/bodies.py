@@ -34,20 +34,6 @@ Albedo = tuple[float, float, float, float]
 # Effective wavelengths of B, V, Cousins' R and I (Bessell 2005, ARA&A 43, 293).
 BANDS_M = (438e-9, 545e-9, 641e-9, 798e-9)
 WHITE: Albedo = (1.0, 1.0, 1.0, 1.0)
-# Planets: geometric albedos of Mallama, Krobusek & Pavlov 2017, Icarus 282, 19 (arXiv:1609.05048), table 7. The Moon,
-# relative to V: Kieffer & Stone 2005, AJ 129, 2887, equation 10 and table 4 at a phase angle of 45 degrees without
-# libration, smoothed by a parabola in the logarithms; it reddens by 0.1 mag in V-I from full to quarter.
-ALBEDO: dict[str, Albedo] = {
-    "sun": WHITE,
-    "moon": (0.786, 1.0, 1.169, 1.402),
-    "mercury": (0.105, 0.142, 0.158, 0.180),
-    "venus": (0.658, 0.689, 0.658, 0.640),
-    "mars": (0.088, 0.170, 0.250, 0.285),
-    "jupiter": (0.443, 0.538, 0.513, 0.389),
-    "saturn": (0.339, 0.499, 0.646, 0.543),
-    "uranus": (0.561, 0.488, 0.264, 0.089),
-    "neptune": (0.562, 0.442, 0.226, 0.072),
-}
 
 
 def reflected_flux_e_s_m2(v_mag: float, albedo: Albedo, band: Band) -> float:
@@ -101,27 +87,33 @@ class Body(NamedTuple):
         Mean radius
     law
         Law of its surface's brightness, see `body_discs.brightness`
+    albedo
+        Albedos at BANDS_M; only their ratios count
     """
 
     naif: int
     radius_km: float
     law: int
+    albedo: Albedo
 
     @property
     def id(self) -> int:
         return ID_BASE + self.naif
 
 
+# Planets: geometric albedos of Mallama, Krobusek & Pavlov 2017, Icarus 282, 19 (arXiv:1609.05048), table 7. The Moon,
+# relative to V: Kieffer & Stone 2005, AJ 129, 2887, equation 10 and table 4 at a phase angle of 45 degrees without
+# libration, smoothed by a parabola in the logarithms; it reddens by 0.1 mag in V-I from full to quarter.
 BODIES = {
-    "sun": Body(10, 695_700.0, LIMB_DARKENED),
-    "moon": Body(301, 1737.4, LOMMEL_SEELIGER),
-    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER),
-    "venus": Body(299, 6051.8, LAMBERT),
-    "mars": Body(499, 3389.5, LOMMEL_SEELIGER),
-    "jupiter": Body(599, 69_911.0, LAMBERT),
-    "saturn": Body(699, 58_232.0, LAMBERT),
-    "uranus": Body(799, 25_362.0, LAMBERT),
-    "neptune": Body(899, 24_622.0, LAMBERT),
+    "sun": Body(10, 695_700.0, LIMB_DARKENED, WHITE),
+    "moon": Body(301, 1737.4, LOMMEL_SEELIGER, (0.786, 1.0, 1.169, 1.402)),
+    "mercury": Body(199, 2439.4, LOMMEL_SEELIGER, (0.105, 0.142, 0.158, 0.180)),
+    "venus": Body(299, 6051.8, LAMBERT, (0.658, 0.689, 0.658, 0.640)),
+    "mars": Body(499, 3389.5, LOMMEL_SEELIGER, (0.088, 0.170, 0.250, 0.285)),
+    "jupiter": Body(599, 69_911.0, LAMBERT, (0.443, 0.538, 0.513, 0.389)),
+    "saturn": Body(699, 58_232.0, LAMBERT, (0.339, 0.499, 0.646, 0.543)),
+    "uranus": Body(799, 25_362.0, LAMBERT, (0.561, 0.488, 0.264, 0.089)),
+    "neptune": Body(899, 24_622.0, LAMBERT, (0.562, 0.442, 0.226, 0.072)),
 }
 NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 
@@ -214,7 +206,7 @@ def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:
     v_mag = magnitude(name, at, tt_jd)
     # Earthshine is modeled for the Moon alone.
     earthshine = earthshine_fraction(at) if name == "moon" else 0.0
-    flux = reflected_flux_e_s_m2(v_mag, ALBEDO[name], band)
+    flux = reflected_flux_e_s_m2(v_mag, body.albedo, band)
     radius_rad = float(np.arcsin(body.radius_km / at.distance_km))
-    colors = reflected_chromatic(ALBEDO[name], band)
+    colors = reflected_chromatic(body.albedo, band)
     return BodyLight(name, at, v_mag, radius_rad, flux * (1 + earthshine), earthshine, colors)

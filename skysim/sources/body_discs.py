@@ -19,7 +19,7 @@ from skysim.core.jit import jit
 from skysim.core.time import J2000_JD
 from skysim.core.types import Floats
 from skysim.sources.ephemeris import Place
-from skysim.sources.stars import sky_axes
+from skysim.sources.stars import directions
 
 # Laws of `brightness`.
 LIMB_DARKENED = 0
@@ -460,7 +460,7 @@ PLANETS: dict[str, Callable[[float, Place, float], float]] = {
 
 def latitudes_rad(name: str, place: Place) -> Floats:
     """(2,) planetocentric latitudes of the Sun and of the observer above the planet's equator."""
-    _, _, pole = sky_axes(*np.radians(POLES_DEG[name]))
+    pole = directions(*POLES_DEG[name])
     sines = [
         -(vector @ pole) / np.linalg.norm(vector)
         for vector in (place.from_sun_km, place.to_body_km)

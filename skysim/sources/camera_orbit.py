@@ -17,7 +17,7 @@ from skysim.core.constants import (
 )
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, taken
 from skysim.scene.sections.surroundings import (
     CircularOrbitConfig,
     TleOrbitConfig,
@@ -51,7 +51,7 @@ class CameraOrbit(Protocol):
 
 def state_at(orbit: CameraOrbit, after_s: float) -> GcrsState:
     """(3,) position and velocity of an orbit at a time since the scene's start."""
-    return GcrsState(*(column[0] for column in orbit.states(np.array([after_s]))))
+    return taken(orbit.states(np.array([after_s])), 0)
 
 
 @dataclass(frozen=True, slots=True)

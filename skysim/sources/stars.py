@@ -186,6 +186,11 @@ def sky_axes(ra_rad: Any, dec_rad: Any) -> tuple[Floats, Floats, Floats]:
     return np.stack(east, -1), np.stack(north, -1), np.stack(toward, -1)
 
 
+def directions(ra_deg: Any, dec_deg: Any) -> Floats:
+    """(..., 3) unit vectors of right ascensions and declinations."""
+    return sky_axes(np.radians(ra_deg), np.radians(dec_deg))[2]
+
+
 def cam_from_icrs(
     ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats
 ) -> Rotation:

@@ -7,7 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.air_glow import airglow_nl, seen_place, sunlight_nl
-from skysim.camera.glow.background import NANOLAMBERT_V0, diffuse_air_mass, glow_map
+from skysim.camera.glow.background import (
+    NANOLAMBERT_V0,
+    PointedCamera,
+    diffuse_air_mass,
+    glow_map,
+)
 from skysim.core.types import Floats
 from skysim.scene.loader import load
 from skysim.scene.sections.surroundings import SkyGlowConfig
@@ -141,6 +146,9 @@ def test_the_dark_glow_is_that_of_the_declared_sky() -> None:
     )
     ours = glow_toward(lab, up_pointing(lab))
     sky_glow = SkyGlowConfig(kind="sky", mag_arcsec2=21)
-    even = glow_map((sky_glow,), lab.camera.optics, up_pointing(lab), lab.camera.band)
+    even = glow_map(
+        (sky_glow,),
+        PointedCamera(lab.camera.optics, up_pointing(lab), np.zeros(3), lab.camera.band),
+    )
     center = tuple(size // 2 for size in ours.shape)
     assert ours[center] == pytest.approx(even[center], rel=2e-3)

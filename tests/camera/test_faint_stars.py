@@ -9,6 +9,7 @@ from skysim.camera.glow.background import (
     LATITUDE_DEG,
     LN_LIGHT,
     SLOPE,
+    PointedCamera,
     faint_starlight_s10,
     galactic_latitude_deg,
     glow_map,
@@ -20,7 +21,7 @@ from skysim.scene import loader
 from skysim.scene.sections.surroundings import FaintStarsGlowConfig, SkyGlowConfig
 from skysim.sources import catalog, star_archives
 from skysim.sources.photometry import Band
-from skysim.sources.stars import cam_from_icrs
+from skysim.sources.stars import cam_from_icrs, directions
 
 EDGES_DEG = np.array([0, 2.5, 5, 10, 15, 20, 30, 45, 60, 90])
 SKY_DEG2 = 4 * np.pi * np.degrees(1) ** 2
@@ -45,8 +46,8 @@ def formula_s10(low: float, high: float) -> Floats:
 def shipped_sky() -> tuple[Floats, Floats]:
     """Galactic latitudes and magnitudes of the shipped sky."""
     stars = catalog.read("gaia_v8.0")
-    directions = star_archives.directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
-    return galactic_latitude_deg(directions), stars.v_mag
+    toward = directions(np.degrees(stars.ra_rad), np.degrees(stars.dec_rad))
+    return galactic_latitude_deg(toward), stars.v_mag
 
 
 def test_the_shipped_sky_s_starlight_follows_the_law_of_counts() -> None:
@@ -63,7 +64,7 @@ def test_gaia_s_starlight_follows_the_law_of_counts() -> None:
         rows["g"].astype(float),
         np.where((bp > 0) & (rp > 0), bp - rp, star_archives.TYPICAL_BP_RP),
     )[0]
-    latitude = galactic_latitude_deg(star_archives.directions(rows["ra"], rows["dec"]))
+    latitude = galactic_latitude_deg(directions(rows["ra"], rows["dec"]))
     for low in (8, 9):
         np.testing.assert_allclose(
             formula_s10(low, low + 1), zone_s10(latitude, v_mag, low, low + 1), rtol=0.05
@@ -98,7 +99,7 @@ def test_galactic_latitudes_match_astropy() -> None:
     ra, dec = np.random.default_rng(3).uniform([0, -90], [360, 90], (50, 2)).T
     expected = SkyCoord(ra, dec, unit="deg").galactic.b.deg
     np.testing.assert_allclose(
-        galactic_latitude_deg(star_archives.directions(ra, dec)), expected, atol=1e-5
+        galactic_latitude_deg(directions(ra, dec)), expected, atol=1e-5
     )
 
 
@@ -107,12 +108,11 @@ def test_the_glow_of_a_field_equals_a_sky_of_the_same_magnitude() -> None:
     optics = Optics.from_camera(loader.load("shefex2").camera)
     band = Band.from_efficiency(0.5)
     attitude = cam_from_icrs(266.4, -28.9, 0.0)  # the Galaxy's center
-    glow = glow_map(
-        [FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], optics, attitude, band
-    )
+    camera = PointedCamera(optics, attitude, np.zeros(3), band)
+    glow = glow_map([FaintStarsGlowConfig(kind="faint_stars", fainter_than_mag=8)], camera)
     s10 = faint_starlight_s10(np.zeros(1), 8.0)[0]
     mag = 10 + 2.5 * np.log10(3600**2 / s10)
-    even = glow_map([SkyGlowConfig(kind="sky", mag_arcsec2=mag)], optics, attitude, band)
+    even = glow_map([SkyGlowConfig(kind="sky", mag_arcsec2=mag)], camera)
     middle = tuple(n // 2 for n in glow.shape)
     assert glow[middle] == pytest.approx(even[middle], rel=0.03)
     assert 20 < mag < 22.5

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skysim.camera.optics import Optics
 from skysim.camera.psf.kernel import GAUSS, GRID, ROUND, build_kernel, gaussian_kernel
 from skysim.camera.psf.kernel_cache import source_kernels
 from skysim.core.errors import InputError
 from skysim.scene.sections.camera import CameraConfig
+from skysim.sources.stars import steady_points
 
 
 def camera(**changes: Any) -> CameraConfig:
@@ -25,9 +27,12 @@ def shapes(
     lens: CameraConfig, radius_m: list[float], near: list[bool], distance_m: list[float]
 ) -> Any:
     count = len(radius_m)
+    ones = np.ones(count)
+    sources = steady_points(np.arange(count), np.zeros((count, 3)), ones, ones)
+    sources.place[:, 3] = near
+    sources.radius_m[:] = radius_m
     return source_kernels(
-        lens, np.tile(lens.center_px, (count, 1)), np.array(radius_m), np.array(near), np.array(distance_m),
-        np.ones(count),
+        sources, Optics.from_camera(lens), np.tile(lens.center_px, (count, 1)), np.array(distance_m), ones
     )  # fmt: skip
 
 
@@ -59,7 +64,9 @@ def test_a_gaussian_widens_towards_the_corner_and_keeps_its_reach() -> None:
         focus="infinity", psf={"kind": "gaussian", "sigma_px": 0.7, "corner_sigma_px": 2.4}
     )
     place = np.array([lens.center_px, (-0.5, -0.5)])
-    made = source_kernels(lens, place, np.zeros(2), np.zeros(2, bool), np.ones(2), np.ones(2))
+    ones = np.ones(2)
+    stars = steady_points(np.arange(2), np.zeros((2, 3)), ones, ones)
+    made = source_kernels(stars, Optics.from_camera(lens), place, ones, ones)
     np.testing.assert_allclose(made.sigma_px, [0.7, 2.5], rtol=1e-12, atol=0)
     assert made.reach_px[1] >= 6.5 * 2.5
 

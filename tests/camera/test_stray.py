@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import nodes_px
+from skysim.camera.glow.background import PointedCamera, even_grid_px
 from skysim.camera.glow.stray import add_glare, block_px, wall_glow
 from skysim.camera.optics import Optics
 from skysim.core.types import Frame, Sources, Truth
@@ -64,8 +64,10 @@ def test_the_glow_of_a_uniform_sphere_matches_theory() -> None:
     optics = Optics.from_camera(CameraConfig.model_validate(CAMERA))
     turned = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
     camera_m = np.array([0.3, -0.5, 0.2])
-    glow = wall_glow(dome, optics, turned, camera_m, Band.from_efficiency(0.5))
-    xy_px, shape = nodes_px(optics.camera)
+    camera = PointedCamera(optics, turned, camera_m, Band.from_efficiency(0.5))
+    glow = wall_glow(dome, camera)
+    shape = camera.nodes().shape
+    xy_px = even_grid_px(optics.camera, *shape[::-1])
     radius = np.linalg.norm(xy_px - optics.camera.center_px, axis=1) / optics.camera.focal_px
     radiance = share * count * math.pi / (16 * math.pi) / (1 - share) / math.pi
     expected = (

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from skysim.camera.glow import display_glow
+from skysim.camera.glow.background import PointedCamera
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, Sources, Truth
 from skysim.scene import loader
@@ -412,7 +413,7 @@ def glow_e_s(lab: Lab) -> np.ndarray:
     camera_m = lab.start.apply(camera.mount.camera_body_m)
     cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
     glow = display_glow.black_glow(
-        lab.scene.light, camera.optics, cam_from_lab, camera_m, camera.band
+        lab.scene.light, PointedCamera(camera.optics, cam_from_lab, camera_m, camera.band)
     )
     assert glow is not None
     return glow
@@ -492,10 +493,9 @@ def test_the_glow_is_on_the_frame_only_with_a_finite_contrast() -> None:
     assert (
         display_glow.black_glow(
             plain.scene.light,
-            plain.camera.optics,
-            star_sources.cam_from_icrs(0, 90, 0),
-            np.zeros(3),
-            BAND,
+            PointedCamera(
+                plain.camera.optics, star_sources.cam_from_icrs(0, 90, 0), np.zeros(3), BAND
+            ),
         )
         is None
     )

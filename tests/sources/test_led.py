@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from skysim.camera.glow.background import PointedCamera
 from skysim.camera.glow.display_glow import black_glow
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
@@ -256,7 +257,10 @@ def test_all_pixels_of_a_panel_age_alike() -> None:
     new, old = (camera.sources.strength for camera in cameras)
     np.testing.assert_allclose(old / new, math.sqrt(0.7), rtol=1e-12)
     glows = [
-        black_glow(one.scene.light, one.optics, Rotation.identity(), np.zeros(3), one.band)
+        black_glow(
+            one.scene.light,
+            PointedCamera(one.optics, Rotation.identity(), np.zeros(3), one.band),
+        )
         for one in cameras
     ]
     assert glows[0] is not None

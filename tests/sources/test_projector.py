@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from skysim.camera.glow import display_glow
+from skysim.camera.glow.background import PointedCamera
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Sources
 from skysim.scene import loader
@@ -201,7 +202,7 @@ def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
     camera_m = lab.start.apply(camera.mount.camera_body_m)
     cam_from_lab = camera.mount.cam_from_body * lab.start.inv()
     glow = display_glow.black_glow(
-        scene.light, camera.optics, cam_from_lab, camera_m, camera.band
+        scene.light, PointedCamera(camera.optics, cam_from_lab, camera_m, camera.band)
     )
     assert glow is not None
     shell = surface.build_surface(scene.light.surface)
@@ -228,7 +229,8 @@ def test_black_has_the_light_of_all_pixels_over_the_contrast() -> None:
     )
     assert isinstance(narrow.scene.light, DomeConfig)
     dark = display_glow.black_glow(
-        narrow.scene.light, narrow.camera.optics, cam_from_lab, camera_m, narrow.camera.band
+        narrow.scene.light,
+        PointedCamera(narrow.camera.optics, cam_from_lab, camera_m, narrow.camera.band),
     )
     assert dark is not None
     assert (dark == 0).any()

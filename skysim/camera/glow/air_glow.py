@@ -14,6 +14,7 @@ from skysim.camera.glow.background import (
     angular_separation_deg,
     diffuse_air_mass,
     moonlight_nl,
+    nanolamberts_e_s,
     scattering,
 )
 from skysim.core.constants import SUN_V_MAG
@@ -21,7 +22,6 @@ from skysim.core.types import Floats
 from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.sources.air import Sky, air_mass
 from skysim.sources.ephemeris import Place, observe_from, place
-from skysim.sources.photometry import sky_radiance_e_s_m2_sr
 
 ERG_NL = 1.02e-15  # erg s^-1 cm^-2 um^-1 arcsec^-2 in a nanolambert (Schaefer 1998)
 # V magnitude of 1 erg s^-1 cm^-2 um^-1 (Schaefer 1998).
@@ -47,8 +47,7 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
             np.degrees(zenith_rad),
             extinction_mag,
         )
-    radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
-    return radiance * nanolamberts * above * view.etendue_m2_sr()
+    return nanolamberts_e_s(nanolamberts, view) * above
 
 
 def seen_place(name: str, sky: Sky) -> Place:

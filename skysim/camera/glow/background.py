@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -33,7 +33,7 @@ from skysim.scene.sections.surroundings import (
     UniformGlowConfig,
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
-from skysim.sources.stars import sky_axes
+from skysim.sources.stars import directions
 
 # Starlight: the light of the stars that are too faint to be drawn one by one.
 
@@ -100,17 +100,17 @@ class ViewingGeometry:
         (M, 3) unit vectors in camera and in lab axes (in star scenes those of the ICRS)
     boresight_lab
         (3,) unit vector of the boresight in lab axes
-    field_rad
-        (M,) angles from the boresight
     pixel_sr
         (M,) solid angles of the nodes' pixels; 1 / focal_px^2 on the axis
+    shape
+        (h, w) of the nodes; M = h w
     """
 
     toward_cam: Floats
     toward_lab: Floats
     boresight_lab: Floats
-    field_rad: Floats
     pixel_sr: Floats
+    shape: tuple[int, int]
     optics: Optics
     band: Band
 
@@ -121,13 +121,45 @@ class ViewingGeometry:
         angle w falls as cos^3: its distance grows as 1 / cos, squared, and it is inclined. With the vignetting V this
         is the cos^4 law of illumination. Distortion changes w, which is pixel_sr.
         """
-        throughput = self.optics.throughput(np.cos(self.field_rad))
+        field_rad = np.arctan2(np.hypot(*self.toward_cam.T[:2]), self.toward_cam[:, 2])
+        throughput = self.optics.throughput(np.cos(field_rad))
         return self.optics.collecting_m2 * throughput * self.pixel_sr
+
+
+class PointedCamera(NamedTuple):
+    """A camera in the lab: its lens, attitude, entrance pupil (3,) and the response of its chip."""
+
+    optics: Optics
+    cam_from_lab: Rotation
+    camera_m: Floats
+    band: Band
+
+    def nodes(self, spacing_px: float | None = None) -> ViewingGeometry:
+        """The geometry of nodes at most this far apart; None for smooth light."""
+        camera = self.optics.camera
+        smooth_px = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
+        spacing = spacing_px or smooth_px
+        size_px = camera.width_px, camera.height_px
+        return self.grid(*(math.ceil((size - 1) / spacing) + 1 for size in size_px))
+
+    def grid(self, columns: int, rows: int) -> ViewingGeometry:
+        """The geometry of nodes that are evenly spread from corner to corner, row by row."""
+        toward, pixel_sr = node_directions(self.optics, columns, rows)
+        lab_from_cam = self.cam_from_lab.inv()
+        return ViewingGeometry(
+            toward_cam=toward,
+            toward_lab=lab_from_cam.apply(toward),
+            boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
+            pixel_sr=pixel_sr,
+            shape=(rows, columns),
+            optics=self.optics,
+            band=self.band,
+        )
 
 
 def uniform_glow(config: UniformGlowConfig, view: ViewingGeometry) -> Floats:
     """Light that reaches the chip past the lens (a leak): the same number of electrons in every pixel."""
-    return np.full(len(view.field_rad), float(config.e_s))
+    return np.full(len(view.pixel_sr), float(config.e_s))
 
 
 def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
@@ -136,7 +168,7 @@ def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
     # Gradient along x, then along y.
     slope = np.degrees(np.arctan2(x, z)) * config.gradient_per_deg[0]
     slope = slope + np.degrees(np.arctan2(y, z)) * config.gradient_per_deg[1]
-    radiance = float(sky_radiance_e_s_m2_sr(config.mag_arcsec2, view.band))
+    radiance = sky_radiance_e_s_m2_sr(config.mag_arcsec2, view.band)
     return radiance * np.maximum(1 + slope, 0.0) * view.etendue_m2_sr()
 
 
@@ -145,7 +177,7 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
 
     The authors give the model an accuracy of 8 to 23 %, which is more than the air mass changes over a camera's field.
     """
-    moon = direction(config.ra_deg, config.dec_deg)
+    moon = directions(config.ra_deg, config.dec_deg)
     to_moon_deg = angular_separation_deg(view.toward_lab, moon)
     nanolamberts = moonlight_nl(
         to_moon_deg,
@@ -154,8 +186,12 @@ def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
         float(diffuse_air_mass(math.radians(config.moon_zenith_deg))),
         diffuse_air_mass(math.radians(config.field_zenith_deg)),
     )
-    # From nanolamberts, by the radiance of one magnitude 0 per square arcsecond.
-    radiance = float(sky_radiance_e_s_m2_sr(0.0, view.band)) / NANOLAMBERT_V0
+    return nanolamberts_e_s(nanolamberts, view)
+
+
+def nanolamberts_e_s(nanolamberts: Floats, view: ViewingGeometry) -> Floats:
+    """(M,) electrons per second and pixel of a surface brightness, by the radiance of V = 0 mag arcsec^-2."""
+    radiance = sky_radiance_e_s_m2_sr(0.0, view.band) / NANOLAMBERT_V0
     return radiance * nanolamberts * view.etendue_m2_sr()
 
 
@@ -207,11 +243,11 @@ def stray_light(config: StrayLightConfig, view: ViewingGeometry) -> Floats:
     The point source transmittance is that of lens and baffle together: irradiance on the chip over irradiance before
     the lens, at the body's angle from the boresight (`transmittance`). The body has the Sun's color.
     """
-    toward = direction(config.ra_deg, config.dec_deg)
+    toward = directions(config.ra_deg, config.dec_deg)
     angle_deg = float(angular_separation_deg(view.boresight_lab[None, :], toward)[0])
     irradiance = float(star_flux_e_s_m2(config.v_mag, *SUN, view.band))
     pst = float(transmittance(angle_deg, config.angle_deg, config.pst))
-    return np.full(len(view.field_rad), irradiance * pst * view.optics.camera.pixel_m**2)
+    return np.full(len(view.pixel_sr), irradiance * pst * view.optics.camera.pixel_m**2)
 
 
 def transmittance(
@@ -224,7 +260,7 @@ def transmittance(
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
     """Light of the stars fainter than those that are drawn, by galactic latitude; the lab's axes are the ICRS."""
     s10 = faint_starlight_s10(galactic_latitude_deg(view.toward_lab), config.fainter_than_mag)
-    of_one = float(sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band))
+    of_one = sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)
     return of_one * s10 * view.etendue_m2_sr()
 
 
@@ -238,20 +274,13 @@ BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
 }
 
 
-def direction(ra_deg: float, dec_deg: float) -> Floats:
-    """(3,) unit vector of a right ascension and declination."""
-    return sky_axes(math.radians(ra_deg), math.radians(dec_deg))[2]
-
-
 def angular_separation_deg(vectors: Floats, vector: Floats) -> Floats:
     """(M,) angles between (M, 3) unit vectors and one: atan2(|a x b|, a . b), accurate for small angles too."""
     sine = np.linalg.norm(np.cross(vectors, vector), axis=-1)
     return np.degrees(np.arctan2(sine, vectors @ vector))
 
 
-def glow_map(
-    glows: Sequence[Glow], optics: Optics, cam_from_lab: Rotation, band: Band
-) -> Floats:
+def glow_map(glows: Sequence[Glow], camera: PointedCamera) -> Floats:
     """(h, w) electrons s^-1 px^-1 of all extended light, at nodes evenly spread over the chip up to its edges.
 
     `fill` interpolates the frame from it, to 1e-3 for maps as smooth as these (test_background). Cusps are smoothed:
@@ -259,38 +288,19 @@ def glow_map(
     If no light depends on the position, or there is none, the map has one node.
     """
     # 1. Geometry of the nodes.
-    if all(glow.kind in ("uniform", "stray") for glow in glows):
-        shape = (1, 1)
-        toward, pixel_sr = pixel_directions(np.array([optics.camera.center_px]), optics)
-    else:
-        toward, pixel_sr, shape = node_directions(optics)
-    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
+    even = all(glow.kind in ("uniform", "stray") for glow in glows)
+    view = camera.grid(1, 1) if even else camera.nodes()
     # 2. Sum of the kinds of light.
-    total = np.zeros(len(toward))
+    total = np.zeros(len(view.pixel_sr))
     for glow in glows:
         total += BACKGROUNDS[glow.kind](glow, view)
-    return total.reshape(shape)
+    return total.reshape(view.shape)
 
 
-@lru_cache(maxsize=8)
-def node_directions(
-    optics: Optics, spacing_px: float | None = None
-) -> tuple[Floats, Floats, tuple[int, int]]:
-    """`pixel_directions` at the nodes, and the nodes' (h, w); cached, since they depend on the camera alone."""
-    xy_px, shape = nodes_px(optics.camera, spacing_px)
-    return *pixel_directions(xy_px, optics), shape
-
-
-def nodes_px(
-    camera: CameraConfig, spacing_px: float | None = None
-) -> tuple[Floats, tuple[int, int]]:
-    """(h * w, 2) pixel positions of nodes at most this far apart, row by row, and (h, w); None for smooth light."""
-    smooth_px = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
-    spacing = spacing_px or smooth_px
-    w, h = (
-        math.ceil((size - 1) / spacing) + 1 for size in (camera.width_px, camera.height_px)
-    )
-    return even_grid_px(camera, w, h), (h, w)
+@lru_cache(maxsize=4)  # those of all pixels take some 60 MB
+def node_directions(optics: Optics, columns: int, rows: int) -> tuple[Floats, Floats]:
+    """`pixel_directions` at the nodes; cached, since they depend on the camera alone."""
+    return pixel_directions(even_grid_px(optics.camera, columns, rows), optics)
 
 
 def even_grid_px(camera: CameraConfig, columns: int, rows: int) -> Floats:
@@ -311,22 +321,6 @@ def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
         for step in np.eye(2)
     )
     return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
-
-
-def viewing_geometry(
-    toward: Floats, pixel_sr: Floats, optics: Optics, cam_from_lab: Rotation, band: Band
-) -> ViewingGeometry:
-    """The geometry of these directions for a camera in this attitude, in a band."""
-    lab_from_cam = cam_from_lab.inv()
-    return ViewingGeometry(
-        toward_cam=toward,
-        toward_lab=lab_from_cam.apply(toward),
-        boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
-        field_rad=np.arctan2(np.hypot(toward[:, 0], toward[:, 1]), toward[:, 2]),
-        pixel_sr=pixel_sr,
-        optics=optics,
-        band=band,
-    )
 
 
 def unproject(xy_px: Floats, optics: Optics) -> Floats:

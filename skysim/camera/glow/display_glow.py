@@ -4,18 +4,12 @@ A black pixel gives 1 / contrast of a white one. The radiance of a white display
 kind of display; times that fraction and the etendue of a camera pixel it is the glow.
 """
 
-from functools import lru_cache
-
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
-    even_grid_px,
+    PointedCamera,
     fill,
-    pixel_directions,
-    viewing_geometry,
 )
-from skysim.camera.optics import Optics
 from skysim.core.types import Floats
 from skysim.scene.sections import layouts, leds, light
 from skysim.sources.dome.display import (
@@ -35,48 +29,34 @@ NODE_SPACING_PX = 16  # greatest spacing of the nodes of a projector's glow
 
 def black_glow(
     config: light.DomeConfig | light.StarsConfig | light.CollimatedDisplayConfig,
-    optics: Optics,
-    cam_from_lab: Rotation,
-    camera_m: Floats,
-    band: Band,
+    pointed: PointedCamera,
 ) -> Floats | None:
     """(H, W) electrons s^-1 px^-1 of a display's black pixels; None without such a display.
 
     A camera pixel sees the display or not, by the direction of its center. So the edge is sharp, and motion during the
     exposure and the row times of a rolling shutter are left out. A projector's picture on the wall varies smoothly
     except at its edges: it is computed at nodes at most NODE_SPACING_PX apart and interpolated between them.
-
-    Parameters
-    ----------
-    camera_m
-        (3,) entrance pupil in the lab
     """
     screen = config.layout if isinstance(config, light.DomeConfig) else config
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
         return None
-    camera = optics.camera
-    size_px = (camera.width_px, camera.height_px)
+    optics, _, camera_m, band = pointed
+    size_px = optics.camera.width_px, optics.camera.height_px
     projected = isinstance(screen, layouts.ProjectorConfig)
-    w, h = (size // NODE_SPACING_PX + 2 for size in size_px) if projected else size_px
-    view = viewing_geometry(*node_views(optics, w, h), optics, cam_from_lab, band)
+    counts = [size // NODE_SPACING_PX + 2 for size in size_px] if projected else size_px
+    view = pointed.grid(*counts)
     if isinstance(config, light.CollimatedDisplayConfig):
         white = collimated_radiance_e_s_m2_sr(config, view.toward_lab, band)
     else:
         assert isinstance(config, light.DomeConfig)  # the screen is its layout
         radiance = projected_radiance_e_s_m2_sr if projected else panel_radiance_e_s_m2_sr
         white = radiance(config, view.toward_lab, camera_m, band)
-    glow = (black_transmission(screen) * white * view.etendue_m2_sr()).reshape(h, w)
+    glow = (black_transmission(screen) * white * view.etendue_m2_sr()).reshape(view.shape)
     if not projected:
         return glow
-    out = np.empty((camera.height_px, camera.width_px))
+    out = np.empty(size_px[::-1])
     fill(out, glow, 1.0)
     return out
-
-
-@lru_cache(maxsize=2)
-def node_views(optics: Optics, columns: int, rows: int) -> tuple[Floats, Floats]:
-    """Viewing directions of an even grid of pixels, (rows * columns, 3) in camera axes, and their solid angles."""
-    return pixel_directions(even_grid_px(optics.camera, columns, rows), optics)
 
 
 def panel_radiance_e_s_m2_sr(

@@ -5,22 +5,19 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import (
+    PointedCamera,
     angular_separation_deg,
-    node_directions,
     transmittance,
-    viewing_geometry,
 )
-from skysim.camera.optics import Optics
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
 from skysim.core.types import Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import EarthConfig
 from skysim.sources.bodies import BodyLight
 from skysim.sources.camera_orbit import TO_SPHERE
-from skysim.sources.dome.surface import perpendicular
+from skysim.sources.dome.surface import perpendicular, unit_vectors
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 
 NODE_PX = 4.0  # spacing of the nodes: the limb is blurred over this number of pixels
@@ -71,23 +68,20 @@ def earth_light(
     config: EarthConfig,
     observer_m: Floats,
     sun_m: Floats,
-    optics: Optics,
-    cam_from_lab: Rotation,
-    band: Band,
+    camera: PointedCamera,
 ) -> Floats | None:
     """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None if it is not in the field."""
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
-    boresight = cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    boresight = camera.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
     distance_m = float(np.linalg.norm(observer_m))
     cosine = float(-boresight @ observer_m) / distance_m
     from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))
     reach_rad = math.asin(min(LAYER[1] * EARTH_RADIUS_M / distance_m, 1.0))
-    if from_nadir_rad > reach_rad + optics.field_rad:
+    if from_nadir_rad > reach_rad + camera.optics.field_rad:
         return None
-    toward, pixel_sr, shape = node_directions(optics, NODE_PX)
-    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
-    radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, band)
-    return (radiance * view.etendue_m2_sr()).reshape(shape)
+    view = camera.nodes(NODE_PX)
+    radiance = earth_radiance(config, observer_m, view.toward_lab, sun_m, view.band)
+    return (radiance * view.etendue_m2_sr()).reshape(view.shape)
 
 
 # Stray light past the baffle: of the Sun, the Moon and the planets, and of the Earth's lit side. A body's irradiance
@@ -172,15 +166,9 @@ def cone_rule(ground: float, top: float) -> tuple[Floats, Floats]:
     """
     rules = [interval_rule(ground, 1.0, GROUND_RINGS), interval_rule(top, ground, AIR_RINGS)]
     cosine, weight = (np.concatenate(column) for column in zip(*rules, strict=True))
-    sine = np.sqrt(1 - cosine**2)
     around = (np.arange(SPOKES) + 0.5) * 2 * np.pi / SPOKES
-    columns = (
-        np.outer(sine, np.cos(around)),
-        np.outer(sine, np.sin(around)),
-        np.outer(cosine, np.ones(SPOKES)),
-    )
     weights_sr = np.repeat(weight * 2 * np.pi / SPOKES, SPOKES)
-    return np.stack([column.ravel() for column in columns], axis=1), weights_sr
+    return unit_vectors(cosine[:, None], around).reshape(-1, 3), weights_sr
 
 
 def interval_rule(low: float, high: float, count: int) -> tuple[Floats, Floats]:

@@ -21,14 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 from scipy.interpolate import RectBivariateSpline
-from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.background import node_directions, unproject, viewing_geometry
+from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
 from skysim.core.types import Floats, SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
-from skysim.sources.photometry import Band
 from skysim.sources.satellites import GHOST
 
 BLUR_PX = 0.7  # sigma of the edge of a ghost's disk
@@ -132,9 +130,7 @@ GRID = (28, 36)
 MARGIN = 0.15  # of the chip's size, beyond its edges, for images of LEDs that reach in
 
 
-def wall_glow(
-    dome: ReflectingDome, optics: Optics, cam_from_lab: Rotation, camera_m: Floats, band: Band
-) -> Floats:
+def wall_glow(dome: ReflectingDome, camera: PointedCamera) -> Floats:
     """(h, w) electrons s^-1 px^-1 of wall and floor at the nodes of `background.glow_map`.
 
     The radiance rho E / pi of a Lambertian surface times the etendue of the pixels.
@@ -143,16 +139,13 @@ def wall_glow(
     2. Where the wall is seen: its light, interpolated.
     3. Where the floor is seen: its light. Beyond wall and floor it is dark.
 
-    Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes.
-
-    Parameters
-    ----------
-    camera_m
-        (3,) entrance pupil in the lab; outside of the wall it sees nothing
+    Nothing is in front of wall and floor. The rim is smoothed over the distance of two nodes. A camera outside of the
+    wall sees nothing.
     """
     # 1.
-    toward, pixel_sr, shape = node_directions(optics)
-    view = viewing_geometry(toward, pixel_sr, optics, cam_from_lab, band)
+    optics, cam_from_lab, camera_m, _ = camera
+    view = camera.nodes()
+    shape = view.shape
     if dome.diffuse is None or not dome.wall.inside(camera_m):
         return np.zeros(shape)
     few = (chip_grid(optics, IRRADIANCE, 0.0) @ cam_from_lab.as_matrix()).reshape(-1, 3)

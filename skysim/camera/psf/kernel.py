@@ -25,7 +25,7 @@ from scipy import fft, special
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, cubic
-from skysim.core.types import Floats, Ints, Singles
+from skysim.core.types import Floats, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular
@@ -383,10 +383,6 @@ class DiskImages(NamedTuple):
     matrix: Floats
     center: Floats
     gradient: Floats
-
-    def take(self, which: Ints) -> "DiskImages":
-        """The images in the chosen rows."""
-        return DiskImages(*(part[which] for part in self))
 
     def semi_axes_px(self) -> Floats:
         """(N, 2) semi-axes of the images, the larger one first; 0 without an image.

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from skysim.camera.optics import Optics
 from skysim.camera.psf import ellipse
 from skysim.camera.psf.kernel import (
     ELLIPSE,
@@ -28,7 +29,7 @@ from skysim.camera.psf.otf import (
     field_sigma_px,
 )
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints, Singles
+from skysim.core.types import Floats, Ints, Singles, Sources, taken
 from skysim.scene.sections.camera import CameraConfig, Psf
 
 BOX_KEY = -1  # first number of the key of an ellipse's box; those of kernels are sizes
@@ -114,17 +115,17 @@ class SourceSizes(NamedTuple):
 
 
 def source_kernels(
-    camera: CameraConfig,
+    sources: Sources,
+    optics: Optics,
     xy_px: Floats,
-    radius_m: Floats,
-    is_led: Bools,
     distance_m: Floats,
     cos_field: Floats,
     disks: DiskImages | None = None,
-    blur_px: float = 0.0,
-    chromatic: Floats | None = None,
 ) -> Kernels:
     """The kernels of N sources.
+
+    A disk is drawn as a circle of angular radius radius / distance where that differs from its image in `disks` by less
+    than MAX_ROUND_ERROR. LEDs may be out of focus by their own distance_m; stars are at infinity.
 
     1. Widths of the blurs and radii of the disks of each source.
     2. Disks that a circle does not represent get an ellipse.
@@ -135,31 +136,27 @@ def source_kernels(
     ----------
     xy_px
         (N, 2) image positions, for the blur that grows with the field; NaN is taken as the principal point
-    radius_m
-        (N,) radii of the emitting disks, 0 for a star. A disk is drawn as a circle of angular radius radius / distance
-        where that differs from its image in `disks` by less than MAX_ROUND_ERROR.
-    is_led
-        (N,) which sources are LEDs, which may be out of focus by their own distance_m; stars are at infinity
     cos_field
         (N,) cosines of the angles from the boresight
     disks
         Geometric images of the disks, NaN for stars; None draws all disks round
-    blur_px, chromatic
-        Standard deviation of a Gaussian blur of all sources; (N, 4) as in `Sources`
 
     Raises
     ------
     InputError
         For a source too far out of focus.
     """
+    camera = optics.camera
+    chromatic = sources.chromatic
+    is_led = sources.place[:, 3] > 0
     # 1. Gaussian blurs add in squares.
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
-    sigma = np.hypot(field_sigma_px(camera.psf, camera, position), blur_px)
+    sigma = np.hypot(field_sigma_px(camera.psf, camera, position), optics.blur_px)
     shift_m: Floats | float = 0.0
     if chromatic is not None:
         sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
         shift_m = chromatic[:, 0]
-    emitter = np.where(is_led, radius_m / distance_m, 0.0) * camera.focal_px
+    emitter = np.where(is_led, sources.radius_m / distance_m, 0.0) * camera.focal_px
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
     defocus = blur_radius_px(camera, axial_m, shift_m)
@@ -181,7 +178,7 @@ def source_kernels(
         keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
     kernels = look_up(camera, keys, disk)
     # 4. Widening.
-    if gaussian and (blur_px or camera.psf.corner_sigma_px or chromatic is not None):
+    if gaussian and (optics.blur_px or camera.psf.corner_sigma_px or chromatic is not None):
         kernels = widened(kernels, sizes.sigma_px)
     return kernels
 
@@ -220,7 +217,7 @@ def ellipses(
     error = round_error(disks, axes_px, emitter, variance_px2)
     chosen = np.flatnonzero((emitter > 0) & (error > MAX_ROUND_ERROR))
     own = (part[chosen] for part in (axes_px, defocus, sigma, variance_px2))
-    disk[chosen], keys[chosen] = ellipse_disks(camera.psf, camera, disks.take(chosen), *own)
+    disk[chosen], keys[chosen] = ellipse_disks(camera.psf, camera, taken(disks, chosen), *own)
     return disk
 
 

@@ -22,7 +22,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, joined, taken
 from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -73,9 +73,6 @@ class StarImages(NamedTuple):
     variance_sigma_px2: Floats
     stretch_px2: Floats
     chi2: Floats
-
-    def take(self, rows: Floats) -> StarImages:
-        return StarImages(*(one[rows] for one in self))
 
 
 class ImageSize(NamedTuple):
@@ -228,7 +225,7 @@ def image_size(
             break
     scatter = max(1.0, float(np.sum(pull[kept] ** 2)) / max(int(kept.sum()) - 2, 1))
     sigma2, corner2 = np.sqrt(np.diag(normal) * scatter)
-    used = stars.take(kept)
+    used = taken(stars, kept)
     return ImageSize(
         Estimate.root(found[0], sigma2),
         Estimate.root(found[1], corner2),
@@ -314,8 +311,7 @@ def measure_night(
 
 def all_stars(frames: list[NightFrame]) -> StarImages:
     """The star images of all frames, without the effect of trails."""
-    still = [without_trail(one.stars) for one in frames]
-    return StarImages(*(np.concatenate(part) for part in zip(*still, strict=True)))
+    return joined([without_trail(one.stars) for one in frames])
 
 
 def read_frame(

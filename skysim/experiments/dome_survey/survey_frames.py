@@ -18,7 +18,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Frame, Ints, Truth
+from skysim.core.types import Bools, Floats, Frame, Ints, Truth, around_z
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
@@ -63,10 +63,9 @@ def stop_attitudes(scene: Scene, stream_name: str, count: int, tilt_deg: float) 
     rng = random_stream(scene.seed, STREAM_KEYS[stream_name])
     tilt = np.arccos(rng.uniform(np.cos(np.radians(tilt_deg)), 1, count))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, (2, count))
-    rotation_vectors = np.column_stack(
-        [tilt * np.cos(azimuth), tilt * np.sin(azimuth), np.zeros(count)]
+    return Rotation.from_rotvec(around_z(tilt, azimuth, 0.0)) * Rotation.from_euler(
+        "z", yaw[:, None]
     )
-    return Rotation.from_rotvec(rotation_vectors) * Rotation.from_euler("z", yaw[:, None])
 
 
 def planned_stops(

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, around_z
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
@@ -279,9 +279,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
     radius = radius_px / context.camera.optics.camera.focal_px
-    rays_cam = np.column_stack(
-        [radius * np.cos(azimuth), radius * np.sin(azimuth), np.ones(SIDES)]
-    )
+    rays_cam = around_z(radius, azimuth, 1.0)
     tilts = np.column_stack([azimuth, np.full(SIDES, math.radians(tilt_deg)), -azimuth])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", tilts):

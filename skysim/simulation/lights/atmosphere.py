@@ -7,7 +7,6 @@ Everything is computed for mid-exposure. The site rotates by 15" in a second, wh
 from dataclasses import dataclass
 
 from skysim.camera.glow.air_glow import air_glow
-from skysim.camera.glow.background import node_directions, viewing_geometry
 from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
 from skysim.core.types import Floats, Sources
@@ -62,11 +61,8 @@ class AirGlow(AddedLight):
 
     def glow(self, exposure: Exposure) -> Floats:
         """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
-        toward, pixel_sr, shape = node_directions(exposure.optics)
-        view = viewing_geometry(
-            toward, pixel_sr, exposure.optics, exposure.cam_from_lab, exposure.band
-        )
-        return air_glow(self.config, self.air.at(exposure.time), view).reshape(shape)
+        view = exposure.camera.nodes()
+        return air_glow(self.config, self.air.at(exposure.time), view).reshape(view.shape)
 
 
 def seen_through(sky: Sky, lit: Lit, exposure: Exposure) -> Lit:

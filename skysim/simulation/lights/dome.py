@@ -114,9 +114,7 @@ def black_pixels(
     """The light of a display's black pixels, of which a share is left; none without a display or if black is dark."""
 
     def e_s() -> Floats | None:
-        glow = black_glow(
-            config, exposure.optics, exposure.cam_from_lab, exposure.camera_m, exposure.band
-        )
+        glow = black_glow(config, exposure.camera)
         return None if glow is None else share * glow
 
     return e_s

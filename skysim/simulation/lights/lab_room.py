@@ -45,13 +45,7 @@ class WallGlow(AddedLight):
 
     def glow(self, exposure: Exposure) -> Floats:
         """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
-        full = wall_glow(
-            self.dome,
-            exposure.optics,
-            exposure.cam_from_lab,
-            exposure.camera_m,
-            exposure.band,
-        )
+        full = wall_glow(self.dome, exposure.camera)
         return warm_up_factor(self.warm_up, exposure.t_s) * full
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import Exposed, centers_of
+from skysim.camera.glow.background import PointedCamera
 from skysim.camera.optics import Optics
 from skysim.camera.projection import Poses
 from skysim.camera.render import OcclusionTest, Window
@@ -110,6 +111,11 @@ class Exposure:
     def camera_m(self) -> Floats:
         """(3,) position of the entrance pupil in the lab at mid-exposure."""
         return self.lab_from_body.apply(self.mount.camera_body_m)
+
+    @cached_property
+    def camera(self) -> PointedCamera:
+        """The camera as it is at mid-exposure."""
+        return PointedCamera(self.optics, self.cam_from_lab, self.camera_m, self.band)
 
     @cached_property
     def boresight(self) -> Floats:

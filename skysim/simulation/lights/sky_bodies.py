@@ -48,12 +48,10 @@ class Earth(Obstacle):
         if self.config is None:
             return dark
         seen_from = (self.config, position_m, sun_m(here.tt_jd))
-        optics = exposure.optics
-        cam_from_lab = exposure.cam_from_lab
-        band = exposure.band
+        camera = exposure.camera
         return dark._replace(
-            edged=lambda: earth_light(*seen_from, optics, cam_from_lab, band),
-            around=lambda: earth_around(*seen_from, band),
+            edged=lambda: earth_light(*seen_from, camera),
+            around=lambda: earth_around(*seen_from, camera.band),
         )
 
 

@@ -92,9 +92,4 @@ class BackgroundLight(AddedLight):
     glows: tuple[Glow, ...]
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit(
-            BACKGROUND,
-            glow=lambda: glow_map(
-                self.glows, exposure.optics, exposure.cam_from_lab, exposure.band
-            ),
-        )
+        return Lit(BACKGROUND, glow=lambda: glow_map(self.glows, exposure.camera))

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints, normalized
+from skysim.core.types import Floats, Ints, normalized, taken
 from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
@@ -38,10 +38,6 @@ class ProjectedStars(NamedTuple):
     v_mag: Floats
     shown_mag: Floats
     place_m: Floats
-
-    def take(self, which: slice | Ints) -> "ProjectedStars":
-        """Select stars by index."""
-        return ProjectedStars(*(column[which] for column in self))  # type: ignore[arg-type]
 
 
 def project_stars(
@@ -136,7 +132,7 @@ def merge_stars(stars: ProjectedStars, target: Ints) -> ProjectedStars:
     v_mag = combined_mag(stars.v_mag)
     order = np.argsort(v_mag, kind="stable")
     shown_mag = combined_mag(stars.shown_mag)
-    return ProjectedStars(stars.hip[first], v_mag, shown_mag, place_m).take(order)
+    return taken(ProjectedStars(stars.hip[first], v_mag, shown_mag, place_m), order)
 
 
 def merge_close_stars(
@@ -147,7 +143,7 @@ def merge_close_stars(
     A merged LED is between the places of its stars and may be too near a third star, so merging repeats until no two
     LEDs are too near.
     """
-    selected = stars.take(slice(count))
+    selected = taken(stars, slice(count))
     while True:
         target = merge_targets(selected.place_m, separation_m)
         if np.all(target == np.arange(len(target))):

@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, around_z, joined
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.light import DomeConfig, FloorConfig, ReflectionConfig
 from skysim.sources.dome.led import LOBES
@@ -80,10 +80,7 @@ def diffuse_light(
     # 1. Patches.
     patches = wall_patches(wall, config.diffuse)
     if config.floor:
-        floor = floor_patches(config.floor)
-        patches = Patches(
-            *(np.concatenate(pair) for pair in zip(patches, floor, strict=True))
-        )
+        patches = joined([patches, floor_patches(config.floor)])
     # 2. Direct light, with the strengths averaged over the pulses.
     duty = np.minimum(leds.on_s / leds.period_s, 1.0)
     sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
@@ -123,13 +120,7 @@ def floor_patches(config: FloorConfig) -> Patches:
     """PATCHES patches of the floor, of equal area, on a Fibonacci spiral."""
     radius_m = config.radius_m * np.sqrt((np.arange(PATCHES) + 0.5) / PATCHES)
     azimuth = np.arange(PATCHES) * GOLDEN_ANGLE_RAD
-    place_m = np.column_stack(
-        [
-            radius_m * np.cos(azimuth),
-            radius_m * np.sin(azimuth),
-            0 * radius_m - config.depth_m,
-        ]
-    )
+    place_m = around_z(radius_m, azimuth, -config.depth_m)
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
     return Patches(
         place_m,

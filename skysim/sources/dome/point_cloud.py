@@ -18,7 +18,7 @@ import scipy
 
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, around_z
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -252,9 +252,8 @@ class SurfaceFit:
     def edge_m(self) -> Floats:
         """(M, 3) points on the edge of the area that the points cover, relative to its center."""
         azimuth = np.arange(EDGE_POINTS) * (2 * np.pi / EDGE_POINTS)
-        ring = np.sin(self.radius.cover_rad)
-        up = np.full(EDGE_POINTS, np.cos(self.radius.cover_rad))
-        unit = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), up])
+        cover_rad = self.radius.cover_rad
+        unit = around_z(np.sin(cover_rad), azimuth, np.cos(cover_rad))
         return self.radius.evaluate(unit)[0][:, None] * unit
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Record, normalized
+from skysim.core.types import Bools, Floats, Record, around_z, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -131,10 +131,9 @@ class Surface(ABC):
         min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-        z, azimuth = (grid.ravel() for grid in np.meshgrid(ring_z, sectors, indexing="ij"))
-        rays = self.lab_from_own.apply(unit_vectors(z, azimuth))
+        rays = unit_vectors(*np.meshgrid(ring_z, sectors, indexing="ij")).reshape(-1, 3)
         # Keep the rays that meet the surface within its rim.
-        met = self.meet(np.zeros(3), rays)
+        met = self.meet(np.zeros(3), self.lab_from_own.apply(rays))
         return met[np.isfinite(met[:, 0])]
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
@@ -147,17 +146,13 @@ class Surface(ABC):
 
 
 def unit_vectors(z: NDArray, azimuth: NDArray) -> Floats:
-    """(N, 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (N,) each."""
-    ring = np.sqrt(1 - z**2)
-    return np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    """(..., 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (...,) each."""
+    return around_z(np.sqrt(1 - z**2), azimuth, z)
 
 
 def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
     """(..., 3) unit vectors at angles from +z and azimuths from +x toward +y, (...,) each."""
-    ring = np.sin(tilt_rad)
-    return np.stack(
-        [ring * np.cos(azimuth_rad), ring * np.sin(azimuth_rad), np.cos(tilt_rad)], axis=-1
-    )
+    return around_z(np.sin(tilt_rad), azimuth_rad, np.cos(tilt_rad))
 
 
 def perpendicular(unit: Floats) -> Floats:
@@ -538,8 +533,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     least = np.cos(np.radians(cap_deg))
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
     azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
-    z, angle = (grid.ravel() for grid in np.meshgrid(cosine, azimuth, indexing="ij"))
-    rays = unit_vectors(z, angle)
+    rays = unit_vectors(*np.meshgrid(cosine, azimuth, indexing="ij")).reshape(-1, 3)
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])
     place_m = place_m[met]

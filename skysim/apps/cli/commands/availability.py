@@ -105,9 +105,9 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
     """The boresight's attitude law. Raises InputError for an inertial one without a direction."""
     import numpy as np
 
-    from skysim.camera.glow.background import direction
     from skysim.scene.sections.motion import PointingConfig
     from skysim.sources.orbit_availability import Pointing
+    from skysim.sources.stars import directions
 
     start = scene.motion.start
     if law == "zenith":
@@ -116,7 +116,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
         )
     if not isinstance(start, PointingConfig):
         raise InputError("--law inertial", "requires motion.start with ra_deg and dec_deg")
-    return Pointing("inertial", direction(start.ra_deg, start.dec_deg))
+    return Pointing("inertial", directions(start.ra_deg, start.dec_deg))
 
 
 def computed(

@@ -19,7 +19,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import OcclusionTest, Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Ints, Trajectory
+from skysim.core.types import Floats, Ints, Trajectory, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
@@ -64,9 +64,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         np.array([each @ camera.mount.camera_body_m for each in R_lab_from_body]),
     )
     rows = [
-        in_view(
-            camera.sources, optics, Poses(*(part[n : n + 1] for part in poses)), reach=0.0
-        )
+        in_view(camera.sources, optics, taken(poses, [n]), reach=0.0)
         for n in range(len(R_lab_from_body))
     ]
     ends = np.cumsum([0, *map(len, rows)])

@@ -10,20 +10,17 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Sources, normalized
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
-from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
     Ints,
     PlacedLeds,
     cap,
     check_cap,
     directions_from_angles,
-    led_sources,
     project_from_bearing,
 )
 from skysim.sources.dome.surface import Surface
-from skysim.sources.photometry import Band
 
 GLUE_STREAM = 1  # spawn key of the glue's own random stream, so that glue errors leave a board's pattern unchanged
 
@@ -47,9 +44,7 @@ class Boards(NamedTuple):
     v: Floats
 
 
-def patch_boards(
-    config: PatchBoardsConfig, surface: Surface, led: LedConfig, band: Band
-) -> Sources:
+def patch_boards(config: PatchBoardsConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """3x3 boards glued flat to the surface, listed or spread evenly, each with its own choice of LEDs and levels.
 
     A board is a plane tangent at its center, so its outer LEDs are off the surface, as on the real dome. Everything
@@ -60,7 +55,6 @@ def patch_boards(
     2. The glue tilts each board, and displaces each LED in the board's plane.
     3. Places of the LEDs: hole h is in column h % 3 and row h // 3; hole 4 is the center.
     """
-    rng = random_stream(config.hardware_seed)
     # 1.
     level: Floats | None
     if config.boards:
@@ -85,10 +79,9 @@ def patch_boards(
     )
     number = (board * HOLES + hole).astype(np.int64)
     types = [name for each in config.boards for name in each.types or [""] * len(each.leds)]
-    placed = PlacedLeds(
+    return PlacedLeds(
         number, place, boards.normal[board], level, np.full(len(board), np.nan), types
     )
-    return led_sources(placed, led, band, rng)
 
 
 def spread_boards(

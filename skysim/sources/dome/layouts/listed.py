@@ -4,24 +4,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError, Where
-from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources, normalized
+from skysim.core.types import Floats, normalized
 from skysim.scene.sections.layouts import ListedConfig, relative_levels
-from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.placing import (
     Ints,
+    PlacedLeds,
     check_cap,
     directions_from_angles,
-    led_sources,
     on_surface,
     project_from_bearing,
 )
 from skysim.sources.dome.point_cloud import UNIT_M
 from skysim.sources.dome.surface import Surface
-from skysim.sources.photometry import Band
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
 SAME_PLACE = 1e-4  # distance of two LEDs of a file that are one, in m or rad
@@ -52,7 +50,7 @@ class LedFile(NamedTuple):
     id: Ints | None
 
 
-def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLeds:
     """LEDs from a list or a CSV file: places in the lab, used unchanged, or directions from the bearing.
 
     Normals are the surface's.
@@ -82,8 +80,7 @@ def listed(config: ListedConfig, surface: Surface, led: LedConfig, band: Band) -
     # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
     placed = on_surface(surface, place_m, level)._replace(types=config.types or ())
-    placed = placed if number is None else placed._replace(id=number)
-    return led_sources(placed, led, band, random_stream(config.hardware_seed))
+    return placed if number is None else placed._replace(id=number)
 
 
 def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, around_z
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.layouts.fisher import (
@@ -359,9 +359,7 @@ def field_reach_rad(config: OptimizedConfig, surface: Surface) -> float:
     # The circle about the field's corners.
     half_diagonal = np.hypot(*tan_half(config))
     azimuth = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    cone = np.column_stack(
-        [half_diagonal * np.cos(azimuth), half_diagonal * np.sin(azimuth), np.ones(24)]
-    )
+    cone = around_z(half_diagonal, azimuth, 1.0)
     tilt_rad = math.radians(config.tilt_deg)
     angles = [(a, tilt_rad, yaw) for a in azimuth for yaw in azimuth[::2]]
     reach = 0.0

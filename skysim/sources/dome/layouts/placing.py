@@ -1,7 +1,6 @@
 """Parts that all layouts share: directions from the bearing, their places on the surface, LEDs as light sources."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,6 @@ from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
-from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
@@ -45,6 +43,8 @@ class PlacedLeds(NamedTuple):
         (N,) magnitudes of the stars that the LEDs represent; NaN for LEDs that represent none
     types
         (N,) names in `led.types`, empty for `led` itself; none for LEDs of one type
+    number
+        (N,) LED numbers instead of `id`, which gives the boards, if only some of the places have an LED
     """
 
     id: Ints
@@ -53,6 +53,7 @@ class PlacedLeds(NamedTuple):
     level: Floats
     magnitude: Floats
     types: Sequence[str] = ()
+    number: Ints | None = None
 
 
 def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: Generator) -> Sources:
@@ -83,7 +84,7 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: Generator) 
         for one, rows in types:
             chromatic[rows] = chromatic_of(one, band, color[rows])
     return Sources(
-        id=placed.id,
+        id=placed.id if placed.number is None else placed.number,
         place=np.column_stack([placed.place_m, np.ones(count)]),
         normal=placed.normal,
         radius_m=np.full(count, led.disk_diameter_m / 2),
@@ -100,35 +101,26 @@ def on_surface(surface: Surface, place_m: Floats, level: Floats) -> PlacedLeds:
     return PlacedLeds(number, place_m, surface.inward(place_m), level, unknown)
 
 
-def dimmed_sources(
-    config: DimmedConfig,
-    surface: Surface,
-    place_m: Floats,
-    led: LedConfig,
-    band: Band,
-    rng: Generator,
-) -> Sources:
-    """Sources of LEDs at (N, 3) places on the surface, each with a random level of the layout's `dimming`."""
+def dimmed(
+    config: DimmedConfig, surface: Surface, place_m: Floats, rng: Generator
+) -> PlacedLeds:
+    """LEDs at (N, 3) places on the surface, each with a random level of the layout's `dimming`.
+
+    Of a regular layout a random fraction `lit_fraction` has an LED; each keeps its number among all places.
+    """
+    number = None
+    # Which LEDs are lit is drawn before their levels.
+    if isinstance(config, LitConfig):
+        lit = max(round(config.lit_fraction * len(place_m)), 1)
+        number = np.sort(rng.permutation(len(place_m))[:lit])
+        place_m = place_m[number]
     if config.unique_neighbors:
         # Levels by which an LED is known from its neighbors.
         levels = np.unique(config.dimming)
         level = levels[unique_levels(len(levels), config.unique_neighbors, place_m, rng)]
     else:
         level = rng.choice(config.dimming, len(place_m))
-    return led_sources(on_surface(surface, place_m, level), led, band, rng)
-
-
-def lit_sources(
-    config: LitConfig, surface: Surface, place_m: Floats, led: LedConfig, band: Band
-) -> Sources:
-    """Sources of a random fraction `lit_fraction` of LEDs at (N, 3) places; each keeps its number among all places."""
-    # Which LEDs are lit is drawn before their levels.
-    rng = random_stream(config.hardware_seed)
-    lit = max(round(config.lit_fraction * len(place_m)), 1)
-    number = np.sort(rng.permutation(len(place_m))[:lit])
-    return replace(
-        dimmed_sources(config, surface, place_m[number], led, band, rng), id=number
-    )
+    return on_surface(surface, place_m, level)._replace(number=number)
 
 
 def cap(count: int, half_angle_rad: float) -> Floats:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator
 
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Sources
@@ -32,7 +33,6 @@ from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.listed import listed
 from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
 from skysim.sources.dome.layouts.spreads import (
-    dimmed,
     fibonacci,
     geodesic,
     optimized,
@@ -42,6 +42,18 @@ from skysim.sources.dome.layouts.spreads import (
 from skysim.sources.dome.layouts.string import displace_ends, string
 from skysim.sources.dome.surface import Surface
 from skysim.sources.photometry import Band
+
+LayoutFunction = Callable[[Any, Surface, LedConfig, Band], Sources]
+
+
+def fitted(place: Callable[[Any, Surface, Generator], PlacedLeds]) -> LayoutFunction:
+    """The layout of the LEDs that a function places; all draws are from one stream of the hardware."""
+
+    def layout(config: Any, surface: Surface, led: LedConfig, band: Band) -> Sources:
+        rng = random_stream(config.hardware_seed)
+        return led_sources(place(config, surface, rng), led, band, rng)
+
+    return layout
 
 
 def celestial(
@@ -82,16 +94,16 @@ def projector(
 
 
 # Arguments: the layout's section of the scene, the surface, the LED section, the chip's band. Returns all LEDs.
-LAYOUTS: dict[str, Callable[[Any, Surface, LedConfig, Band], Sources]] = {
-    "patch_boards": patch_boards,
-    "fibonacci": dimmed(fibonacci),
-    "poisson_disk": dimmed(poisson_disk),
-    "random": dimmed(random_places),
-    "geodesic": geodesic,
-    "string": string,
-    "optimized": dimmed(optimized),
+LAYOUTS: dict[str, LayoutFunction] = {
+    "patch_boards": fitted(patch_boards),
+    "fibonacci": fitted(fibonacci),
+    "poisson_disk": fitted(poisson_disk),
+    "random": fitted(random_places),
+    "geodesic": fitted(geodesic),
+    "string": fitted(string),
+    "optimized": fitted(optimized),
     "celestial": celestial,
-    "listed": listed,
+    "listed": fitted(listed),
     "fibers": fibers,
     "lcd": lcd,
     "projector": projector,

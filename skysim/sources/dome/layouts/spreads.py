@@ -1,6 +1,6 @@
 """Spreads of single LEDs over the cap: Fibonacci spiral, random, Poisson disk, optimized, geodesic sphere."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Sources, normalized
+from skysim.core.types import Floats, around_z, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -18,12 +18,11 @@ from skysim.scene.sections.layouts import (
     PoissonDiskConfig,
     RandomPlacesConfig,
 )
-from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts import optimize
 from skysim.sources.dome.layouts.placing import (
+    PlacedLeds,
     cap,
-    dimmed_sources,
-    lit_sources,
+    dimmed,
     project_from_bearing,
     scattered_cap,
     spread,
@@ -31,7 +30,6 @@ from skysim.sources.dome.layouts.placing import (
     tilts_rad,
 )
 from skysim.sources.dome.surface import Surface, directions
-from skysim.sources.photometry import Band
 
 # Random points per spacing^2: a gap of .03 of that area is found with probability .95.
 DARTS_PER_SPACING2 = 100
@@ -42,36 +40,22 @@ UNDIMMED = {"levels": None, "magnitudes": None, "unique_neighbors": None}
 BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a millimeter
 
 
-# Spreads whose LEDs all have random levels: `dimmed` makes their layouts. Arguments: the layout's section of the scene,
-# the surface, and the hardware's random stream. They return (N, 3) places.
+# Arguments: the layout's section of the scene, the surface, and the hardware's random stream.
 
 
-def dimmed(
-    places: Callable[[Any, Surface, Generator], Floats],
-) -> Callable[[Any, Surface, LedConfig, Band], Sources]:
-    """The layout of LEDs at a spread's places, each with a random level of the layout's `dimming`."""
-
-    def layout(config: Any, surface: Surface, led: LedConfig, band: Band) -> Sources:
-        rng = random_stream(config.hardware_seed)
-        place_m = places(config, surface, rng)
-        return dimmed_sources(config, surface, place_m, led, band, rng)
-
-    return layout
-
-
-def fibonacci(config: FibonacciConfig, surface: Surface, _rng: Generator) -> Floats:
+def fibonacci(config: FibonacciConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
-    return project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
+    place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
+    return dimmed(config, surface, place_m, rng)
 
 
-def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> Floats:
+def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
-    return project_from_bearing(
-        surface, scattered_cap(config.count, np.radians(config.cap_deg), rng)
-    )
+    directions = scattered_cap(config.count, np.radians(config.cap_deg), rng)
+    return dimmed(config, surface, project_from_bearing(surface, directions), rng)
 
 
-def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> Floats:
+def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -93,7 +77,8 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) ->
         darts_m = project_from_bearing(
             surface, scattered_cap(DARTS_PER_LED * count, half, rng)
         )
-        return darts_m[spread(darts_m, 0.0, count, BISECTIONS)]
+        chosen = spread(darts_m, 0.0, count, BISECTIONS)
+        return dimmed(config, surface, darts_m[chosen], rng)
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
     # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
@@ -112,10 +97,10 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) ->
             f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
-    return darts_m[thin(darts_m, config.spacing_m)]
+    return dimmed(config, surface, darts_m[thin(darts_m, config.spacing_m)], rng)
 
 
-def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Floats:
+def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
@@ -134,7 +119,7 @@ def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Floa
     place_m, state = optimized_places(config_of_places, *points)
     # The random stream goes on as if the search had not been cached.
     rng.bit_generator.state = state
-    return place_m
+    return dimmed(config, surface, place_m, rng)
 
 
 # A search takes seconds; a study's trials, its costs and its report ask for the same places.
@@ -173,7 +158,7 @@ def optimized_places(
 CAP_SLACK = 1e-12  # relative rounding error of a vertex on the rim of the cap
 
 
-def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def geodesic(config: GeodesicConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
     vertices = geodesic_vertices(config.frequency, config.class_)
     tilt_rad = tilts_rad(vertices)
@@ -182,10 +167,8 @@ def geodesic(config: GeodesicConfig, surface: Surface, led: LedConfig, band: Ban
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
     turned = azimuth_rad[order] + np.radians(config.rotation_deg)
-    directions_lab = directions(tilt_rad[order], turned)
-    return lit_sources(
-        config, surface, project_from_bearing(surface, directions_lab), led, band
-    )
+    place_m = project_from_bearing(surface, directions(tilt_rad[order], turned))
+    return dimmed(config, surface, place_m, rng)
 
 
 def geodesic_vertices(frequency: int, class_: str) -> Floats:
@@ -218,7 +201,6 @@ def icosahedron() -> Floats:
     z = 1 / np.sqrt(5)
     ring = 2 / np.sqrt(5)
     azimuth = np.arange(5) * (2 * np.pi / 5)
-    upper = np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), np.full(5, z)])
-    between = azimuth + np.pi / 5
-    lower = np.column_stack([ring * np.cos(between), ring * np.sin(between), np.full(5, -z)])
+    upper = around_z(ring, azimuth, z)
+    lower = around_z(ring, azimuth + np.pi / 5, -z)
     return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])

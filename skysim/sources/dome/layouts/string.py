@@ -25,10 +25,8 @@ from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
-from skysim.scene.sections.leds import LedConfig
-from skysim.sources.dome.layouts.placing import lit_sources, project_from_bearing
+from skysim.sources.dome.layouts.placing import PlacedLeds, dimmed, project_from_bearing
 from skysim.sources.dome.surface import Surface, directions, perpendicular
-from skysim.sources.photometry import Band
 
 STEPS_PER_TURN = 720
 STEPS_PER_PITCH = 16
@@ -90,9 +88,9 @@ class Wound(NamedTuple):
     tape_m: Floats
 
 
-def string(config: StringConfig, surface: Surface, led: LedConfig, band: Band) -> Sources:
+def string(config: StringConfig, surface: Surface, rng: Generator) -> PlacedLeds:
     """LEDs of tapes, one every pitch along the surface. Raises InputError for too long a tape."""
-    return lit_sources(config, surface, wind(config, surface).place_m, led, band)
+    return dimmed(config, surface, wind(config, surface).place_m, rng)
 
 
 def wind(config: StringConfig, surface: Surface) -> Wound:
