@@ -274,12 +274,11 @@ def predicted(
 # --- faults -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class DomeFaults:
-    """Faults of the dome by LED number.
+def find_faults(run: SurveyRun) -> Record:
+    """The faults that a survey shows, by LED number.
 
-    Attributes
-    ----------
+    Returns
+    -------
     dark
         LEDs that no frame shows although it should
     displaced
@@ -299,25 +298,6 @@ class DomeFaults:
         Fraction of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
         none are compared: too few are in enough frames, or the time of their code is unknown
     """
-
-    dark: list[int]
-    displaced: dict[int, float]
-    list_sigma_m: float
-    tested: int
-    tested_m: float | None
-    exchanged: list[tuple[int, int, list[int]]]
-    found_m: dict[int, list[float]]
-    unlisted: list[list[float]]
-    exchange_share: float | None
-
-    @property
-    def count(self) -> int:
-        """Number of faults."""
-        return len(self.dark) + len(self.displaced) + len(self.exchanged) + len(self.unlisted)
-
-
-def find_faults(run: SurveyRun) -> DomeFaults:
-    """The faults that a survey shows."""
     survey = run.survey
     leds = run.listed
     table = light_table(run)
@@ -330,27 +310,28 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None
     exchanges, share = ([], None) if is_free else survey_faults.exchanged(table)
-    return DomeFaults(
-        leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
-        {int(leds.id[row]): float(off_m[row]) for row in rows},
-        sigma_m,
-        len(size_m),
-        float(np.median(size_m)) if len(size_m) else None,
-        [
+    dark = survey_faults.dark(table.shown & (table.expected > 0), run.seen)
+    return {
+        "dark": leds.id[dark].tolist(),
+        "displaced": {int(leds.id[row]): float(off_m[row]) for row in rows},
+        "list_sigma_m": sigma_m,
+        "tested": len(size_m),
+        "tested_m": float(np.median(size_m)) if len(size_m) else None,
+        "exchanged": [
             (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
             for x in exchanges
         ],
-        {
+        "found_m": {
             int(leds.id[row]): survey.leds.position_m[row].tolist()
             for row in (*rows, *(x.led for x in exchanges))
         },
-        [stray.position_m.tolist() for stray in stray_lights(run)],
-        share,
-    )
+        "unlisted": [stray.position_m.tolist() for stray in stray_lights(run)],
+        "exchange_share": share,
+    }
 
 
 def fault_rows(faults: Record) -> Iterator[tuple[str, str, str, str]]:
-    """LED, fault and details of each fault of a `DomeFaults` as a record, and a sentence on it."""
+    """LED, fault and details of each fault of `find_faults`, and a sentence on it."""
     at = {led: f"at {coordinates(place_m)} mm" for led, place_m in faults["found_m"].items()}
     for led in faults["dark"]:
         yield f"{led}", "dark", "no frame shows it", f"LED {led} is dark"
@@ -373,7 +354,7 @@ def coordinates(place_m: list[float]) -> str:
 
 
 def fault_lines(faults: Record) -> list[str]:
-    """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
+    """The faults of `find_faults` as lines of text, one per fault, and a summary line."""
     return [*(line for *_, line in fault_rows(faults)), fault_summary(faults)]
 
 

@@ -18,7 +18,6 @@ from skysim.core.types import Bools, Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
-    DomeFaults,
     SurveyRun,
     accuracy_statistics,
     fault_rows,
@@ -342,7 +341,7 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
 
 def survey_figure(
     so_far: Coverage,
-    faults: DomeFaults,
+    faults: Record,
     further: Rotation,
     errors: LedErrors | None,
     run: SurveyRun,
@@ -366,7 +365,7 @@ def survey_figure(
     return png(draw, (7 * (1 + len(panels)), 6.5))
 
 
-def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
+def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation) -> None:
     """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
     from matplotlib.colors import LogNorm
 
@@ -389,13 +388,13 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rota
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
-    exchanged = [led for led, _, _ in faults.exchanged]
-    for name, numbers, marker, color in (
-        ("dark", faults.dark, "x", "black"),
-        ("displaced", list(faults.displaced), "D", "magenta"),
-        ("exchanged", exchanged, "s", "red"),
+    numbers = faults | {"exchanged": [led for led, _, _ in faults["exchanged"]]}
+    for name, marker, color in (
+        ("dark", "x", "black"),
+        ("displaced", "D", "magenta"),
+        ("exchanged", "s", "red"),
     ):
-        rows = rows_of(numbers, leds.id)
+        rows = rows_of(list(numbers[name]), leds.id)
         colors = (
             {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
         )
