@@ -87,7 +87,7 @@ def parse_uncertainty(
         raise InputError(
             "balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm"
         )
-    return Uncertainty(*sigmas, tacho_sigma_rpm * RPM_RAD_S)
+    return Uncertainty._make([*sigmas, tacho_sigma_rpm * RPM_RAD_S])
 
 
 class Assumptions(NamedTuple):
