@@ -19,13 +19,13 @@ from estimator.calibration.mass_dynamics import (
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.errors import InputError
 from skysim.core.random_streams import BALANCE, random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.core.units import quantities_within
 from skysim.dynamics import imu, multibody
 from skysim.dynamics.multibody import VehicleModel
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
-from skysim.scene.sections.motion import MotionConfig
+from skysim.scene.sections.motion import BUILT_IN_LAWS, MotionConfig
 from skysim.simulation.flight import Flight, Progress, open_flight
 
 # The assumed vehicle before it is balanced, and its uncertainty.
@@ -82,12 +82,12 @@ def parse_uncertainty(
 ) -> Uncertainty:
     """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = inertia_sigma, offset_sigma, wheel_sigma, mount_sigma
-    inertia, offset_m, wheel, mount_rad = quantities_within("balance", RANGES, texts)
+    sigmas = quantities_within("balance", RANGES, texts)
     if not 0 <= tacho_sigma_rpm <= MAX_TACHO_RPM:
         raise InputError(
             "balance.tacho_sigma", f"{tacho_sigma_rpm:g}", f"0 to {MAX_TACHO_RPM:g} rpm"
         )
-    return Uncertainty(inertia, offset_m, wheel, mount_rad, tacho_sigma_rpm * RPM_RAD_S)
+    return Uncertainty._make([*sigmas, tacho_sigma_rpm * RPM_RAD_S])
 
 
 class Assumptions(NamedTuple):
@@ -337,32 +337,32 @@ def excited_by_wheels(
         momentum / math.radians(tilt_deg) / (2 * math.pi),
     )
     acceleration = math.degrees(TORQUE_SHARE * wheels.torque_limit_nm / largest)
-    legs = []
+    legs: list[Record] = []
     for yaw_deg, axis_deg in zip(YAWS_DEG, AXES_DEG, strict=True):
-        legs.append(
+        axis_rad = math.radians(axis_deg)
+        legs += [
             {
                 "kind": "slew",
                 "yaw_deg": yaw_deg,
                 "rate_deg_s": min(YAW_DEG_S, math.degrees(momentum)),
                 "acceleration_deg_s2": min(YAW_DEG_S2, acceleration),
-            }
-        )
-        direction = [math.cos(math.radians(axis_deg)), math.sin(math.radians(axis_deg)), 0.0]
-        legs.append(
+            },
             {
                 "kind": "sine",
-                "amplitude_deg": [tilt_deg * one for one in direction],
+                "amplitude_deg": [
+                    tilt_deg * math.cos(axis_rad),
+                    tilt_deg * math.sin(axis_rad),
+                    0.0,
+                ],
                 "frequency_hz": rate_hz,
                 "duration": f"{longer * PERIODS / rate_hz} s",
-            }
-        )
+            },
+        ]
     control = scene.motion.control
     law = {"law": "pid", "actuators": "wheels"}
-    if control and control.law in ("pid", "pd"):
-        law |= {
-            key: getattr(control, key)
-            for key in ("bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz")
-        }
+    if control and control.law in BUILT_IN_LAWS:
+        kept = {"bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz"}
+        law |= control.model_dump(include=kept)
     motion = MotionConfig.model_validate({"control": law, "maneuver": legs[1:]})
     return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(
         update={"motion": motion}

@@ -164,9 +164,9 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
     """
     order = np.argsort(-truth.electrons, kind="stable")
     rows = np.zeros(len(order), SOURCE)
-    rows["x_px"], rows["y_px"] = truth.xy_px[order].T
-    rows["flux_x_px"], rows["flux_y_px"] = truth.flux_xy_px[order].T
-    rows["streak_x_px"], rows["streak_y_px"] = truth.streak_xy_px[order].T
+    for name in ("", "flux_", "streak_"):
+        place = getattr(truth, f"{name}xy_px")[order]
+        rows[f"{name}x_px"], rows[f"{name}y_px"] = place.T
     for name in ("id", "streak_px", "electrons", "peak_e", "snr", "saturated"):
         rows[name] = getattr(truth, name)[order]
     rows["sigma_px"] = across_sigma_px(truth.area_px, truth.streak_px)[order]

@@ -14,7 +14,7 @@ The vehicle is held at several attitudes (stops), and each frame shows the same 
 LEDs are named by the predicted image of the assumed dome at the IMU's attitude, so the truth is not used.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.attitude.nearfield import thesis_points
 from estimator.attitude.solvers import quest
 from estimator.calibration.home_position import (
@@ -43,16 +42,23 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Bools, Floats, Ints, Record, normalized
+from skysim.core.types import Floats, Ints, Record, normalized
 from skysim.experiments.dome_survey import survey_images
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, calibration_prior
 from skysim.results.plots import INK, png
 from skysim.results.report import Report
-from skysim.results.report_blocks import Column, Figure, Section, Table, Verdict
-from skysim.results.telemetry_report import euler_deg
+from skysim.results.report_blocks import (
+    Column,
+    Figure,
+    Section,
+    Table,
+    Verdict,
+    text_column,
+)
+from skysim.results.telemetry_report import EULER, euler_deg
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Progress, open_flight
 from skysim.simulation.lab import Lab, build_lab
-from skysim.tracking import onboard_model
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
 
 SAME_STOP_DEG = 0.5  # frames of a stop differ by less, two stops in a row by more
@@ -62,15 +68,6 @@ CLICKS = 4
 # Angles with a larger gap are distinct: a bucket of the thesis's pair catalog.
 DISTINCT_ARCSEC = 100.0
 QUEST_LEDS = 2
-
-
-class Assumed(NamedTuple):
-    """What the vehicle knows before: its camera, its dome, and the camera's place."""
-
-    scene: Scene
-    camera: Camera
-    leds: LedMap
-    lever: Lever
 
 
 class Calibration(NamedTuple):
@@ -84,8 +81,8 @@ class Calibration(NamedTuple):
         (N,) numbers of the LEDs at home
     stop
         (F,) number of the stop of each frame, from 0
-    magnitude, body_m, lab_m
-        (F, N), and (F, N, 3) positions in body axes and, by the IMU, in the lab
+    magnitude, lab_m
+        (F, N), and (F, N, 3) positions in the lab by the IMU
     angle_rad
         (F, N (N - 1) / 2) of the pairs, in the order of np.triu_indices
     imu_deg, algorithm_deg
@@ -97,26 +94,19 @@ class Calibration(NamedTuple):
     led: Ints
     stop: Ints
     magnitude: Floats
-    body_m: Floats
     lab_m: Floats
     angle_rad: Floats
     imu_deg: Floats
     algorithm_deg: Floats
 
 
-def assumed(lab: Lab) -> Assumed:
+def assumed(lab: Lab) -> CalibrationPrior:
     """What the scene's tracker assumes. Raises InputError for a scene without LEDs."""
-    scene = lab.scene
-    if scene.dome is None:
+    if lab.scene.dome is None:
         raise InputError(
-            "light.kind", scene.light.kind, "dome, for a calibration by its LEDs"
+            "light.kind", lab.scene.light.kind, "dome, for a calibration by its LEDs"
         )
-    return Assumed(
-        scene,
-        onboard_model.assumed_camera(scene),
-        onboard_model.assumed_dome(scene, scene.dome, lab.camera.sources),
-        onboard_model.assumed_lever(scene, lab.camera.mount),
-    )
+    return calibration_prior(lab)
 
 
 # Frames of a flight, or of a folder.
@@ -159,7 +149,7 @@ def intensity_threshold_dn(scene: Scene) -> float:
 
 def measure_scene(
     scene: Scene, progress: Progress | None = None
-) -> tuple[Assumed, list[HeldFrame]]:
+) -> tuple[CalibrationPrior, list[HeldFrame]]:
     """Fly a scene and measure its frames. The IMU's attitude is the true one if the vehicle has none."""
     with open_flight(scene) as flight:
         known = assumed(flight.lab)
@@ -175,7 +165,7 @@ def measure_scene(
     return known, [HeldFrame(at(t_s), *rest) for t_s, *rest in measured]
 
 
-def measure_folder(folder: Path, scene: Scene) -> tuple[Assumed, list[HeldFrame]]:
+def measure_folder(folder: Path, scene: Scene) -> tuple[CalibrationPrior, list[HeldFrame]]:
     """Measure the images of a folder with the IMU's attitudes in its `attitudes.csv`. Raises InputError."""
     known = assumed(build_lab(scene))
     threshold_dn = intensity_threshold_dn(scene)
@@ -187,7 +177,7 @@ def measure_folder(folder: Path, scene: Scene) -> tuple[Assumed, list[HeldFrame]
     return known, frames
 
 
-def sightings(known: Assumed, frames: Sequence[HeldFrame]) -> Iterator[Sighting]:
+def sightings(known: CalibrationPrior, frames: Sequence[HeldFrame]) -> Iterator[Sighting]:
     """The frames that show a stop's LEDs: in motion or without an LED they are left out."""
     stop = -1
     start = before = None
@@ -216,14 +206,14 @@ def apart_deg(a: Rotation, b: Rotation) -> float:
     return float(np.degrees((a.inv() * b).magnitude()))
 
 
-def name_lights(known: Assumed, frame: HeldFrame) -> tuple[NDArray[Any], NDArray[Any]]:
+def name_lights(
+    known: CalibrationPrior, frame: HeldFrame
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Rows of the map and of the frame's lights that are each other's nearest, within half the least spacing.
 
     An error of the IMU moves all images alike, so a frame with all its LEDs is first moved onto the expected ones.
     """
-    expected_px = project(
-        frame.lab_from_body.inv(), known.leds.position_m, known.lever, known.camera
-    )
+    expected_px = known.pixels(frame.lab_from_body.inv())
     led = np.flatnonzero(known.camera.contains(expected_px))
     if not len(led):
         return led, led
@@ -232,20 +222,20 @@ def name_lights(known: Assumed, frame: HeldFrame) -> tuple[NDArray[Any], NDArray
     if len(xy_px) == len(led):
         xy_px = xy_px - xy_px.mean(axis=0) + expected_px.mean(axis=0)
     tree = cKDTree(expected_px)
-    spacing_px = tree.query(expected_px, 2)[0][:, 1] if len(led) > 1 else np.array([np.inf])
-    distance_px, nearest = tree.query(xy_px)
-    _, nearest_light = cKDTree(xy_px).query(expected_px)
-    is_mutual = nearest_light[nearest] == np.arange(len(nearest))
-    light = np.flatnonzero(is_mutual & (distance_px < spacing_px.min() / 2))
-    order = np.argsort(led[nearest[light]])
-    return led[nearest[light]][order], light[order]
+    # The spacing of a single LED is infinite.
+    spacing_px = tree.query(expected_px, 2)[0][:, 1].min()
+    _, nearest = tree.query(xy_px)
+    distance_px, light = cKDTree(xy_px).query(expected_px)
+    is_mutual = nearest[light] == np.arange(len(led))
+    named = is_mutual & (distance_px < spacing_px / 2)
+    return led[named], light[named]
 
 
 # The thesis's steps.
 
 
 def calibrated(
-    known: Assumed, frames: Sequence[HeldFrame], clicks: int = CLICKS
+    known: CalibrationPrior, frames: Sequence[HeldFrame], clicks: int = CLICKS
 ) -> Calibration:
     """The numbered steps of the module.
 
@@ -287,7 +277,6 @@ def calibrated(
         common[0].led,
         stop,
         brightness,
-        body_m,
         lab_m,
         pair_angles_rad(body_m),
         euler_deg(imu[first]),
@@ -311,7 +300,7 @@ def complete(seen: Sequence[Sighting]) -> list[Sighting]:
     return kept
 
 
-def scaled(known: Assumed, first: Sighting, clicks: int) -> Camera:
+def scaled(known: CalibrationPrior, first: Sighting, clicks: int) -> Camera:
     """Step 1: the camera whose focal length makes the first frame's spacings those of the map.
 
     MATLAB's `cp2tform` of type `linear conformal` is scikit-image's `SimilarityTransform`; its scale is millimeters per
@@ -345,9 +334,7 @@ def statistics(found: Calibration) -> Record:
     order = np.argsort(-found.magnitude.mean(axis=0), kind="stable")
     ranked = -np.sort(-found.magnitude, axis=1)
     angle = found.angle_rad / ARCSEC_RAD
-    pairs = np.argsort(angle.mean(axis=0), kind="stable")
-    sets = [found.stop == n for n in np.unique(found.stop)]
-    ascending = angle[:, pairs]
+    ascending = angle[:, np.argsort(angle.mean(axis=0), kind="stable")]
     groups = np.flatnonzero(np.diff(ascending.mean(axis=0)) > DISTINCT_ARCSEC) + 1
     difference_deg = found.algorithm_deg - found.imu_deg
     columns_mm = 1e3 * found.lab_m
@@ -355,13 +342,13 @@ def statistics(found: Calibration) -> Record:
         "frames": len(found.stop),
         "focal_px": found.camera.focal_px,
         "leds": [
-            {"led": int(found.led[n])} | spread(found.magnitude[:, n], sets) for n in order
+            {"led": int(found.led[n])} | spread(found, found.magnitude[:, n]) for n in order
         ],
-        "ranks": [spread(column, sets) for column in ranked.T],
-        "pairs": [spread(angle[:, n], sets) for n in pairs],
+        "ranks": [spread(found, column) for column in ranked.T],
+        "pairs": [spread(found, column) for column in ascending.T],
         "distinct": len(groups) + 1,
         "angles": [
-            {"pairs": columns.shape[1]} | spread(columns.mean(axis=1), sets)
+            {"pairs": columns.shape[1]} | spread(found, columns.mean(axis=1))
             for columns in np.split(ascending, groups, axis=1)
         ],
         "epsilon": {
@@ -373,13 +360,13 @@ def statistics(found: Calibration) -> Record:
         "difference_deg": differences(difference_deg),
         "stops": [
             {
-                "frames": int(one.sum()),
+                "frames": len(one),
                 "imu_deg": found.imu_deg[n].tolist(),
                 "algorithm_deg": found.algorithm_deg[n].tolist(),
                 "difference_deg": difference_deg[n].tolist(),
-                "x_mm": columns_mm[one, :, 0].mean(axis=0).tolist(),
+                "x_mm": one[:, :, 0].mean(axis=0).tolist(),
             }
-            for n, one in enumerate(sets)
+            for n, one in enumerate(by_stop(found, columns_mm))
         ],
     }
 
@@ -390,24 +377,28 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     A single stop has no deviation, NaN.
     """
     absolute = np.abs(difference_deg)
-    sd = absolute.std(axis=0, ddof=1) if len(absolute) > 1 else np.full(3, np.nan)
-    return {
-        "least": absolute.min(axis=0).tolist(),
-        "largest": absolute.max(axis=0).tolist(),
-        "mean": absolute.mean(axis=0).tolist(),
-        "sd": sd.tolist(),
+    columns: dict[str, Callable[..., Any]] = {
+        "least": np.min,
+        "largest": np.max,
+        "mean": np.mean,
+        "sd": deviation,
     }
+    return {name: of(absolute, axis=0).tolist() for name, of in columns.items()}
 
 
-def spread(values: Floats, sets: Sequence[Bools]) -> Record:
+def spread(found: Calibration, values: Floats) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values, over all frames and at each stop."""
-    return moments(values) | {"stops": [moments(values[one]) for one in sets]}
+    return moments(values) | {"stops": [moments(one) for one in by_stop(found, values)]}
 
 
 def moments(values: Floats) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values; NaN for the deviation of one."""
-    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
-    return {"mean": float(values.mean()), "sd": sd}
+    return {"mean": float(values.mean()), "sd": float(deviation(values))}
+
+
+def deviation(values: Floats, axis: int = 0) -> Any:
+    """Standard deviation (n - 1) of the values along an axis; NaN for one."""
+    return values.std(axis=axis, ddof=1) if len(values) > 1 else np.nan * values[0]
 
 
 def calibration_report(
@@ -434,19 +425,19 @@ def calibration_report(
     by_rank = spread_table("", "rank in the image", magnitude, numbers["ranks"])
     pairs = spread_table("", "pair", angle, numbers["pairs"])
     distinct = spread_table("pairs", "pairs of one angle", angle, numbers["angles"])
-    angles = [
-        f"{name} {kind}" for kind in ("IMU", "camera") for name in ("roll", "pitch", "yaw")
-    ]
+
+    def angles(source: str = "") -> list[Column]:
+        return [Column(name + source, "°", ".4f") for name in EULER]
+
     stops = Table(
-        [Column("stop"), Column("frames"), *(Column(name, "°", ".4f") for name in angles)],
+        [Column("stop"), Column("frames"), *angles(" IMU"), *angles(" camera")],
         [
             [n, one["frames"], *one["imu_deg"], *one["algorithm_deg"]]
             for n, one in enumerate(numbers["stops"], 1)
         ],
     )
-    names = [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
     difference = Table(
-        [Column("camera minus IMU, absolute", kind="text"), *names],
+        [text_column("camera minus IMU, absolute"), *angles()],
         [[name, *values] for name, values in numbers["difference_deg"].items()],
     )
     sections = [
@@ -473,11 +464,11 @@ def spread_table(key: str, name: str, value: Column, rows: list[Record]) -> Tabl
 
 
 def write_results(
-    folder: Path, known: Assumed, found: Calibration, command: str
+    folder: Path, scene: str, known: CalibrationPrior, found: Calibration, command: str
 ) -> tuple[Record, Report]:
     """Write the report, and the catalog as a map for `tracker.map`; return what `--json` prints, and the report."""
     numbers = statistics(found)
-    made = calibration_report(f"Calibration of {known.scene.name}", command, found, numbers)
+    made = calibration_report(f"Calibration of {scene}", command, found, numbers)
     page = make_folder(folder) / "report.html"
     made.save(page)
     catalog = folder / "leds.ecsv"
@@ -489,7 +480,7 @@ def write_results(
     return numbers | {"report": str(page)}, made
 
 
-def catalog_map(known: Assumed, found: Calibration) -> DomeMap:
+def catalog_map(known: CalibrationPrior, found: Calibration) -> DomeMap:
     """The on-board catalog (section 3.6.4), with the camera as calibrated. Raises ImageError."""
     leds = led_map(found.catalog, known.leds)
     camera = found.camera

@@ -11,7 +11,8 @@ from estimator.calibration.home_position import Sighting
 from estimator.core.camera import Camera
 from skysim.core.errors import InputError
 from skysim.experiments import home_calibration as home
-from skysim.experiments.home_calibration import Assumed, HeldFrame
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.experiments.home_calibration import HeldFrame
 from skysim.scene.loader import load
 
 MM = 1e-3
@@ -20,17 +21,17 @@ HEIGHT_M = 1.2192
 
 
 @pytest.fixture(scope="module")
-def known() -> Assumed:
+def known() -> CalibrationPrior:
     """A camera below the apex of a sphere about the bearing, with a cross of five LEDs."""
     place_m = np.column_stack([CROSS_M, np.full(5, HEIGHT_M)])
     leds = LedMap(np.arange(5), place_m, np.zeros(3), np.full(3, HEIGHT_M))
     lever = Lever(np.array([0.0, 0.0, 0.381]), Rotation.identity())
     camera = Camera(1600, 1200, 9000.0, (799.5, 599.5))
-    return Assumed(load("afit_test3"), camera, leds, lever)
+    return CalibrationPrior(camera, leds, lever, 0.0, 0.0, np.ones(5))
 
 
 def seen_from(
-    known: Assumed, lab_from_body: Rotation, imu: Rotation | None = None
+    known: CalibrationPrior, lab_from_body: Rotation, imu: Rotation | None = None
 ) -> HeldFrame:
     """The frame of an attitude without noise, the lights in another order than the LEDs."""
     xy_px = project(lab_from_body.inv(), known.leds.position_m, known.lever, known.camera)
@@ -57,7 +58,7 @@ def test_lights_are_regions_of_fifty_pixels_above_four_percent() -> None:
 
 
 def test_lights_are_named_although_the_imu_errs_by_the_spacing_of_the_leds(
-    known: Assumed,
+    known: CalibrationPrior,
 ) -> None:
     frame = seen_from(known, tilted(0.3, -0.2), imu=tilted(0.3, 0.2))
     led, light = home.name_lights(known, frame)
@@ -65,14 +66,14 @@ def test_lights_are_named_although_the_imu_errs_by_the_spacing_of_the_leds(
     assert frame.magnitude[light].tolist() == [10, 11, 12, 13, 14]
 
 
-def test_frames_in_motion_belong_to_no_stop(known: Assumed) -> None:
+def test_frames_in_motion_belong_to_no_stop(known: CalibrationPrior) -> None:
     pitches = [0, 0, 0, 0.5, 1.2, 2, 2, 2]
     frames = [seen_from(known, tilted(0, pitch)) for pitch in pitches]
     stops = [one.stop for one in home.sightings(known, frames)]
     assert stops == [0, 0, 0, 1, 1]
 
 
-def test_four_clicks_find_the_focal_length(known: Assumed) -> None:
+def test_four_clicks_find_the_focal_length(known: CalibrationPrior) -> None:
     """A tracker that believes 5 % less: the spacings of the first frame correct it, but for the dome's curvature."""
     frame = seen_from(known, Rotation.identity())
     led, light = home.name_lights(known, frame)
@@ -88,7 +89,7 @@ def test_pair_angles_are_those_of_equation_45() -> None:
     assert home.pair_angles_rad(points) == pytest.approx(wanted)
 
 
-def test_attitude_and_angles_of_noise_free_stops_are_true(known: Assumed) -> None:
+def test_attitude_and_angles_of_noise_free_stops_are_true(known: CalibrationPrior) -> None:
     """Near the boresight eqs 43-44 are exact to second order: 0.02 deg and an arcsecond at 2 deg of tilt."""
     attitudes = [Rotation.identity()] * 3 + [tilted(1.5, 2.0)] * 3
     frames = [seen_from(known, one) for one in attitudes]
@@ -102,7 +103,7 @@ def test_attitude_and_angles_of_noise_free_stops_are_true(known: Assumed) -> Non
 
 
 def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
-    known: Assumed,
+    known: CalibrationPrior,
 ) -> None:
     """Pooled over n frames at each stop, the deviation of two values d apart is d / 2 sqrt(2n / (2n - 1))."""
     error_deg = 0.2
@@ -116,12 +117,12 @@ def test_an_imu_error_at_one_of_two_stops_spreads_positions_by_half_of_it(
     )
 
 
-def test_too_few_frames_are_refused(known: Assumed) -> None:
+def test_too_few_frames_are_refused(known: CalibrationPrior) -> None:
     with pytest.raises(InputError, match="2 or more"):
         home.calibrated(known, [seen_from(known, tilted(0, 0))])
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_single_stop_has_no_deviation_between_stops(known: Assumed) -> None:
+def test_a_single_stop_has_no_deviation_between_stops(known: CalibrationPrior) -> None:
     found = home.calibrated(known, [seen_from(known, Rotation.identity())] * 3)
     assert np.isnan(home.statistics(found)["difference_deg"]["sd"]).all()

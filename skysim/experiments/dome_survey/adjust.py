@@ -265,12 +265,9 @@ def with_names(run: SurveyRun) -> SurveyRun:
     )
     if (old == new).all():
         return run
-    every = np.arange(len(listed_m))
-    others = np.setdiff1d(every, old)
-    free = np.setdiff1d(every, new)
-    name = every.copy()
+    name = np.arange(len(listed_m))
     name[old] = new
-    name[np.setdiff1d(others, free)] = np.setdiff1d(free, others)
+    name[np.setdiff1d(new, old)] = np.setdiff1d(old, new)
     position_m = run.prior.leds.position_m.copy()
     position_m[new] = survey.leds.position_m[old]
     order = np.argsort(name)
@@ -398,21 +395,18 @@ def largest_connected_group(visible: Bools, min_shared: int) -> list[int]:
     min_shared
         Minimum number of LEDs that a frame shares with the rest of the group
     """
-    n_frames = len(visible)
-    remaining = np.ones(n_frames, dtype=bool)
-    best = np.zeros(n_frames, dtype=bool)
+    remaining = np.ones(len(visible), dtype=bool)
+    best = np.zeros_like(remaining)
     while remaining.any():
-        group = np.zeros(n_frames, dtype=bool)
-        group[np.argmax(remaining * (1 + visible.sum(axis=1)))] = True
+        group = np.zeros_like(remaining)
+        joins = np.arange(len(visible)) == np.argmax(remaining * (1 + visible.sum(axis=1)))
         # Add frames that share enough LEDs with the group until it no longer grows.
-        while True:
-            group_leds = visible[group].any(axis=0)
-            grown = group | (remaining & ((visible & group_leds).sum(axis=1) >= min_shared))
-            if (grown == group).all():
-                break
-            group = grown
+        while joins.any():
+            group |= joins
+            shared = visible & visible[group].any(axis=0)
+            joins = remaining & ~group & (shared.sum(axis=1) >= min_shared)
         remaining &= ~group
-        best = group if group.sum() > best.sum() else best
+        best = max(best, group, key=np.sum)
     return np.flatnonzero(best).tolist()
 
 

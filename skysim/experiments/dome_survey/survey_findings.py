@@ -3,10 +3,10 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
@@ -16,6 +16,7 @@ from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLig
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.dome_survey.survey_frames import (
+    ANGLES,
     GATE_SIGMAS,
     Correspondences,
     SurveyFrame,
@@ -27,6 +28,7 @@ from skysim.experiments.dome_survey.survey_prior import (
     SurveyUncertainty,
     survey_model,
 )
+from skysim.results.metrics import rms
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.sources.dome.layouts.placing import tilts_rad
@@ -115,9 +117,10 @@ class SurveyRun:
     def uncertainty_after(self) -> SurveyUncertainty:
         """The uncertainty of the IMU and of unmeasured LEDs as before, and of lever and lens as found."""
         accuracy = self.accuracy
-        lever_m = math.sqrt(np.mean(accuracy.lever_sigma_m**2))
-        focal = float(accuracy.lens_sigma[0] / self.survey.camera.focal_px)
-        return self.uncertainty._replace(lever_sigma_m=lever_m, focal_error=focal)
+        return self.uncertainty._replace(
+            lever_sigma_m=float(rms(accuracy.lever_sigma_m)),
+            focal_error=float(accuracy.lens_sigma[0] / self.survey.camera.focal_px),
+        )
 
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
@@ -274,12 +277,11 @@ def predicted(
 # --- faults -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class DomeFaults:
-    """Faults of the dome by LED number.
+def find_faults(run: SurveyRun) -> Record:
+    """The faults that a survey shows, by LED number.
 
-    Attributes
-    ----------
+    Returns
+    -------
     dark
         LEDs that no frame shows although it should
     displaced
@@ -299,25 +301,6 @@ class DomeFaults:
         Fraction of the pairs of LEDs whose exchange would be found; 0 if all are alike, None if
         none are compared: too few are in enough frames, or the time of their code is unknown
     """
-
-    dark: list[int]
-    displaced: dict[int, float]
-    list_sigma_m: float
-    tested: int
-    tested_m: float | None
-    exchanged: list[tuple[int, int, list[int]]]
-    found_m: dict[int, list[float]]
-    unlisted: list[list[float]]
-    exchange_share: float | None
-
-    @property
-    def count(self) -> int:
-        """Number of faults."""
-        return len(self.dark) + len(self.displaced) + len(self.exchanged) + len(self.unlisted)
-
-
-def find_faults(run: SurveyRun) -> DomeFaults:
-    """The faults that a survey shows."""
     survey = run.survey
     leds = run.listed
     table = light_table(run)
@@ -330,27 +313,28 @@ def find_faults(run: SurveyRun) -> DomeFaults:
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None
     exchanges, share = ([], None) if is_free else survey_faults.exchanged(table)
-    return DomeFaults(
-        leds.id[survey_faults.dark(table.shown & (table.expected > 0), run.seen)].tolist(),
-        {int(leds.id[row]): float(off_m[row]) for row in rows},
-        sigma_m,
-        len(size_m),
-        float(np.median(size_m)) if len(size_m) else None,
-        [
+    dark = survey_faults.dark(table.shown & (table.expected > 0), run.seen)
+    return {
+        "dark": leds.id[dark].tolist(),
+        "displaced": {int(leds.id[row]): float(off_m[row]) for row in rows},
+        "list_sigma_m": sigma_m,
+        "tested": len(size_m),
+        "tested_m": float(np.median(size_m)) if len(size_m) else None,
+        "exchanged": [
             (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
             for x in exchanges
         ],
-        {
+        "found_m": {
             int(leds.id[row]): survey.leds.position_m[row].tolist()
             for row in (*rows, *(x.led for x in exchanges))
         },
-        [stray.position_m.tolist() for stray in stray_lights(run)],
-        share,
-    )
+        "unlisted": [stray.position_m.tolist() for stray in stray_lights(run)],
+        "exchange_share": share,
+    }
 
 
 def fault_rows(faults: Record) -> Iterator[tuple[str, str, str, str]]:
-    """LED, fault and details of each fault of a `DomeFaults` as a record, and a sentence on it."""
+    """LED, fault and details of each fault of `find_faults`, and a sentence on it."""
     at = {led: f"at {coordinates(place_m)} mm" for led, place_m in faults["found_m"].items()}
     for led in faults["dark"]:
         yield f"{led}", "dark", "no frame shows it", f"LED {led} is dark"
@@ -373,7 +357,7 @@ def coordinates(place_m: list[float]) -> str:
 
 
 def fault_lines(faults: Record) -> list[str]:
-    """The fields of a `DomeFaults` as lines of text, one per fault, and a summary line."""
+    """The faults of `find_faults` as lines of text, one per fault, and a summary line."""
     return [*(line for *_, line in fault_rows(faults)), fault_summary(faults)]
 
 
@@ -411,12 +395,10 @@ def attitude_record(body_from_lab: Rotation, covariance_rad2: Floats, lever: Lev
 
     Roll, pitch and yaw are the vehicle's. The quaternion, scalar last, turns the dome's axes (lab) to the camera's.
     """
-    roll_deg, pitch_deg, yaw_deg = euler_deg(body_from_lab.inv()).tolist()
+    angles_deg = euler_deg(body_from_lab.inv()).tolist()
     cam_from_lab = lever.cam_from_body * body_from_lab
     return {
-        "roll_deg": roll_deg,
-        "pitch_deg": pitch_deg,
-        "yaw_deg": yaw_deg,
+        **dict(zip(ANGLES, angles_deg, strict=True)),
         "cam_from_lab_xyzw": cam_from_lab.as_quat(canonical=True).tolist(),
         "covariance_rad2": covariance_rad2.tolist(),
     }
@@ -465,9 +447,9 @@ def coverage_statistics(so_far: Coverage) -> Record:
     }
 
 
-def rows_of_columns(**columns: NDArray[Any]) -> list[Record]:
+def rows_of_columns(**columns: ArrayLike) -> list[Record]:
     """Rows as numbers from columns by name."""
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
@@ -478,7 +460,7 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
     return {
         "measured": int(accuracy.measured.sum()),
         "led_mm": 1e3 * accuracy.led_rms_m,
-        "lever_mm": 1e3 * math.sqrt(np.mean(accuracy.lever_sigma_m**2)),
+        "lever_mm": 1e3 * float(rms(accuracy.lever_sigma_m)),
         "focal_px": float(accuracy.lens_sigma[0]),
     }
 
@@ -486,7 +468,5 @@ def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
 def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
     tilt_deg = np.degrees(tilts_rad(lab_from_body.apply([0.0, 0.0, 1.0])))
-    roll, pitch, yaw = euler_deg(lab_from_body).T
-    return rows_of_columns(
-        roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw, tilt_deg=tilt_deg, leds=shown.sum(axis=1)
-    )
+    angles = dict(zip(ANGLES, euler_deg(lab_from_body).T, strict=True))
+    return rows_of_columns(**angles, tilt_deg=tilt_deg, leds=shown.sum(axis=1))

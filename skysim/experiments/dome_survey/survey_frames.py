@@ -103,16 +103,17 @@ def planned_stops(
     return candidates[chosen].inv()
 
 
+ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+
+
 def from_angles(roll_pitch_yaw_deg: Floats) -> Rotation:
     """lab_from_body of (F, 3) roll, pitch and yaw."""
     return Rotation.from_euler("ZYX", roll_pitch_yaw_deg[:, ::-1], degrees=True)
 
 
 def from_rows(rows: Sequence[Mapping[str, float]]) -> Rotation:
-    """lab_from_body of rows with roll_deg, pitch_deg and yaw_deg."""
-    return from_angles(
-        np.array([[row[f"{name}_deg"] for name in ("roll", "pitch", "yaw")] for row in rows])
-    )
+    """lab_from_body of rows with ANGLES."""
+    return from_angles(np.array([[row[name] for name in ANGLES] for row in rows]))
 
 
 NOISE_FRAMES = 4  # number of frames from which the noise of a centroid is determined

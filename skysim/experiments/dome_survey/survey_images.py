@@ -27,6 +27,7 @@ from skysim.core.files import atomic_file
 from skysim.core.text import excerpt, read_named_rows
 from skysim.core.types import Record
 from skysim.experiments.dome_survey.survey_frames import (
+    ANGLES,
     SurveyFrame,
     detect_lights,
     from_angles,
@@ -38,7 +39,7 @@ from skysim.results.telemetry_report import euler_deg
 ATTITUDES = "attitudes.csv"
 SOLVED = "solved_attitudes.csv"
 FRAME = "frame_{:04d}.fits"
-COLUMNS = ("file", "roll_deg", "pitch_deg", "yaw_deg")
+COLUMNS = ("file", *ANGLES)
 NO_COLUMNS: Mapping[str, Sequence[object]] = {}
 MIN_IMAGES = 3
 # Of several images with the same name, the first format of this list is read.
@@ -109,7 +110,7 @@ def read_attitudes(path: Path) -> dict[str, Rotation]:
     refusal = InputError(
         path, "no attitudes", f"columns {', '.join(COLUMNS)}, and others, which are not used"
     )
-    files, numbers = read_named_rows(path, COLUMNS[0], COLUMNS[1:], refusal)
+    files, numbers = read_named_rows(path, COLUMNS[0], ANGLES, refusal)
     return dict(zip(files, from_angles(numbers), strict=True))
 
 
@@ -174,9 +175,7 @@ def lost_in_space(
         common_m=None,
         common_camera=None,
     )
-    lever = Lever(
-        model.lever.camera_body_m, model.lever.cam_from_body, uncertainty.lever_sigma_m
-    )
+    lever = replace(model.lever, sigma_m=uncertainty.lever_sigma_m)
     return dome_tracker(camera, leds, lever, settings)
 
 

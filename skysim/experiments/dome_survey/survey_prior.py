@@ -126,8 +126,8 @@ def survey_uncertainty(
 ) -> SurveyUncertainty:
     """Parse quantities with units. Raises InputError for an invalid or out-of-range value."""
     texts = imu_sigma, led_sigma, lever_sigma, focal_error
-    imu_rad, led_m, lever_m, focal = quantities_within("survey", UNCERTAINTY_RANGES, texts)
-    return SurveyUncertainty(imu_rad, led_m, lever_m, focal, fit_distortion)
+    sigmas = quantities_within("survey", UNCERTAINTY_RANGES, texts)
+    return SurveyUncertainty._make([*sigmas, fit_distortion])
 
 
 def before_text(scene: Scene, uncertainty: SurveyUncertainty) -> str:
@@ -219,9 +219,12 @@ def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
 
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
-    focal_sigma_m = scene.camera.focal_length_m * uncertainty.focal_error
-    return with_map(
-        scene, None, uncertainty.led_sigma_m, uncertainty.lever_sigma_m, focal_sigma_m
+    return with_config(
+        with_map(scene, None),
+        "tracker.survey",
+        led_sigma_m=uncertainty.led_sigma_m,
+        lever_sigma_m=uncertainty.lever_sigma_m,
+        focal_length_sigma_m=scene.camera.focal_length_m * uncertainty.focal_error,
     )
 
 
@@ -230,20 +233,10 @@ def as_listed(scene: Scene) -> Scene:
     return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
 
 
-def with_map(
-    scene: Scene,
-    path: str | None,
-    led_sigma_m: float = 0.0,
-    lever_sigma_m: float = 0.0,
-    focal_sigma_m: float = 0.0,
-) -> Scene:
-    """The scene whose tracker uses the map file of a surveyed dome, if any, and has these onboard errors alone."""
+def with_map(scene: Scene, path: str | None) -> Scene:
+    """The scene whose tracker uses the map file of a surveyed dome, if any, without random errors of a survey."""
     scene = with_config(
-        scene,
-        "tracker.survey",
-        led_sigma_m=led_sigma_m,
-        lever_sigma_m=lever_sigma_m,
-        focal_length_sigma_m=focal_sigma_m,
+        scene, "tracker.survey", led_sigma_m=0.0, lever_sigma_m=0.0, focal_length_sigma_m=0.0
     )
     return with_config(
         scene,

@@ -19,6 +19,7 @@ from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     accuracy_statistics,
+    fault_rows,
     find_faults,
     predicted,
 )
@@ -269,7 +270,7 @@ def survey_errors(run: SurveyRun, prior: CalibrationPrior, lab: Lab) -> Simulate
         float(np.mean(lever_m**2)),
         (survey.camera.focal_px - lab.scene.camera.focal_px) ** 2,
         int(survey.surveyed.sum()),
-        find_faults(run).count,
+        len([*fault_rows(find_faults(run))]),
     )
 
 

@@ -18,12 +18,12 @@ from skysim.core.types import Bools, Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
-    DomeFaults,
     SurveyRun,
     accuracy_statistics,
     fault_rows,
     fault_summary,
     residuals_px,
+    rows_of_columns,
 )
 from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
@@ -152,14 +152,17 @@ def accuracy_table(statistics: Record, reached: Record) -> Table:
     """Errors: predicted by the plan, by the covariance, true, and predicted with the next attitudes."""
     predicted = statistics.get("predicted")
     after = statistics.get("led_mm_after")
-    columns = {"by the plan": predicted} if predicted else {}
-    columns["by this survey's covariance"] = reached
-    columns |= {"true error, rms": {"led_mm": after}} if after is not None else {}
-    columns["with the next attitudes"] = statistics["next_reaches"]
+    columns = {
+        "by the plan": predicted,
+        "by this survey's covariance": reached,
+        "true error, rms": {} if after is None else {"led_mm": after},
+        "with the next attitudes": statistics["next_reaches"],
+    }
+    given = {head: one for head, one in columns.items() if one}
     rows = [
-        [what, *(one.get(key) for one in columns.values())] for key, what in REACHED.items()
+        [what, *(one.get(key) for one in given.values())] for key, what in REACHED.items()
     ]
-    return Table([text_column("1σ"), *(Column(head, format=".3g") for head in columns)], rows)
+    return Table([text_column("1σ"), *(Column(head, format=".3g") for head in given)], rows)
 
 
 def coverage_blocks(statistics: Record) -> list[Block]:
@@ -251,7 +254,6 @@ def draw_means(
 
 LENS = ("focal length px", "center x px", "center y px", "k1", "k2", "p1", "p2")
 PARAMETERS = (*LENS, *(f"lever {axis} mm" for axis in "xyz"))
-VALUE_KEYS = ("what", "believed", "found", "sigma")
 
 
 def compare_trackers(
@@ -301,9 +303,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
     """Statistics of a survey without the truth. `values` holds one row per lens and lever parameter that is fitted."""
     survey = run.survey
     sigma_mm = 1e3 * run.accuracy.led_sigma_m[survey.surveyed]
-    columns = [parameters(one.camera, one.lever) for one in (before, survey)]
-    lever_sigma_mm = 1e3 * np.sqrt(np.diag(survey.lever_covariance_m2))
-    sigma = [*lens_sigma(survey)[:7].tolist(), *lever_sigma_mm.tolist()]
+    lever_sigma_mm = 1e3 * run.accuracy.lever_sigma_m
     return {
         "status": survey.status,
         "tied": int(survey.tied.sum()),
@@ -315,10 +315,12 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
         "misfit": survey.misfit,
         "led_sigma_mm_median": float(np.median(sigma_mm)),
         "led_sigma_mm_worst": float(sigma_mm.max()),
-        "values": [
-            dict(zip(VALUE_KEYS, row, strict=True))
-            for row in zip(PARAMETERS, *columns, sigma, strict=True)
-        ],
+        "values": rows_of_columns(
+            what=PARAMETERS,
+            believed=parameters(before.camera, before.lever),
+            found=parameters(survey.camera, survey.lever),
+            sigma=[*lens_sigma(survey)[:7], *lever_sigma_mm],
+        ),
     }
 
 
@@ -328,8 +330,8 @@ def truth_statistics(run: SurveyRun, before: CalibrationPrior, lab: Lab) -> Reco
     truth = parameters(lab.scene.camera, lab.camera.mount)
     return {
         "renamed": int(errors.renamed.sum()),
-        "led_mm_before": float(1e3 * np.sqrt(np.mean(errors.before_m**2))),
-        "led_mm_after": float(1e3 * np.sqrt(np.mean(errors.after_m**2))),
+        "led_mm_before": 1e3 * float(metrics.rms(errors.before_m.ravel())),
+        "led_mm_after": 1e3 * float(metrics.rms(errors.after_m.ravel())),
         "truth": dict(zip(PARAMETERS, truth, strict=True)),
     }
 
@@ -342,7 +344,7 @@ def parameters(lens: Camera | CameraConfig, lever: Lever | Mount) -> list[float]
 
 def survey_figure(
     so_far: Coverage,
-    faults: DomeFaults,
+    faults: Record,
     further: Rotation,
     errors: LedErrors | None,
     run: SurveyRun,
@@ -366,7 +368,7 @@ def survey_figure(
     return png(draw, (7 * (1 + len(panels)), 6.5))
 
 
-def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rotation) -> None:
+def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation) -> None:
     """LEDs by their standard deviation, gray if not measured; faults; the numbers of the next attitudes."""
     from matplotlib.colors import LogNorm
 
@@ -389,13 +391,13 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: DomeFaults, further: Rota
         axes.figure.colorbar(
             points, ax=axes, label="standard deviation about each axis [mm]", shrink=0.8
         )
-    exchanged = [led for led, _, _ in faults.exchanged]
-    for name, numbers, marker, color in (
-        ("dark", faults.dark, "x", "black"),
-        ("displaced", list(faults.displaced), "D", "magenta"),
-        ("exchanged", exchanged, "s", "red"),
+    numbers = faults | {"exchanged": [led for led, _, _ in faults["exchanged"]]}
+    for name, marker, color in (
+        ("dark", "x", "black"),
+        ("displaced", "D", "magenta"),
+        ("exchanged", "s", "red"),
     ):
-        rows = rows_of(numbers, leds.id)
+        rows = rows_of(list(numbers[name]), leds.id)
         colors = (
             {"color": color} if marker == "x" else {"facecolor": "none", "edgecolor": color}
         )

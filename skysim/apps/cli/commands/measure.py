@@ -191,9 +191,11 @@ def calibrate(
             else home_calibration.measure_scene(loaded, watch)
         )
     found = home_calibration.calibrated(known, frames, clicks)
-    command = command_line()
     folder = output_folder(out, f"{loaded.name}_calibration")
-    print_report(*home_calibration.write_results(folder, known, found, command), json)
+    written = home_calibration.write_results(
+        folder, loaded.name, known, found, command_line()
+    )
+    print_report(*written, json)
 
 
 # Command `skysim characterize`: a camera preset from darks, flats and night frames.

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from estimator.trackers.pipeline import Settings
@@ -306,7 +306,7 @@ def write_results(
     )
     statistics |= {
         "scene": request.scene.name,
-        "faults": asdict(faults),
+        "faults": faults,
         "attitudes": survey_findings.attitude_rows(run, names),
         "map": str(path),
         "picture": str(picture),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -114,7 +114,7 @@ class Survey:
             statistics |= survey_report.truth_statistics(run, self.before, self.lab)
             statistics["connected"] = int(run.survey.tied.sum())
             statistics["sigma_mm"] = 1e3 * run.accuracy.led_rms_m
-            faults += survey_findings.fault_lines(asdict(survey_findings.find_faults(run)))
+            faults += survey_findings.fault_lines(survey_findings.find_faults(run))
         # Attitudes to hold next.
         further = survey_findings.next_stops(
             self.scene, so_far, self.before.margin_px, count, tilt_deg(self.scene)
