@@ -9,7 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Self, get_args
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from pydantic import (
@@ -249,6 +249,13 @@ class ConfigModel(BaseModel):
             if value is not None or key not in fields or keeps_null(fields[key])
         }
 
+    def model_post_init(self, _context: Any) -> None:
+        """Check the section as a whole, once its keys are valid."""
+        self.check()
+
+    def check(self) -> None:
+        """Raise InputError unless the keys suit each other; a class that extends it checks those of its base first."""
+
 
 def keeps_null(field: FieldInfo) -> bool:
     """Whether null is a value of a field, or the field is required."""
@@ -274,8 +281,6 @@ def check_table(
 class TableConfig(ConfigModel):
     """Base of a section whose last two keys are the columns of a table: of equal length, the first ascending."""
 
-    @model_validator(mode="after")
-    def check_columns(self) -> Self:
+    def check(self) -> None:
         *_, first, second = type(self).model_fields
         check_table(getattr(self, first), getattr(self, second), second, first)
-        return self

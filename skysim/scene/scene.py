@@ -68,8 +68,7 @@ class ExposureConfig(ConfigModel):
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
-    @model_validator(mode="after")
-    def check_period(self) -> "ExposureConfig":
+    def check(self) -> None:
         """Check that an exposure ends before the next begins, and that the run is not too long."""
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = (
@@ -88,7 +87,6 @@ class ExposureConfig(ConfigModel):
                 f"{self.frames} frames over {duration_s:g} s",
                 f"up to {MAX_FRAMES}, over a day ({MAX_DURATION_S:g} s)",
             )
-        return self
 
 
 class HeadConfig(ConfigModel):

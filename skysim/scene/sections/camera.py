@@ -11,7 +11,6 @@ from pydantic import (
     Field,
     Tag,
     field_validator,
-    model_validator,
 )
 
 from skysim.core.errors import InputError, unknown_name
@@ -160,8 +159,7 @@ class ChromaticConfig(ConfigModel):
         | None
     ) = None
 
-    @model_validator(mode="after")
-    def check_columns(self) -> "ChromaticConfig":
+    def check(self) -> None:
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
         for name, column in columns.items():
             if column is not None:
@@ -170,7 +168,6 @@ class ChromaticConfig(ConfigModel):
             raise InputError(
                 "", "nothing depends on the wavelength", "focus or corner_px other than 0"
             )
-        return self
 
 
 class GhostConfig(ConfigModel):
@@ -232,11 +229,10 @@ class BaffleConfig(TableConfig):
     angle_deg: Ascending
     pst: Fractions
 
-    @model_validator(mode="after")
-    def check_angles(self) -> "BaffleConfig":
+    def check(self) -> None:
+        super().check()
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
-        return self
 
 
 class GlobalShutterConfig(ConfigModel):
@@ -433,8 +429,7 @@ class DetectorConfig(ConfigModel):
             return 0.0
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
-    @model_validator(mode="after")
-    def check_values(self) -> "DetectorConfig":
+    def check(self) -> None:
         if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
             raise InputError(
                 "quantum_efficiency",
@@ -451,7 +446,6 @@ class DetectorConfig(ConfigModel):
             raise InputError(
                 "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"
             )
-        return self
 
 
 class CameraConfig(ConfigModel):
@@ -496,14 +490,12 @@ class CameraConfig(ConfigModel):
     shutter: Shutter = GlobalShutterConfig()
     detector: DetectorConfig
 
-    @model_validator(mode="after")
-    def check_focus(self) -> "CameraConfig":
+    def check(self) -> None:
         if self.focus_m <= 2 * self.focal_length_m:
             raise InputError(
                 "focus",
                 f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m",
             )
-        return self
 
     @property
     def pupil_m(self) -> float:

@@ -1,14 +1,13 @@
 """Schema of the LED type of a dome: emission lobe, drive, brightness."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
     Tag,
-    model_validator,
 )
 
 from skysim.core.errors import InputError
@@ -50,11 +49,10 @@ class LobeTableConfig(TableConfig):
     angle_deg: Ascending
     intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
 
-    @model_validator(mode="after")
-    def check_axis(self) -> "LobeTableConfig":
+    def check(self) -> None:
+        super().check()
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
-        return self
 
 
 Lobe = Annotated[CosineLobeConfig | LobeTableConfig, Field(discriminator="kind")]
@@ -179,15 +177,13 @@ class TriggeredCodeConfig(CodeConfig):
 
     levels: Literal[2, 4, 8] = 2
 
-    @model_validator(mode="after")
-    def check_levels(self) -> Self:
+    def check(self) -> None:
         if self.levels > 2 and self.depth == 1:
             raise InputError(
                 "levels",
                 f"{self.levels} with depth 1, equally spaced in magnitude",
                 "depth below 1",
             )
-        return self
 
 
 class PlainCodeConfig(TriggeredCodeConfig):
@@ -327,8 +323,7 @@ class LedLightConfig(ConfigModel):
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
-    @model_validator(mode="after")
-    def check_light(self) -> Self:
+    def check(self) -> None:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise InputError("", "an LED takes either intensity or radiant_intensity")
         if isinstance(self.spectrum, str) and (
@@ -338,7 +333,6 @@ class LedLightConfig(ConfigModel):
             raise InputError(
                 key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"
             )
-        return self
 
 
 class LedTypeConfig(LedLightConfig):
@@ -385,12 +379,11 @@ class LedConfig(LedLightConfig):
         """The LED with brightness and color of one of its types; itself for an empty name."""
         return self.model_copy(update=dict(self.types[name])) if name else self
 
-    @model_validator(mode="after")
-    def check_code(self) -> "LedConfig":
+    def check(self) -> None:
+        super().check()
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
             raise InputError(
                 "code.bit_time",
                 f"a {self.code.kind} code cannot be read without the camera's trigger",
                 "frame, or kind cyclic",
             )
-        return self

@@ -8,7 +8,7 @@ point of the group `skysim.lights` with the name of the kind, which names the mo
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -73,14 +73,12 @@ class SurfaceConfig(ConfigModel):
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 
-    @model_validator(mode="after")
-    def check_below_apex(self) -> Self:
+    def check(self) -> None:
         rim_m = getattr(self, "rim_height_m", None)
         if rim_m is not None and rim_m >= getattr(self, "apex_m", math.inf):
             raise InputError(
                 "rim_height", f"{rim_m:g} m is not below the apex", "less than apex"
             )
-        return self
 
 
 class RimmedConfig(SurfaceConfig):
@@ -89,11 +87,10 @@ class RimmedConfig(SurfaceConfig):
     rim_height_m: Length | None = None
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
 
-    @model_validator(mode="after")
-    def check_rim(self) -> Self:
+    def check(self) -> None:
+        super().check()
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
-        return self
 
 
 class WallConfig(ConfigModel):
@@ -124,8 +121,8 @@ class SphereSurfaceConfig(RimmedConfig):
     radius_m: PositiveLength
     wall: WallConfig | None = None
 
-    @model_validator(mode="after")
-    def check_wall(self) -> Self:
+    def check(self) -> None:
+        super().check()
         thickest = (
             max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         )
@@ -133,7 +130,6 @@ class SphereSurfaceConfig(RimmedConfig):
             raise InputError(
                 "", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius"
             )
-        return self
 
 
 class EllipsoidSurfaceConfig(RimmedConfig):
@@ -163,11 +159,10 @@ class CylinderSurfaceConfig(SurfaceConfig):
     length_m: PositiveLength | None = None
     rim_height_m: Length | None = None
 
-    @model_validator(mode="after")
-    def check_extent(self) -> Self:
+    def check(self) -> None:
+        super().check()
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
-        return self
 
 
 class SurveyedSurfaceConfig(RimmedConfig):
@@ -238,8 +233,7 @@ class RoomConfig(ConfigModel):
     segments: Annotated[int, Field(ge=1, le=100)] = 1
     thickness_m: Annotated[Length, Field(ge=0)] = 0.0
 
-    @model_validator(mode="after")
-    def check_limits(self) -> "RoomConfig":
+    def check(self) -> None:
         if self.height_m is not None and self.bearing_height_m is None:
             raise InputError(
                 "", "height requires bearing_height, the bearing's center above the floor"
@@ -248,7 +242,6 @@ class RoomConfig(ConfigModel):
             raise InputError(
                 "segments", "have no effect without a door", "door, or no segments"
             )
-        return self
 
 
 class FloorConfig(ConfigModel):
@@ -290,8 +283,7 @@ class ReflectionConfig(ConfigModel):
     refractive_index: Annotated[Number, Field(gt=1, le=4)] | None = None
     floor: FloorConfig | None = None
 
-    @model_validator(mode="after")
-    def check_shares(self) -> Self:
+    def check(self) -> None:
         if self.specular and self.refractive_index is not None:
             raise InputError("", "specular and refractive_index conflict", "one of the two")
         if self.diffuse + self.specular >= 1:
@@ -306,7 +298,6 @@ class ReflectionConfig(ConfigModel):
                 "nothing reflects",
                 "diffuse, specular, refractive_index or floor, or no reflection",
             )
-        return self
 
     @property
     def mirrors(self) -> bool:
@@ -340,8 +331,7 @@ class DomeConfig(ConfigModel):
         """The layout of single LEDs or boards: of fibers and displays, that of the points that they show."""
         return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
-    @model_validator(mode="after")
-    def check_layout(self) -> "DomeConfig":
+    def check(self) -> None:
         """Check that the layout fits the LEDs' controller, types and drive, and the surface."""
         layout = self.layout
         kind = layout.kind
@@ -379,7 +369,6 @@ class DomeConfig(ConfigModel):
                 "led.drive",
                 f"refresh requires a layout of kind lcd or projector, not {kind}",
             )
-        return self
 
 
 class BodiesConfig(ConfigModel):
@@ -395,11 +384,9 @@ class BodiesConfig(ConfigModel):
     moon: bool = True
     planets: bool = True
 
-    @model_validator(mode="after")
-    def check_any(self) -> Self:
+    def check(self) -> None:
         if not (self.sun or self.moon or self.planets):
             raise InputError("", "no body is left", "sun, moon or planets, or no bodies")
-        return self
 
 
 class StarsConfig(ConfigModel):

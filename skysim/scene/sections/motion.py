@@ -8,7 +8,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    model_validator,
 )
 
 from skysim.core.errors import InputError
@@ -93,11 +92,9 @@ class JitterBandConfig(ConfigModel):
     rms_arcsec: AxesRms
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
-    @model_validator(mode="after")
-    def check_frequencies(self) -> "JitterBandConfig":
+    def check(self) -> None:
         if self.from_hz >= self.to_hz:
             raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
-        return self
 
 
 JitterPart = Annotated[JitterLineConfig | JitterBandConfig, Field(discriminator="kind")]
@@ -137,11 +134,9 @@ class SlewConfig(AttitudeConfig):
     acceleration_deg_s2: Positive = 0.5
     duration_s: Duration | None = None
 
-    @model_validator(mode="after")
-    def check_rate(self) -> "SlewConfig":
+    def check(self) -> None:
         if self.rate_deg_s is not None and self.duration_s is not None:
             raise InputError("duration", "given beside rate_deg_s", "one of the two")
-        return self
 
 
 class RateConfig(ConfigModel):
@@ -187,8 +182,7 @@ class ChirpConfig(ConfigModel):
     duration_s: Duration
     sweep: Literal["linear", "log"] = "linear"
 
-    @model_validator(mode="after")
-    def check_frequencies(self) -> "ChirpConfig":
+    def check(self) -> None:
         if self.from_hz == self.to_hz:
             raise InputError(
                 "",
@@ -201,7 +195,6 @@ class ChirpConfig(ConfigModel):
                 f"{self.duration_s:g} s is shorter than a period of from_hz and one of to_hz,"
                 f" {1 / self.from_hz + 1 / self.to_hz:g} s",
             )
-        return self
 
 
 # The rotation of a profile's quaternions.
@@ -261,13 +254,11 @@ class BumpConfig(ConfigModel):
     duration_s: Duration
     caught_after_s: Duration | None = None
 
-    @model_validator(mode="after")
-    def check_catch_time(self) -> "BumpConfig":
+    def check(self) -> None:
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
             raise InputError(
                 "caught_after", f"{self.caught_after_s:g} s is before the impulse ends"
             )
-        return self
 
 
 Maneuver = Annotated[
@@ -303,13 +294,11 @@ class DesaturationConfig(ConfigModel):
     stop_nms: Stored
     time_s: Duration = 10.0
 
-    @model_validator(mode="after")
-    def check_thresholds(self) -> "DesaturationConfig":
+    def check(self) -> None:
         if self.stop_nms >= self.start_nms:
             raise InputError(
                 "stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s"
             )
-        return self
 
 
 class ControlConfig(ConfigModel):
@@ -349,8 +338,7 @@ class ControlConfig(ConfigModel):
     integral_rad_s: Positive = 0.6
     desaturation: DesaturationConfig | None = None
 
-    @model_validator(mode="after")
-    def check_options(self) -> "ControlConfig":
+    def check(self) -> None:
         """Refuse keys that have no effect with the law."""
         unused = []
         if self.law in BUILT_IN_LAWS:
@@ -364,7 +352,6 @@ class ControlConfig(ConfigModel):
             if getattr(self, name) != default:
                 key = name.removesuffix("_s")
                 raise InputError("", f"{key} has no effect with law {self.law}", "none")
-        return self
 
 
 def expand_control(value: Any) -> Any:
@@ -408,8 +395,7 @@ class MotionConfig(ConfigModel):
         """Whether the vehicle moves exactly along the maneuver, without dynamics."""
         return self.control is not None and self.control.law == PRESCRIBED
 
-    @model_validator(mode="after")
-    def check_motion(self) -> "MotionConfig":
+    def check(self) -> None:
         if self.rate_deg_s == SIDEREAL and self.control is not None:
             raise InputError(
                 "rate_deg_s", "sidereal conflicts with a controller", "no control"
@@ -430,7 +416,7 @@ class MotionConfig(ConfigModel):
                 "control: pid",
             )
         if self.start != "profile":
-            return self
+            return
         if not self.maneuver or self.maneuver[0].kind != "profile":
             raise InputError("start", "profile requires a first maneuver of kind profile")
         if any(self.rate_deg_s):
@@ -439,4 +425,3 @@ class MotionConfig(ConfigModel):
                 "has no effect with start: profile, which gives the rate",
                 "[0, 0, 0]",
             )
-        return self

@@ -1,9 +1,9 @@
 """Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, satellites, `background`."""
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
@@ -41,11 +41,10 @@ class HorizonConfig(TableConfig):
     azimuth_deg: Ascending
     altitude_deg: Annotated[tuple[Altitude, ...], Field(min_length=2)]
 
-    @model_validator(mode="after")
-    def check_azimuths(self) -> Self:
+    def check(self) -> None:
+        super().check()
         if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
             raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
-        return self
 
 
 class AirGlowConfig(ConfigModel):
@@ -188,15 +187,13 @@ class ThermalConfig(ConfigModel):
         """Whether anything depends on the temperature."""
         return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
 
-    @model_validator(mode="after")
-    def check_effect(self) -> "ThermalConfig":
+    def check(self) -> None:
         if not self.has_effect:
             raise InputError(
                 "",
                 "nothing depends on the temperature",
                 "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal",
             )
-        return self
 
 
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
@@ -226,15 +223,13 @@ class RandomSatellitesConfig(ConfigModel):
     v_mag: tuple[Magnitude, Magnitude] = (2.0, 8.0)
     seed: Seed
 
-    @model_validator(mode="after")
-    def check_ranges(self) -> Self:
+    def check(self) -> None:
         for name in ("rate_deg_s", "v_mag"):
             low, high = getattr(self, name)
             if low > high:
                 raise InputError(
                     name, f"{low:g} is above {high:g}", "the least, then the greatest"
                 )
-        return self
 
 
 class SatellitesConfig(ConfigModel):
@@ -254,11 +249,9 @@ class SatellitesConfig(ConfigModel):
     standard_mag: Magnitude = 6.0
     random: RandomSatellitesConfig | None = None
 
-    @model_validator(mode="after")
-    def check_any(self) -> Self:
+    def check(self) -> None:
         if self.file is None and self.random is None:
             raise InputError("", "no satellite is left", "file or random, or no satellites")
-        return self
 
 
 class ExclusionConfig(ConfigModel):

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
@@ -127,13 +127,11 @@ class ExposureControlConfig(ConfigModel):
     overexposed_objects: PositiveInt = 4
     saturated_px: Annotated[int, Field(ge=0)] = 1
 
-    @model_validator(mode="after")
-    def check_limits(self) -> "ExposureControlConfig":
+    def check(self) -> None:
         if self.shortest_s > self.longest_s:
             raise InputError(
                 "shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s"
             )
-        return self
 
 
 class DecoderConfig(ConfigModel):
@@ -267,8 +265,7 @@ class TrackerConfig(ConfigModel):
     computer: ComputerConfig | None = None
     map: Annotated[str, AfterValidator(existing_file)] | None = None
 
-    @model_validator(mode="after")
-    def check_assumed(self) -> "TrackerConfig":
+    def check(self) -> None:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise InputError(
                 "survey.lever_sigma",
@@ -295,7 +292,6 @@ class TrackerConfig(ConfigModel):
             raise InputError(
                 conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map"
             )
-        return self
 
 
 class FilterConfig(ConfigModel):
@@ -373,10 +369,8 @@ class FilterConfig(ConfigModel):
     latency_s: Delay = 0.0
     time_tag_sigma_s: Delay = 0.0
 
-    @model_validator(mode="after")
-    def check_drift(self) -> "FilterConfig":
+    def check(self) -> None:
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
             raise InputError(
                 "mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0"
             )
-        return self

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
@@ -68,13 +68,11 @@ class WheelsConfig(ConfigModel):
     dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
     start_rpm: tuple[Number, ...] = ()
 
-    @model_validator(mode="after")
-    def check_speeds(self) -> "WheelsConfig":
+    def check(self) -> None:
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         if 0 < self.stiction_nm < self.coulomb_nm:
             raise InputError("stiction", f"below coulomb {self.coulomb_nm:g} N m")
-        return self
 
 
 class FansConfig(ConfigModel):
@@ -181,11 +179,9 @@ class TrimConfig(ConfigModel):
     travel_m: PositiveLength = 0.02
     step_m: PositiveLength = 1e-6
 
-    @model_validator(mode="after")
-    def check_positions(self) -> "TrimConfig":
+    def check(self) -> None:
         if any(abs(position_m) > self.travel_m for position_m in self.position_m):
             raise InputError("position", f"beyond travel {1e3 * self.travel_m:g} mm")
-        return self
 
 
 class DragConfig(ConfigModel):
@@ -361,8 +357,7 @@ class VehicleConfig(ConfigModel):
     imu: ImuConfig | None = None
     gimbals: GimbalsConfig | None = None
 
-    @model_validator(mode="after")
-    def check_body(self) -> "VehicleConfig":
+    def check(self) -> None:
         inertia = self.inertia_kg_m2
         if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(
@@ -380,7 +375,6 @@ class VehicleConfig(ConfigModel):
                 "a free vehicle rotates about its center of mass",
                 "mount: air_bearing",
             )
-        return self
 
 
 class SiteConfig(ConfigModel):
