@@ -9,7 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -173,12 +173,18 @@ Temperature = Annotated[Number, Field(ge=-150, le=150)]
 Seed = Annotated[int, Field(ge=0)]
 PositiveInt = Annotated[int, Field(ge=1)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
-Fractions = Annotated[tuple[Fraction, ...], Field(min_length=2)]
 PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NotNegative = Annotated[Number, Field(ge=0)]
-Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
+# Lists of one value or more, and of two or more, as a table has.
+Item = TypeVar("Item")
+NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
+Several = Annotated[tuple[Item, ...], Field(min_length=2)]
+Fractions = Several[Fraction]
+Ascending = Several[Number]
+# Chooses the class of a section by its key `kind`.
+BY_KIND = Field(discriminator="kind")
 
 
 # SI unit, name, example, least and greatest value of a quantity.

@@ -19,6 +19,7 @@ from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Delay,
     Position,
@@ -204,7 +205,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     orbit: Orbit | None = None
     vehicle: VehicleConfig
     motion: MotionConfig
-    light: Annotated[Light, Field(discriminator="kind")]
+    light: Annotated[Light, BY_KIND]
     background: tuple[Glow, ...] = ()
     lights: tuple[FurtherLight, ...] = ()
     camera: CameraConfig

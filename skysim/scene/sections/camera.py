@@ -16,6 +16,7 @@ from pydantic import (
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
 from skysim.core.units import (
+    BY_KIND,
     Ascending,
     ConfigModel,
     Duration,
@@ -26,6 +27,7 @@ from skysim.core.units import (
     Number,
     PositiveFraction,
     Seed,
+    Several,
     TableConfig,
     Temperature,
     check_table,
@@ -114,7 +116,7 @@ class MeasuredPsfConfig(PsfConfig):
 
 Psf = Annotated[
     GaussianPsfConfig | MoffatPsfConfig | AiryPsfConfig | DiskPsfConfig | MeasuredPsfConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -147,17 +149,9 @@ class ChromaticConfig(ConfigModel):
         distance from the principal point
     """
 
-    wavelength_m: Annotated[tuple[Wavelength, ...], Field(min_length=2)]
-    focus_m: (
-        Annotated[
-            tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)
-        ]
-        | None
-    ) = None
-    corner_px: (
-        Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)]
-        | None
-    ) = None
+    wavelength_m: Several[Wavelength]
+    focus_m: Several[Annotated[Length, Field(ge=-1e-3, le=1e-3)]] | None = None
+    corner_px: Several[Annotated[Number, Field(ge=-100, le=100)]] | None = None
 
     def check(self) -> None:
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
@@ -265,7 +259,7 @@ class InterlineConfig(ConfigModel):
 
 Shutter = Annotated[
     GlobalShutterConfig | RollingShutterConfig | FrameTransferConfig | InterlineConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -471,9 +465,7 @@ class CameraConfig(ConfigModel):
         float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)
     ] = math.inf
     transmission: Transmission = 1.0
-    vignetting: (
-        Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None
-    ) = None
+    vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, BY_KIND] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (
         0.0,
         0.0,

@@ -10,11 +10,13 @@ from pydantic import Field
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Fractions,
     Length,
     Magnitude,
+    NotEmpty,
     Number,
     Position,
     Positive,
@@ -27,9 +29,9 @@ from skysim.core.units import (
 
 HOLES = 9  # holes of a patch board, 3x3
 Level = PositiveFraction
-Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
-Magnitudes = Annotated[tuple[Magnitude, ...], Field(min_length=1)]
-TypeNames = Annotated[tuple[str, ...], Field(min_length=1)]
+Levels = NotEmpty[Level]
+Magnitudes = NotEmpty[Magnitude]
+TypeNames = NotEmpty[str]
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
@@ -62,7 +64,7 @@ class BoardConfig(ConfigModel):
     azimuth_deg: Number
     tilt_deg: Annotated[Number, Field(ge=0, le=90)]
     rotation_deg: Number = 0.0
-    leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
+    leds: NotEmpty[Annotated[int, Field(ge=0, lt=HOLES)]]
     levels: Levels | None = None
     types: TypeNames | None = None
 
@@ -340,10 +342,8 @@ class ListedConfig(DimmedConfig):
     """
 
     kind: Literal["listed"]
-    positions_m: Annotated[tuple[Position, ...], Field(min_length=1)] | None = None
-    directions_deg: (
-        Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None
-    ) = None
+    positions_m: NotEmpty[Position] | None = None
+    directions_deg: NotEmpty[tuple[Number, Number]] | None = None
     file: str | None = None
     types: TypeNames | None = None
 
@@ -379,7 +379,7 @@ SingleLeds = (
     | CelestialConfig
     | ListedConfig
 )
-Points = Annotated[SingleLeds, Field(discriminator="kind")]
+Points = Annotated[SingleLeds, BY_KIND]
 
 
 class AimingConfig(ConfigModel):
@@ -562,4 +562,4 @@ OnPoints = (
     FibersConfig | LcdConfig | ProjectorConfig
 )  # layouts that show the points of another one
 
-Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, Field(discriminator="kind")]
+Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, BY_KIND]

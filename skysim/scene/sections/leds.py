@@ -14,6 +14,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
+    BY_KIND,
     Ascending,
     ConfigModel,
     Duration,
@@ -26,6 +27,7 @@ from skysim.core.units import (
     PositiveFraction,
     PositiveInt,
     RadiantIntensity,
+    Several,
     TableConfig,
     Time,
     with_unit,
@@ -47,7 +49,7 @@ class LobeTableConfig(TableConfig):
 
     kind: Literal["table"]
     angle_deg: Ascending
-    intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+    intensity: Several[NotNegative]
 
     def check(self) -> None:
         super().check()
@@ -55,7 +57,7 @@ class LobeTableConfig(TableConfig):
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
 
 
-Lobe = Annotated[CosineLobeConfig | LobeTableConfig, Field(discriminator="kind")]
+Lobe = Annotated[CosineLobeConfig | LobeTableConfig, BY_KIND]
 
 
 class DirectConfig(ConfigModel):
@@ -125,9 +127,7 @@ class RefreshConfig(ConfigModel):
     duty: PositiveFraction = 1.0
 
 
-Drive = Annotated[
-    DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, Field(discriminator="kind")
-]
+Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, BY_KIND]
 
 
 class ClockConfig(ConfigModel):
@@ -214,9 +214,7 @@ class CyclicCodeConfig(CodeConfig):
     distance: Distance = 7
 
 
-Code = Annotated[
-    PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")
-]
+Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, BY_KIND]
 
 
 def below_one(effect: str) -> AfterValidator:

@@ -24,6 +24,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.tolerance import LengthError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Fraction,
@@ -198,7 +199,7 @@ AnySurface = Annotated[
     | FlatSurfaceConfig
     | CylinderSurfaceConfig
     | SurveyedSurfaceConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 

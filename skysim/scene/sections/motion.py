@@ -12,10 +12,12 @@ from pydantic import (
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Duration,
     Momentum,
+    NotEmpty,
     NotNegative,
     Number,
     Positive,
@@ -97,7 +99,7 @@ class JitterBandConfig(ConfigModel):
             raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
 
 
-JitterPart = Annotated[JitterLineConfig | JitterBandConfig, Field(discriminator="kind")]
+JitterPart = Annotated[JitterLineConfig | JitterBandConfig, BY_KIND]
 
 
 class HoldConfig(ConfigModel):
@@ -233,7 +235,7 @@ class ShakeConfig(ConfigModel):
 
     kind: Literal["jitter"]
     duration_s: Duration
-    components: Annotated[tuple[JitterPart, ...], Field(min_length=1)]
+    components: NotEmpty[JitterPart]
 
 
 class BumpConfig(ConfigModel):
@@ -272,7 +274,7 @@ Maneuver = Annotated[
     | ProfileConfig
     | ShakeConfig
     | BumpConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 

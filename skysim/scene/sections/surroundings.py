@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field
 from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    BY_KIND,
     Ascending,
     ConfigModel,
     Declination,
@@ -20,6 +21,7 @@ from skysim.core.units import (
     Position,
     RightAscension,
     Seed,
+    Several,
     Spin,
     TableConfig,
     Temperature,
@@ -39,7 +41,7 @@ class HorizonConfig(TableConfig):
     """
 
     azimuth_deg: Ascending
-    altitude_deg: Annotated[tuple[Altitude, ...], Field(min_length=2)]
+    altitude_deg: Several[Altitude]
 
     def check(self) -> None:
         super().check()
@@ -141,7 +143,7 @@ class TemperatureTableConfig(TableConfig):
 
     kind: Literal["table"]
     hours: Ascending
-    temperature_c: Annotated[tuple[Temperature, ...], Field(min_length=2)]
+    temperature_c: Several[Temperature]
 
 
 Temperatures = Annotated[
@@ -149,7 +151,7 @@ Temperatures = Annotated[
     | LinearTemperatureConfig
     | SineTemperatureConfig
     | TemperatureTableConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -342,9 +344,7 @@ class OemOrbitConfig(OrbitConfig):
     file: ElementsFile
 
 
-Orbit = Annotated[
-    CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
-]
+Orbit = Annotated[CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, BY_KIND]
 
 
 # The scene section `background`: glow.
@@ -430,5 +430,5 @@ Glow = Annotated[
     | MoonGlowConfig
     | StrayLightConfig
     | FaintStarsGlowConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
