@@ -13,7 +13,6 @@ import struct
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from struct import calcsize
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.types import frozen
 
 # Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same structure.
 
@@ -62,7 +62,7 @@ class TiffEntry(NamedTuple):
     at: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Tiff:
     """The structure of a TIFF file (TIFF 6.0, section 2) or a BigTIFF. Methods raise struct.error beyond its end."""
 

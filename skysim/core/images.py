@@ -17,7 +17,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -31,7 +31,7 @@ from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
 from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 
 # FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
 # row order and date.
@@ -264,7 +264,7 @@ LUMINANCE = np.array(
 )  # of blue, green and red (ITU-R BT.601), OpenCV's order
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ViewedImage:
     """An image as a person sees it: turned as EXIF says, the highest row first.
 

@@ -138,6 +138,12 @@ def finite(value: float) -> float:
     return value
 
 
+# Of any type: a value above zero, and one of zero or more; a list of one value or more, and one of two or more.
+Item = TypeVar("Item")
+AboveZero = Annotated[Item, Field(gt=0)]
+ZeroOrMore = Annotated[Item, Field(ge=0)]
+NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
+Several = Annotated[tuple[Item, ...], Field(min_length=2)]
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
 Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
@@ -156,10 +162,10 @@ QuadraticDrag = Annotated[
 ]
 Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
 Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
-PositiveLength = Annotated[Length, Field(gt=0)]
+PositiveLength = AboveZero[Length]
 Position = tuple[Length, Length, Length]
-Duration = Annotated[Time, Field(gt=0)]
-Delay = Annotated[Time, Field(ge=0)]
+Duration = AboveZero[Time]
+Delay = ZeroOrMore[Time]
 TimeLimit = Annotated[Time, Field(ge=1e-3, le=3600)]
 # An angle or a rate.
 Spin = Annotated[Number, Field(ge=-360, le=360)]
@@ -170,17 +176,13 @@ Triple = tuple[Number, Number, Number]
 Angles = Triple
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
-Seed = Annotated[int, Field(ge=0)]
+Seed = ZeroOrMore[int]
 PositiveInt = Annotated[int, Field(ge=1)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
 PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
-Positive = Annotated[Number, Field(gt=0)]
-NotNegative = Annotated[Number, Field(ge=0)]
-# Lists of one value or more, and of two or more, as a table has.
-Item = TypeVar("Item")
-NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
-Several = Annotated[tuple[Item, ...], Field(min_length=2)]
+Positive = AboveZero[Number]
+NotNegative = ZeroOrMore[Number]
 Fractions = Several[Fraction]
 Ascending = Several[Number]
 # Chooses the class of a section by its key `kind`.

@@ -10,13 +10,13 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    field_validator,
 )
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
 from skysim.core.units import (
     BY_KIND,
+    AboveZero,
     Ascending,
     ConfigModel,
     Duration,
@@ -179,17 +179,16 @@ class GhostConfig(ConfigModel):
     """
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
-    share: Annotated[Fraction, Field(gt=0)]
+    share: AboveZero[Fraction]
     radius_px: DiskRadius
 
-    @field_validator("magnification")
-    @classmethod
-    def check_magnification(cls, value: float) -> float:
-        if abs(value) < 0.05:
+    def check(self) -> None:
+        if abs(self.magnification) < 0.05:
             raise InputError(
-                "", f"{value:g} images half of space on the chip", "from 0.05 or to -0.05"
+                "magnification",
+                f"{self.magnification:g} images half of space on the chip",
+                "from 0.05 or to -0.05",
             )
-        return value
 
 
 class GlareConfig(ConfigModel):

@@ -15,6 +15,7 @@ from skysim.core.paths import DATA
 from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     BY_KIND,
+    AboveZero,
     Ascending,
     ConfigModel,
     Duration,
@@ -315,8 +316,8 @@ class LedLightConfig(ConfigModel):
         by the layout's hardware_seed
     """
 
-    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
-    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
+    intensity_cd: AboveZero[Intensity] | None = None
+    radiant_intensity_w_sr: AboveZero[RadiantIntensity] | None = None
     spectrum: LedSpectrum = "white"
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0

@@ -16,7 +16,6 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     SerializeAsAny,
-    field_validator,
     model_validator,
 )
 
@@ -36,6 +35,7 @@ from skysim.core.units import (
     PositiveLength,
     RightAscension,
     Seed,
+    ZeroOrMore,
 )
 from skysim.scene.sections.layouts import (
     Layout,
@@ -185,12 +185,10 @@ class SurveyedSurfaceConfig(RimmedConfig):
     degree: Annotated[int, Field(ge=0, le=12)] = 6
     rms_limit_m: PositiveLength = 1e-3
 
-    @field_validator("file")
-    @classmethod
-    def check_file(cls, value: str) -> str:
-        if not value.endswith(".csv") or not Path(value).is_file():
-            raise InputError("", f"{value!r} is not a file", "a .csv file of x, y, z")
-        return value
+    def check(self) -> None:
+        super().check()
+        if not self.file.endswith(".csv") or not Path(self.file).is_file():
+            raise InputError("file", f"{self.file!r} is not a file", "a .csv file of x, y, z")
 
 
 AnySurface = Annotated[
@@ -227,12 +225,12 @@ class RoomConfig(ConfigModel):
     """
 
     height_m: PositiveLength | None = None
-    bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
+    bearing_height_m: ZeroOrMore[Length] | None = None
     width_m: PositiveLength | None = None
     length_m: PositiveLength | None = None
     door_m: tuple[PositiveLength, PositiveLength] | None = None
     segments: Annotated[int, Field(ge=1, le=100)] = 1
-    thickness_m: Annotated[Length, Field(ge=0)] = 0.0
+    thickness_m: ZeroOrMore[Length] = 0.0
 
     def check(self) -> None:
         if self.height_m is not None and self.bearing_height_m is None:

@@ -13,6 +13,7 @@ from pydantic import (
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
+    AboveZero,
     ConfigModel,
     Declination,
     Duration,
@@ -278,7 +279,7 @@ Maneuver = Annotated[
 ]
 
 
-Stored = Annotated[Momentum, Field(gt=0)]
+Stored = AboveZero[Momentum]
 
 
 class DesaturationConfig(ConfigModel):

@@ -25,6 +25,7 @@ from skysim.core.units import (
     Spin,
     TableConfig,
     Temperature,
+    ZeroOrMore,
 )
 from skysim.core.yaml_reader import existing_file
 
@@ -272,7 +273,7 @@ class ExclusionConfig(ConfigModel):
     sun_deg: ExclusionAngle = 0.0
     earth_deg: ExclusionAngle = 0.0
     moon_deg: ExclusionAngle = 0.0
-    stars: Annotated[int, Field(ge=0)] = 4
+    stars: ZeroOrMore[int] = 4
 
 
 class EarthConfig(ConfigModel):

@@ -21,6 +21,7 @@ from skysim.core.units import (
     Spins,
     Time,
     TimeLimit,
+    ZeroOrMore,
 )
 from skysim.core.yaml_reader import existing_file
 
@@ -125,7 +126,7 @@ class ExposureControlConfig(ConfigModel):
     step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
     min_stars: PositiveInt = 4
     overexposed_objects: PositiveInt = 4
-    saturated_px: Annotated[int, Field(ge=0)] = 1
+    saturated_px: ZeroOrMore[int] = 1
 
     def check(self) -> None:
         if self.shortest_s > self.longest_s:

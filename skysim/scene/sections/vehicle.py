@@ -7,9 +7,11 @@ from pydantic import Field
 from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
 from skysim.core.units import (
+    AboveZero,
     Angles,
     ConfigModel,
     Damping,
+    Delay,
     Duration,
     Force,
     Imbalance,
@@ -30,13 +32,14 @@ from skysim.core.units import (
     Stiffness,
     Time,
     Torque,
+    ZeroOrMore,
 )
 
 # Keys of `vehicle`, and the ideal torques.
 ActuatorsName = Literal["ideal", "wheels", "fans", "thrusters", "trims", "cmgs"]
-TorqueLimit = Annotated[Torque, Field(gt=0)]
-TorqueLevel = Annotated[Torque, Field(ge=0)]
-Friction = Annotated[Damping, Field(ge=0)]
+TorqueLimit = AboveZero[Torque]
+TorqueLevel = ZeroOrMore[Torque]
+Friction = ZeroOrMore[Damping]
 LagTime = Annotated[Time, Field(ge=5e-3)]
 
 
@@ -64,8 +67,8 @@ class WheelsConfig(ConfigModel):
     coulomb_nm: TorqueLevel = 0.0
     viscous_nms: Friction = 0.0
     stiction_nm: TorqueLevel = 0.0
-    static_imbalance_kg_m: Annotated[Imbalance, Field(ge=0)] = 0.0
-    dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
+    static_imbalance_kg_m: ZeroOrMore[Imbalance] = 0.0
+    dynamic_imbalance_kg_m2: ZeroOrMore[Inertia] = 0.0
     start_rpm: tuple[Number, ...] = ()
 
     def check(self) -> None:
@@ -86,7 +89,7 @@ class FansConfig(ConfigModel):
         Time constant of the first-order lag between command and thrust
     """
 
-    thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
+    thrust_limit_n: AboveZero[Force] = 0.5
     time_constant_s: LagTime = 0.2
 
 
@@ -111,11 +114,11 @@ class ThrustersConfig(ConfigModel):
         `regulated`: the thrust is constant until the tank is empty; `blowdown`: proportional to the propellant left
     """
 
-    thrust_n: Annotated[Force, Field(gt=0)] = 0.5
-    minimum_impulse_ns: Annotated[LinearImpulse, Field(ge=0)] = 2.5e-3
-    time_constant_s: Annotated[Time, Field(ge=0)] = 3e-3
+    thrust_n: AboveZero[Force] = 0.5
+    minimum_impulse_ns: ZeroOrMore[LinearImpulse] = 2.5e-3
+    time_constant_s: Delay = 3e-3
     specific_impulse_s: Duration = 60.0
-    propellant_kg: Annotated[Mass, Field(gt=0)] = 0.3
+    propellant_kg: AboveZero[Mass] = 0.3
     supply: Literal["regulated", "blowdown"] = "regulated"
 
 
@@ -133,7 +136,7 @@ class TrimsConfig(ConfigModel):
     """
 
     travel_m: PositiveLength = 0.02
-    speed_limit_m_s: Annotated[Speed, Field(gt=0)] = 0.01
+    speed_limit_m_s: AboveZero[Speed] = 0.01
 
 
 class CmgsConfig(ConfigModel):
@@ -188,13 +191,13 @@ class DragConfig(ConfigModel):
     """Air drag about each body axis independently: T = -(viscous + quadratic |rate|) rate."""
 
     viscous_nms: Friction = 0.0
-    quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0
+    quadratic_nms2: ZeroOrMore[QuadraticDrag] = 0.0
 
 
 class CableConfig(ConfigModel):
     """A cable attached to the vehicle: a torsional spring that rotates it back to (0, 0, 0) by the shorter rotation."""
 
-    stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
+    stiffness_nm_rad: AboveZero[Stiffness]
 
 
 class AirCurrentConfig(ConfigModel):
@@ -339,7 +342,7 @@ class VehicleConfig(ConfigModel):
 
     model: str
     mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
-    mass_kg: Annotated[Mass, Field(gt=0)] | None = None
+    mass_kg: AboveZero[Mass] | None = None
     inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
