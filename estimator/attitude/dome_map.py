@@ -306,7 +306,8 @@ def check_map(leds: object) -> None:
 
 
 def check_lever(leds: LedMap, lever: Lever) -> None:
-    """Raise ImageError unless the lever's numbers are usable and its arm is shorter than the nearest LED's distance."""
+    """Raise ImageError unless map and lever are usable, and the lever's arm is shorter than any LED's distance."""
+    check_map(leds)
     checks.of_type("lever", lever, Lever)
     if not np.isfinite(
         checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))

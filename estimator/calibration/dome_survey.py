@@ -34,7 +34,7 @@ import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
+from estimator.attitude.dome_map import LedMap, Lever, check_lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
@@ -207,7 +207,6 @@ def survey(
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: finite, above 0")
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
-    check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
@@ -215,8 +214,7 @@ def survey(
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     fit = _fit(start, sightings, fit_noise)
     # The frame, and the row in it, of each rejected sighting.
-    row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
-    outliers = np.column_stack([sightings.frame, row])[~fit.keep]
+    outliers = sightings.in_frames[~fit.keep]
     return _report(fit, start, outliers, leds_start, camera_start)
 
 
@@ -326,12 +324,8 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
             raise ValueError(
                 f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0"
             )
-    return Sightings(
-        np.repeat(np.arange(len(frames)), [len(frame.led) for frame in frames]),
-        np.concatenate([frame.led for frame in frames]).astype(np.int64),
-        np.concatenate([frame.xy_px for frame in frames]),
-        np.concatenate([frame.sigma_px for frame in frames]),
-    )
+    led = np.concatenate([frame.led for frame in frames]).astype(np.int64)
+    return Sightings.of(frames, led)
 
 
 def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, np.ndarray]:

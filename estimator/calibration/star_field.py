@@ -171,12 +171,10 @@ def calibrate(
     checks.of_type("calibrate: camera_start", camera_start, Camera)
     checks.of_type("calibrate: prior", prior, LensPrior)
     sightings = _collect(frames)
-    row = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
-    counts = np.array([len(frame.xy_px) for frame in frames])
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
     # 1. Start attitudes
     fit = _start(sightings, vectors, camera_start, prior, len(frames))
-    enough = counts[sightings.frame] >= LEAST_STARS
+    enough = np.bincount(sightings.frame)[sightings.frame] >= LEAST_STARS
     used = sightings.take(enough)
     _check_enough(used)
     try:
@@ -190,7 +188,7 @@ def calibrate(
         # 4. Wrong identifications
         distance = np.linalg.norm(ba.residuals(fit, sightings), axis=1)
         keep = enough & (distance < GATE * ba.robust_scale(fit, used))
-        outliers = np.column_stack([sightings.frame, row])[~keep & enough]
+        outliers = sightings.in_frames[~keep & enough]
         tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
         keep &= tied[sightings.frame]
         # 5. Least squares
@@ -339,13 +337,7 @@ def _collect(frames: Sequence[StarFrame]) -> Sightings:
             raise ValueError(
                 f"calibrate: frame {k} has a pixel or direction that is not finite or a sigma_px not above 0"
             )
-    counts = [len(frame.xy_px) for frame in frames]
-    return Sightings(
-        np.repeat(np.arange(len(frames)), counts),
-        np.arange(sum(counts)),
-        np.concatenate([frame.xy_px for frame in frames]),
-        np.concatenate([frame.sigma_px for frame in frames]),
-    )
+    return Sightings.of(frames, np.arange(sum(len(frame.xy_px) for frame in frames)))
 
 
 def _check_enough(sightings: Sightings) -> None:

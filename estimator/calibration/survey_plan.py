@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
@@ -62,7 +62,6 @@ class SurveyModel:
     fit_distortion: bool = False
 
     def __post_init__(self) -> None:
-        check_map(self.leds)
         check_lever(self.leds, self.lever)
         for name in ("sigma_px", "leds_sigma_m"):
             if not 0 < getattr(self, name) < np.inf:

@@ -37,7 +37,7 @@ class Subset:
     @property
     def terms(self) -> ba.NormalEquations:
         """Normal equations of its least-squares fit."""
-        return ba.normal_equations(self.bundle, self.sightings, np.ones(len(self.index)))
+        return self.bundle.equations(self.sightings, np.ones(len(self.index)))
 
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
         """Return the full bundle with the adjusted values of this subset inserted."""
