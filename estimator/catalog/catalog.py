@@ -412,13 +412,20 @@ def from_columns(
     sa = np.sin(ra_rad)
     ca = np.cos(ra_rad)
     sd = np.sin(dec_rad)
-    cd = np.cos(dec_rad)
-    vectors = np.column_stack([cd * ca, cd * sa, sd])
+    vectors = from_angles(ra_rad, dec_rad)
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
-    north = np.column_stack([-sd * ca, -sd * sa, cd])
+    north = np.column_stack([-sd * ca, -sd * sa, np.cos(dec_rad)])
     drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
     parallax_rad = MAS_RAD * parallax_mas
     return StarCatalog(hip.astype(np.int64), vectors, drift, parallax_rad, v_mag, epoch_yr)
+
+
+def from_angles(east_rad: Floats | float, north_rad: Floats | float) -> Floats:
+    """Return the (..., 3) unit vectors at angles east along the equator and north of it."""
+    cosine = np.cos(north_rad)
+    return np.stack(
+        [cosine * np.cos(east_rad), cosine * np.sin(east_rad), np.sin(north_rad)], axis=-1
+    )
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:

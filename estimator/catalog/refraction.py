@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog.catalog import days_after_j2000, utc
+from estimator.catalog.catalog import days_after_j2000, from_angles, utc
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Allowed, Floats
@@ -112,13 +112,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
     # Zenith in the mean equator of date.
     sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
     hour = np.radians(sidereal_deg % 360) + longitude_rad
-    of_date = np.array(
-        [
-            np.cos(latitude_rad) * np.cos(hour),
-            np.cos(latitude_rad) * np.sin(hour),
-            np.sin(latitude_rad),
-        ]
-    )
+    of_date = from_angles(hour, latitude_rad)
     # Precession from the equator of date to that of J2000.0.
     zeta, z, theta = ARCSEC_RAD * np.array(
         [
