@@ -237,7 +237,11 @@ class Centroids:
                 )
 
     def check_values(self) -> None:
-        """Raise ImageError unless positions are finite, sigmas in range and fluxes above 0; it takes a microsecond."""
+        """Raise ImageError unless positions are finite, sigmas in range and fluxes above 0; it takes a microsecond.
+
+        The trackers call it for any object, `Centroids.check_values(centroids)`, and it refuses all other types.
+        """
+        checks.of_type("centroids", self, Centroids)
         spread = self.covariance_px2
         row, fault = _first_fault(
             self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread

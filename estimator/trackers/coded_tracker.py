@@ -154,8 +154,7 @@ class CodedTracker(DomeTracker):
         frame
             Number of the frame
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         clock = clock or Clock()
         exposure_s = exposure_s or 0.0
         # 2. Tracks

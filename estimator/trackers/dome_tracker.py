@@ -24,7 +24,6 @@ from estimator.attitude.dome_map import (
     LedMap,
     Lever,
     check_lever,
-    check_map,
     common_images_px,
     common_shifts_m,
     led_sigma_rad,
@@ -198,7 +197,6 @@ class DomeTracker(FrameTracker):
             if getattr(settings, stage, "") == "default":
                 settings = replace(settings, **{stage: getattr(SETTINGS, stage)})
         check_algorithms(settings, IDENTIFIERS, SOLVERS)
-        check_map(leds)
         check_lever(leds, lever)
         self.camera = camera
         self.leds = leds
@@ -244,8 +242,7 @@ class DomeTracker(FrameTracker):
         rate, exposure_s
             Rate and exposure time as in `solve`
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         clock = clock or Clock()
         lever_cam_m = self.lever.pupil_cam_m
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
@@ -296,7 +293,7 @@ class DomeTracker(FrameTracker):
         for _ in range(2):
             try:
                 tracker = tracker._with_fitted_focal(centroids, match)
-            except (ValueError, np.linalg.LinAlgError) as error:
+            except ValueError as error:
                 return Attitude(f"no attitude: {error}")
             attitude = tracker._solve_calibrated(centroids, match)
             if attitude.match is None:
@@ -361,7 +358,12 @@ class DomeTracker(FrameTracker):
                 body_from_lab, _, _ = self._solve(
                     "rotation_only", rays, pixel_rad, observed, star, body_from_lab
                 )
-                observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
+                xy_px = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
+                # An LED whose center is just off the chip may still have light on it.
+                inside = np.flatnonzero(self.camera.contains(xy_px, -30.0))
+                observed, star = mutual_nearest(
+                    centroids.xy_px, xy_px[inside], factor * radius_px, inside
+                )
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
@@ -374,7 +376,7 @@ class DomeTracker(FrameTracker):
             body_from_lab, covariance, sigma_rad = self._solve(
                 self.settings.solver, rays, pixel_rad, observed, star, body_from_lab
             )
-        except (ValueError, np.linalg.LinAlgError) as error:
+        except ValueError as error:
             return Attitude(f"no attitude: {error}")
         # 6. Covariance in camera axes
         cam_from_lab = self.lever.cam_from_body * body_from_lab
@@ -552,12 +554,3 @@ class DomeTracker(FrameTracker):
             seen, sigma_rad, position_m, self.leds, self.lever, body_from_lab
         )
         return *solved, sigma_rad
-
-    def _nearest(
-        self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
-    ) -> tuple[NDArray, NDArray]:
-        """Return mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
-        xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
-        # An LED whose center is just off the chip may still have light on it.
-        inside = np.flatnonzero(self.camera.contains(xy, -30.0))
-        return mutual_nearest(centroids.xy_px, xy[inside], radius_px, inside)

@@ -307,8 +307,7 @@ class StarTracker(FrameTracker):
                 exposure_s=exposure_s,
             )
             return solve_through_air(solve, self.camera, self.air, t_s, centroids)
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         if effort is not None:
             effort = checks.number(
                 "effort",
@@ -432,8 +431,7 @@ class StarTracker(FrameTracker):
         ImageError
             For rows outside of the centroids or stars.
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         observed = checks.row_numbers("observed", observed, len(centroids))
         star = checks.row_numbers("star", star, len(self.stars))
         if len(observed) != len(star):
