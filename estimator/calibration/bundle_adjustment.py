@@ -25,7 +25,7 @@ with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduce
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +36,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.rotation_fit import tangent_gradients
 from estimator.core.camera import Camera, distorted, distortion_slopes
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 
 # Newton decrement g^T N^-1 g at convergence: the squared step in standard deviations. It is small enough for a
 # relative accuracy of 1e-9 in lengths.
@@ -48,7 +48,7 @@ EXACT = 1e-6
 MEDIAN_RADIUS = np.sqrt(2 * np.log(2))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sightings:
     """Observations of M lights in all frames.
 
@@ -126,7 +126,7 @@ class Assumed(NamedTuple):
         return np.array([lever_m, lever_m, lever_m, focal_px]) ** -2.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Bundle:
     """Parameters of the model, on which the pixels depend, and their priors.
 

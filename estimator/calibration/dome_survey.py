@@ -27,7 +27,7 @@ then wrong by about 0.1 percent, whatever the number of lights. The start map co
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -42,7 +42,7 @@ from estimator.calibration.bundle_covariance import Covariances
 from estimator.calibration.survey_subset import Subset, connected_subset
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
@@ -55,7 +55,7 @@ NOISE_ROUNDS = 8
 NOISE_TOLERANCE = 0.01
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeFrame:
     """One frame of a survey: identified LEDs and their centroids.
 
@@ -78,7 +78,7 @@ class DomeFrame:
     body_from_lab: Rotation
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeSurvey:
     """Result of a dome survey.
 

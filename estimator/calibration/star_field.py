@@ -21,7 +21,7 @@ by the square of the field angle, and k2 and k3 resemble k1 over a narrow field.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -39,7 +39,7 @@ from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
@@ -52,7 +52,7 @@ CALIBRATION_ROUNDS = 8  # greatest number of rounds of self_calibrate
 MIN_STAR_FRACTION = 0.9
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StarFrame:
     """Identified stars of one frame.
 
@@ -79,7 +79,7 @@ class StarFrame:
     exposure_s: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LensPrior:
     """Prior standard deviations of the lens parameters about the start camera.
 
@@ -106,7 +106,7 @@ class LensPrior:
         return np.array([np.inf, center, center, k1, k1 / r**2, p, p, k1 / r**4])
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FieldReport:
     """Diagnostics of a calibration.
 
@@ -278,7 +278,7 @@ def self_calibrate(
     return best
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _StarBundle(Bundle):
     """Bundle with the stars as lights at distance 1, whose unknowns in separate blocks are the attitudes.
 

@@ -10,8 +10,6 @@ A fault is reported only if chance would make it in fewer than FALSE_ALARMS surv
 together (Bonferroni: each of N LEDs is tested at FALSE_ALARMS / N).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
@@ -21,7 +19,7 @@ from scipy.special import gammainccinv
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.catalog.catalog import close_groups
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.vectors import normalized
 
@@ -38,7 +36,7 @@ CHANCE = 0.02
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class HeldFrames:
     """Attitudes of a survey's F frames, and the model that it found."""
 
@@ -79,12 +77,12 @@ class HeldFrames:
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
         """Return the (M, 3) origins and unit directions, in the lab, of the rays to pixels (M, 2) of frames (M,)."""
         lab_from_body = self.body_from_lab[frame].inv()
-        rays_body = self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px))
+        rays_body = self.lever.body_from_cam.apply(self.camera.rays(xy_px))
         origins = lab_from_body.apply(np.tile(self.lever.camera_body_m, (len(frame), 1)))
         return origins, lab_from_body.apply(rays_body)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StrayLight:
     """A light at rest in the lab where no LED is expected.
 
@@ -293,7 +291,7 @@ def name_strays(
     return list(zip(leds, columns[inside].tolist(), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LightTable:
     """Light of a survey's LEDs in its frames.
 
@@ -313,7 +311,7 @@ class LightTable:
     expected: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Exchange:
     """An LED that shines at the place of another one.
 

@@ -9,7 +9,7 @@ low-precision sidereal time and precession; the simulator integrates the refract
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog.catalog import days_after_j2000, from_angles, utc
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats
+from estimator.core.checks import Allowed, Floats, frozen
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
@@ -42,7 +42,7 @@ NUMBERS = {
 RAISING_STEPS = 6  # iterations of `raised`
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SiteAir:
     """The air over a site, as a tracker there knows it.
 

@@ -147,7 +147,7 @@ def assumed_directions(
     light i along its ray b_i depends on the attitude A, and follows from the surface at an assumed A.
     """
     lab_from_body = Rotation.from_euler("ZYX", assumed_deg[::-1], degrees=True)
-    lab_from_cam = lab_from_body * lever.cam_from_body.inv()
+    lab_from_cam = lab_from_body * lever.body_from_cam
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
     return lab_from_cam.inv().apply(normalized(points_m))
@@ -221,7 +221,7 @@ class DomeTracker(FrameTracker):
         position_m = self.leds.position_m
         for toward_m in position_m[:: max(len(position_m) // 40, 1)]:
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
-            body_from_lab = self.lever.cam_from_body.inv() * cam_from_lab
+            body_from_lab = self.lever.body_from_cam * cam_from_lab
             xy_px = project(body_from_lab, position_m, self.lever, self.camera)
             fields.append(xy_px[self.camera.contains(xy_px, 2.0)])
         xy_px = max(fields, key=len)
@@ -308,7 +308,7 @@ class DomeTracker(FrameTracker):
         rays = self.camera.rays(centroids.xy_px[observed])
         pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
         sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
-        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         ratio = fit_focal_ratio(
             rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab
         )
@@ -346,7 +346,7 @@ class DomeTracker(FrameTracker):
         """
         observed = match.observed
         star = match.star
-        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
         pixel_rad = self._pixel_rad(centroids)
         # Matching radius: four standard deviations, at least 4 px

@@ -25,7 +25,7 @@ from estimator.attitude.rate import center_streak_px, image_paths
 from estimator.centroiding.centroid import CENTROIDERS, known_streaks
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Allowed, Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
@@ -77,7 +77,7 @@ ALLOWED = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Settings:
     """Algorithm of each stage, and its parameters.
 
@@ -158,7 +158,7 @@ class Settings:
 
     def __new__(cls, *args: Any, **named: Any) -> Settings:
         for name in named:
-            checks.known("settings", name, cls.__slots__)
+            checks.known("settings", name, cls.__dataclass_fields__)
         return object.__new__(cls)
 
     @property

@@ -88,6 +88,25 @@ def whole_matrix(terms: ba.NormalEquations) -> Floats:
 # Bundle adjustment
 
 
+@law(Sightings.of, Sightings.in_frames)
+@given(rng=SEEDS)
+def test_sightings_are_those_of_the_frames_in_their_order(rng: np.random.Generator) -> None:
+    counts = rng.integers(0, 4, FRAMES)
+    frames = [
+        StarFrame(rng.uniform(0, 99, (count, 2)), rng.uniform(1, 2, count), units(rng, count))
+        for count in counts
+    ]
+    led = rng.permutation(counts.sum())
+    seen = Sightings.of(frames, led)
+    assert (seen.led == led).all()
+    for (frame, n), xy_px, sigma_px in zip(
+        seen.in_frames, seen.xy_px, seen.sigma_px, strict=True
+    ):
+        assert (frames[frame].xy_px[n] == xy_px).all()
+        assert frames[frame].sigma_px[n] == sigma_px
+    assert (np.bincount(seen.frame, minlength=FRAMES) == counts).all()
+
+
 @law(ba.linearize, ba.residuals, Bundle.start, Bundle.apply_step, Sightings.take)
 @given(rng=SEEDS)
 def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
