@@ -258,11 +258,10 @@ class ConfigModel(BaseModel):
         }
 
     def model_post_init(self, _context: Any) -> None:
-        """Check the section as a whole, once its keys are valid."""
-        self.check()
-
-    def check(self) -> None:
-        """Raise InputError unless the keys suit each other; a class that extends it checks those of its base first."""
+        """Call the method `check` of each class, the base first: whether the keys, which are valid, suit each other."""
+        for kind in reversed(type(self).__mro__):
+            if check := vars(kind).get("check"):
+                check(self)
 
 
 def keeps_null(field: FieldInfo) -> bool:

@@ -223,7 +223,6 @@ class BaffleConfig(TableConfig):
     pst: Fractions
 
     def check(self) -> None:
-        super().check()
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
 

@@ -177,7 +177,6 @@ class PoissonDiskConfig(DimmedConfig):
     count: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
     def check(self) -> None:
-        super().check()
         if (self.spacing_m is None) == (self.count is None):
             raise InputError("", "poisson_disk takes either spacing or count")
 
@@ -219,7 +218,6 @@ class GeodesicConfig(LitConfig):
     rotation_deg: Number = 0.0
 
     def check(self) -> None:
-        super().check()
         if self.class_ == "II" and self.frequency % 2:
             raise InputError("frequency", f"{self.frequency} is odd, with class: II", "even")
 
@@ -348,7 +346,6 @@ class ListedConfig(DimmedConfig):
     types: TypeNames | None = None
 
     def check(self) -> None:
-        super().check()
         lists = [
             each
             for each in (self.positions_m, self.directions_deg, self.file)
@@ -491,7 +488,6 @@ class LensDisplayConfig(PixelsConfig):
     distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
 
     def check(self) -> None:
-        super().check()
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
@@ -550,7 +546,6 @@ class ProjectorConfig(LensDisplayConfig):
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
     def check(self) -> None:
-        super().check()
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
             raise InputError(

@@ -53,7 +53,6 @@ class LobeTableConfig(TableConfig):
     intensity: Several[NotNegative]
 
     def check(self) -> None:
-        super().check()
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
 
@@ -379,7 +378,6 @@ class LedConfig(LedLightConfig):
         return self.model_copy(update=dict(self.types[name])) if name else self
 
     def check(self) -> None:
-        super().check()
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
             raise InputError(
                 "code.bit_time",

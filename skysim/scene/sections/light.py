@@ -89,7 +89,6 @@ class RimmedConfig(SurfaceConfig):
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
 
     def check(self) -> None:
-        super().check()
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
 
@@ -123,7 +122,6 @@ class SphereSurfaceConfig(RimmedConfig):
     wall: WallConfig | None = None
 
     def check(self) -> None:
-        super().check()
         thickest = (
             max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         )
@@ -161,7 +159,6 @@ class CylinderSurfaceConfig(SurfaceConfig):
     rim_height_m: Length | None = None
 
     def check(self) -> None:
-        super().check()
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
 
@@ -186,7 +183,6 @@ class SurveyedSurfaceConfig(RimmedConfig):
     rms_limit_m: PositiveLength = 1e-3
 
     def check(self) -> None:
-        super().check()
         if not self.file.endswith(".csv") or not Path(self.file).is_file():
             raise InputError("file", f"{self.file!r} is not a file", "a .csv file of x, y, z")
 

@@ -45,7 +45,6 @@ class HorizonConfig(TableConfig):
     altitude_deg: Several[Altitude]
 
     def check(self) -> None:
-        super().check()
         if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
             raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
 
