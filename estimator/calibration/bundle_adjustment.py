@@ -445,10 +445,10 @@ def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
 
 def adjust(
     bundle: Bundle, sightings: Sightings, width: float, decrement: float = DECREMENT
-) -> tuple[Bundle, bool]:
-    """Minimize the loss over all unknowns by Levenberg-Marquardt; return the bundle and whether it converged.
+) -> tuple[Bundle, str]:
+    """Minimize the loss over all unknowns by Levenberg-Marquardt; return the bundle and the status of the fit.
 
-    The numbered steps are those of the module.
+    The status is "converged", or "stopped ..." without convergence. The numbered steps are those of the module.
 
     Parameters
     ----------
@@ -485,13 +485,13 @@ def adjust(
             damping = max(damping / 10, 1e-12)
             # 6. Convergence
             if slope < decrement:
-                return bundle, True
+                return bundle, "converged"
             terms = bundle.equations(sightings, new_weight)
         else:
             damping *= 10
             if damping > 1e12:
                 break
-    return bundle, False
+    return bundle, f"stopped after {STEPS} steps without convergence"
 
 
 def attitude_equations(

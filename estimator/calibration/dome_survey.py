@@ -223,7 +223,7 @@ class _Fit(NamedTuple):
 
     subset: Subset
     keep: np.ndarray
-    converged: bool
+    status: str
     covariances: Covariances
     misfit: float
     noise_scale: float
@@ -250,7 +250,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             scaled = replace(
                 subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index]
             )
-            fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
+            fitted, status = ba.adjust(subset.bundle, scaled, np.inf)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 4. Covariances, misfit, and noise
             covariances = bundle_covariance.covariance(subset.terms, fitted)
@@ -268,7 +268,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
-    return _Fit(subset, keep, converged, covariances, misfit, scale, common)
+    return _Fit(subset, keep, status, covariances, misfit, scale, common)
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
@@ -382,11 +382,6 @@ def _report(
     fit: _Fit, start: Bundle, outliers: Ints, leds: LedMap, camera: Camera
 ) -> DomeSurvey:
     """Return the survey's result: the fitted subset in the full set of lights and frames."""
-    status = (
-        "converged"
-        if fit.converged
-        else f"stopped after {ba.STEPS} steps without convergence"
-    )
     subset = fit.subset
     full = subset.insert_into(start, subset.bundle)
     lights = len(full.position_m)
@@ -404,7 +399,7 @@ def _report(
     common_m[:, subset.led], by_camera = fit.common
     common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
     return DomeSurvey(
-        status,
+        fit.status,
         replace(leds, position_m=full.position_m),
         surveyed,
         Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),

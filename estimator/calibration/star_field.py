@@ -194,13 +194,8 @@ def calibrate(
         # 5. Least squares
         used = sightings.take(keep)
         _check_enough(used)
-        fit, converged = ba.adjust(fit, used, np.inf)
+        fit, status = ba.adjust(fit, used, np.inf)
         # 6. Covariance and diagnostics
-        status = (
-            "converged"
-            if converged
-            else f"stopped after {ba.STEPS} steps without convergence"
-        )
         return _report(status, fit, used, tied, outliers, keep, frames, camera_start)
     except LinAlgError:
         raise ValueError(

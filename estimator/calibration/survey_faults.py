@@ -136,7 +136,7 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
         (N, 3, 3) covariance of the positions found; NaN for LEDs that are not measured
     """
     # 1. Squared distances along the axes of each covariance
-    rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    rows = _measured(covariance_m2)
     if not len(rows):
         return rows, 0.0
     eigenvalue, axes = np.linalg.eigh(covariance_m2[rows])
@@ -169,9 +169,14 @@ def found_displacements_m(covariance_m2: Floats, sigma_m: float) -> Floats:
     covariance_m2, sigma_m
         As of `displaced`: covariances, NaN for LEDs that are not measured, and the list's error s
     """
-    measured = covariance_m2[np.isfinite(covariance_m2).all(axis=(1, 2))]
+    measured = covariance_m2[_measured(covariance_m2)]
     greatest_m2 = np.linalg.eigvalsh(measured)[:, 2] + sigma_m**2
     return (np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2)
+
+
+def _measured(covariance_m2: Floats) -> Ints:
+    """Return the rows of the lights with a covariance."""
+    return np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
 
 
 def _limit(count: int) -> float:
@@ -394,7 +399,7 @@ def names(
         (N, 3), (N, 3) and (N, 3, 3) positions in the list, as found, and their covariance, as of
         `displaced`
     """
-    rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    rows = _measured(covariance_m2)
     if not len(rows):
         return rows, rows
     # 1. Error of the list

@@ -321,8 +321,8 @@ def test_an_adjustment_converges_to_the_observed_pixels(
     start = replace(nudged(rng, true, by), map_sigma_m=0.01)
     turned = ba.fit_attitudes(start, seen, 3)
     assert turned.cost(seen, np.inf)[0] <= start.cost(seen, np.inf)[0] * (1 + 1e-9) + 1e-9
-    found, at_rest = ba.adjust(turned, seen, np.inf)
-    assert at_rest
+    found, status = ba.adjust(turned, seen, np.inf)
+    assert status == "converged"
     assert np.abs(ba.residuals(found, seen)).max() < 1e-5
     terms = found.equations(seen, np.ones(len(seen.led)))
     by_led, by_rotation, shared = bundle_covariance.covariance(terms, found)
