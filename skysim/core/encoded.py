@@ -191,13 +191,6 @@ def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
         )
 
 
-def check_bytes(path: Path) -> None:
-    """Raise InputError for a file larger than the largest allowed image."""
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
-
-
 @contextlib.contextmanager
 def silent_opencv() -> Iterator[None]:
     """Suppress OpenCV's own messages, for example about a missing camera."""

@@ -228,12 +228,17 @@ def as_tree(keys: Keys) -> tuple[Tree, str]:
     return tree, yaml.safe_dump(tree, sort_keys=False)
 
 
+def check_bytes(path: Path, limit_bytes: int) -> None:
+    """Raise InputError for a file of more than limit_bytes."""
+    size = path.stat().st_size
+    if size > limit_bytes:
+        raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+
+
 def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
     """The text of a file. Raises InputError if it is too large, cannot be read or is not UTF-8."""
     try:
-        size = path.stat().st_size
-        if size > limit_bytes:
-            raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+        check_bytes(path, limit_bytes)
         return path.read_text(encoding)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
