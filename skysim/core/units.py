@@ -138,12 +138,13 @@ def finite(value: float) -> float:
     return value
 
 
-# Of any type: a value above zero, and one of zero or more; a list of one value or more, and one of two or more.
+# Of any type: a value above zero, and one of zero or more; lists of one or more, two or more, three.
 Item = TypeVar("Item")
 AboveZero = Annotated[Item, Field(gt=0)]
 ZeroOrMore = Annotated[Item, Field(ge=0)]
 NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
 Several = Annotated[tuple[Item, ...], Field(min_length=2)]
+Three = tuple[Item, Item, Item]
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
 Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
@@ -163,16 +164,16 @@ QuadraticDrag = Annotated[
 Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
 Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
 PositiveLength = AboveZero[Length]
-Position = tuple[Length, Length, Length]
+Position = Three[Length]
 Duration = AboveZero[Time]
 Delay = ZeroOrMore[Time]
 TimeLimit = Annotated[Time, Field(ge=1e-3, le=3600)]
 # An angle or a rate.
 Spin = Annotated[Number, Field(ge=-360, le=360)]
-Spins = tuple[Spin, Spin, Spin]
+Spins = Three[Spin]
 RightAscension = Annotated[Number, Field(ge=0, lt=360)]
 Declination = Annotated[Number, Field(ge=-90, le=90)]
-Triple = tuple[Number, Number, Number]
+Triple = Three[Number]
 Angles = Triple
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
 Temperature = Annotated[Number, Field(ge=-150, le=150)]

@@ -16,10 +16,10 @@ import json
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
@@ -124,6 +124,9 @@ def existing_file(value: str) -> str:
             "", f"{value!r} is not a file", "a path, or a file in the scene's folder"
         )
     return value
+
+
+ExistingFile = Annotated[str, AfterValidator(existing_file)]
 
 
 def find_file(name: str, folder: Path, what: str) -> Path:

@@ -221,8 +221,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     # Keys as loaded, see `loader.keys_of`.
     _source: RawKeys = RawKeys()
 
-    @model_validator(mode="after")
-    def check_light_source(self) -> "Scene":
+    def check(self) -> None:
         """Check keys that depend on the kind of light, and that the shutter reads all rows within a frame period."""
         sky = self.light.kind == "stars"
         tracker = self.tracker
@@ -271,7 +270,6 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "the rows of a rolling shutter show different bits",
                 "frame, or another camera.shutter",
             )
-        return self
 
     @model_validator(mode="after")
     def complete_layout(self) -> "Scene":

@@ -35,6 +35,7 @@ from skysim.core.units import (
     PositiveLength,
     RightAscension,
     Seed,
+    Three,
     ZeroOrMore,
 )
 from skysim.scene.sections.layouts import (
@@ -136,7 +137,7 @@ class EllipsoidSurfaceConfig(RimmedConfig):
 
     kind: Literal["ellipsoid"]
     apex_m: PositiveLength
-    semi_axes_m: tuple[PositiveLength, PositiveLength, PositiveLength]
+    semi_axes_m: Three[PositiveLength]
 
 
 class FlatSurfaceConfig(SurfaceConfig):

@@ -3,7 +3,6 @@
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     BeforeValidator,
     Discriminator,
     Field,
@@ -24,10 +23,11 @@ from skysim.core.units import (
     Positive,
     RightAscension,
     Spins,
+    Three,
     TimeLimit,
     Triple,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile
 from skysim.scene.sections.vehicle import ActuatorsName
 
 SIDEREAL = "sidereal"  # the rate of a vehicle that stands on the Earth, under the stars
@@ -75,7 +75,7 @@ Start = Annotated[
 ]
 
 
-AxesRms = tuple[NotNegative, NotNegative, NotNegative]
+AxesRms = Three[NotNegative]
 
 
 class JitterLineConfig(ConfigModel):
@@ -226,7 +226,7 @@ class ProfileConfig(ConfigModel):
     """
 
     kind: Literal["profile"]
-    file: Annotated[str, AfterValidator(existing_file)]
+    file: ExistingFile
     begin: Literal["zero", "first_sample"] = "zero"
     rotation: RotationName | None = None
 

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
@@ -25,9 +25,10 @@ from skysim.core.units import (
     Spin,
     TableConfig,
     Temperature,
+    Three,
     ZeroOrMore,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile
 
 # The scene section `light.air`: the atmosphere between the camera of a sky scene and the stars.
 
@@ -110,7 +111,7 @@ class AirConfig(ConfigModel):
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
-Coefficients = tuple[Coefficient, Coefficient, Coefficient]
+Coefficients = Three[Coefficient]
 
 
 class SteadyTemperatureConfig(ConfigModel):
@@ -200,7 +201,6 @@ class ThermalConfig(ConfigModel):
 
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
-ElementsFile = Annotated[str, AfterValidator(existing_file)]
 ExclusionAngle = Annotated[Number, Field(ge=0, lt=180)]
 Rate = Annotated[Number, Field(gt=0, le=30)]
 
@@ -247,7 +247,7 @@ class SatellitesConfig(ConfigModel):
         Further satellites on random paths
     """
 
-    file: ElementsFile | None = None
+    file: ExistingFile | None = None
     standard_mag: Magnitude = 6.0
     random: RandomSatellitesConfig | None = None
 
@@ -333,7 +333,7 @@ class TleOrbitConfig(OrbitConfig):
     """
 
     kind: Literal["tle"]
-    file: ElementsFile
+    file: ExistingFile
     number: Annotated[int, Field(ge=0, le=999_999_999)] | None = None
 
 
@@ -341,7 +341,7 @@ class OemOrbitConfig(OrbitConfig):
     """An orbit of a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation."""
 
     kind: Literal["oem"]
-    file: ElementsFile
+    file: ExistingFile
 
 
 Orbit = Annotated[CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, BY_KIND]

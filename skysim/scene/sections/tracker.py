@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
@@ -23,7 +23,7 @@ from skysim.core.units import (
     TimeLimit,
     ZeroOrMore,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile, value_at
 
 OWN = "own"  # skysim's tracker
 
@@ -172,6 +172,11 @@ class ComputerConfig(ConfigModel):
     host_clock_mhz: Positive | None = None
 
 
+# Keys of a tracker, and of its survey, whose values a map contains.
+ASSUMED_KEYS = ("assumed_focal_length", "assumed_camera_body", "assumed_distortion")
+SURVEYED_KEYS = ("led_sigma", "lever_sigma", "focal_length_sigma", "instrument")
+
+
 class TrackerConfig(ConfigModel):
     """Settings of the star tracker and its assumed values of the hardware; an assumed value of `null` is the true one.
 
@@ -264,7 +269,7 @@ class TrackerConfig(ConfigModel):
     assumed_attitude_deg: Spins | None = None
     magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
     computer: ComputerConfig | None = None
-    map: Annotated[str, AfterValidator(existing_file)] | None = None
+    map: ExistingFile | None = None
 
     def check(self) -> None:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
@@ -279,20 +284,12 @@ class TrackerConfig(ConfigModel):
                 "conflicts with assumed_focal_length",
                 "one of the two",
             )
-        values = {
-            "assumed_focal_length": self.assumed_focal_length_m,
-            "assumed_camera_body": self.assumed_camera_body_m,
-            "assumed_distortion": self.assumed_distortion,
-            "survey.led_sigma": self.survey.led_sigma_m,
-            "survey.lever_sigma": self.survey.lever_sigma_m,
-            "survey.focal_length_sigma": self.survey.focal_length_sigma_m,
-            "survey.instrument": self.survey.instrument,
-        }
-        conflicts = [key for key, value in values.items() if value]
-        if self.map and conflicts:
-            raise InputError(
-                conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map"
-            )
+        tree = self.model_dump(by_alias=True) if self.map else {}
+        for key in (*ASSUMED_KEYS, *(f"survey.{name}" for name in SURVEYED_KEYS)):
+            if value_at(tree, key):
+                raise InputError(
+                    key, "conflicts with tracker.map, which contains it", "0, or no map"
+                )
 
 
 class FilterConfig(ConfigModel):

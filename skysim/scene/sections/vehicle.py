@@ -30,6 +30,7 @@ from skysim.core.units import (
     Spin,
     Spins,
     Stiffness,
+    Three,
     Time,
     Torque,
     ZeroOrMore,
@@ -203,7 +204,7 @@ class CableConfig(ConfigModel):
 class AirCurrentConfig(ConfigModel):
     """Air currents: a random torque about each lab axis, correlated over the correlation time."""
 
-    rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
+    rms_nm: Three[TorqueLevel]
     correlation_s: Duration = 2.0
 
 
@@ -220,7 +221,7 @@ class DisturbancesConfig(ConfigModel):
         Cable and air currents
     """
 
-    turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
+    turbine_nm: Three[Torque] = (0.0, 0.0, 0.0)
     earth_rotation: bool = False
     cable: CableConfig | None = None
     air_current: AirCurrentConfig | None = None
@@ -343,7 +344,7 @@ class VehicleConfig(ConfigModel):
     model: str
     mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
     mass_kg: AboveZero[Mass] | None = None
-    inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
+    inertia_kg_m2: Three[Inertia] | None = None
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
     camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
@@ -368,11 +369,13 @@ class VehicleConfig(ConfigModel):
                 f"{inertia} is not possible for a rigid body",
                 "positive, none above the sum of the others",
             )
-        if self.mount == "free" and self.disturbances != DisturbancesConfig():
+        if self.mount != "free":
+            return
+        if self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
-        if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
+        if self.imu and self.imu.earth_rate != "none":
             raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
-        if self.mount == "free" and (self.trim or self.trims):
+        if self.trim or self.trims:
             raise InputError(
                 "trim" if self.trim else "trims",
                 "a free vehicle rotates about its center of mass",
