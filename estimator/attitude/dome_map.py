@@ -7,7 +7,6 @@ surface gives points whose directions from the bearing center have angles that d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import INCH_M
 from estimator.core.errors import ImageError
 
@@ -24,7 +23,7 @@ UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": INCH_M}
 SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LedMap:
     """The believed dome: LED positions and inner surface, in the lab frame.
 
@@ -161,7 +160,7 @@ def _read_leds(path: str | Path, unit: str | None) -> tuple[list[int], Floats]:
     return [n for n, _ in rows[1:]], np.array(table) * scales[: len(used)]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Lever:
     """The believed position and orientation of the camera on the vehicle.
 
@@ -178,6 +177,11 @@ class Lever:
     camera_body_m: Floats
     cam_from_body: Rotation
     sigma_m: float = 0.0
+
+    @property
+    def body_from_cam(self) -> Rotation:
+        """Rotation from camera axes to body axes."""
+        return self.cam_from_body.inv()
 
     @property
     def pupil_cam_m(self) -> Floats:
@@ -306,7 +310,8 @@ def check_map(leds: object) -> None:
 
 
 def check_lever(leds: LedMap, lever: Lever) -> None:
-    """Raise ImageError unless the lever's numbers are usable and its arm is shorter than the nearest LED's distance."""
+    """Raise ImageError unless map and lever are usable, and the lever's arm is shorter than any LED's distance."""
+    check_map(leds)
     checks.of_type("lever", lever, Lever)
     if not np.isfinite(
         checks.floats("lever: camera_body_m", lever.camera_body_m, (3,))

@@ -136,7 +136,7 @@ def infinity(
     to its angle off the boresight. The bias on AFIT's dome with five LEDs is .52 degrees cross-boresight at every tilt
     (reference, section 5).
     """
-    rays = lever.cam_from_body.inv().apply(rays_cam)
+    rays = lever.body_from_cam.apply(rays_cam)
     at_infinity = np.ones(
         len(rays)
     )  # equal radius and distance: the weights are those of the rays
@@ -162,7 +162,7 @@ def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever) -> tuple[Floats,
     ValueError
         If eq. 44 has no root.
     """
-    boresight_body = lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])
+    boresight_body = lever.body_from_cam.apply([0.0, 0.0, 1.0])
     height_m = on_surface(np.array([[0.0, 0.0, 1.0]]), np.zeros(3), leds)[0, 2]  # R
     distance_m = float(height_m - lever.camera_body_m @ boresight_body)  # R - M
     # Eq. 43: across the boresight
@@ -196,7 +196,7 @@ def thesis(
     # 1. Points in camera axes
     point_cam, distance_m = thesis_points(rays_cam, leds, lever)
     # 2. Points from the bearing, in body axes
-    R_body_from_cam = lever.cam_from_body.inv().as_matrix()
+    R_body_from_cam = lever.body_from_cam.as_matrix()
     point = point_cam @ R_body_from_cam.T + lever.camera_body_m
     distances_m = np.full(len(rays_cam), distance_m)
     # 3. Wahba's problem
@@ -233,7 +233,7 @@ def tappe(
     point along its ray, which is almost its direction from the bearing, so an update reduces the error by a factor of
     about M / R times the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
     """
-    rays = lever.cam_from_body.inv().apply(rays_cam)
+    rays = lever.body_from_cam.apply(rays_cam)
     for _ in range(MAX_UPDATES):
         # 1. Distances. They change little with the attitude, so a few updates converge.
         distance_m = np.linalg.norm(
@@ -273,7 +273,7 @@ def ray_on_surface(
     A bias comes only from errors of the surface: LEDs off the believed ellipsoid, amplified where rays meet it
     obliquely.
     """
-    rays = lever.cam_from_body.inv().apply(rays_cam)
+    rays = lever.body_from_cam.apply(rays_cam)
     for _ in range(MAX_UPDATES):
         # 1. Intersections, in the lab frame
         origin = body_from_lab.inv().apply(lever.camera_body_m)
@@ -349,7 +349,7 @@ def pnp(
     cam_from_lab, covariance_cam = _gauss_newton(
         pattern_m, measured, cam_from_lab, shift_m, weight
     )
-    return lever.cam_from_body.inv() * cam_from_lab, in_body_axes(covariance_cam, lever)
+    return lever.body_from_cam * cam_from_lab, in_body_axes(covariance_cam, lever)
 
 
 def _gauss_newton(

@@ -98,7 +98,7 @@ def _fit_rotation(
     if not step_rad < 1e-9:
         raise ValueError(f"rotation_only: not converged, last step {step_rad:.1e} rad")
     cam_from_lab = Rotation.from_quat(quaternion_xyzw(R_cam_from_lab))
-    return lever.cam_from_body.inv() * cam_from_lab, ratio, covariance_cam
+    return lever.body_from_cam * cam_from_lab, ratio, covariance_cam
 
 
 @jit
@@ -205,5 +205,5 @@ def tangent_jacobian(b: Floats, q: Floats) -> Floats:
 
 def in_body_axes(covariance_cam: np.ndarray, lever: Lever) -> Floats:
     """Return a (3, 3) covariance of a small rotation in body axes, from one in camera axes: R P R^T."""
-    R_body_from_cam = lever.cam_from_body.inv().as_matrix()
+    R_body_from_cam = lever.body_from_cam.as_matrix()
     return R_body_from_cam @ covariance_cam @ R_body_from_cam.T

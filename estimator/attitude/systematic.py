@@ -181,10 +181,8 @@ def with_focal_error(
     seen_cam: Floats,
     sigma_rad: Floats,
     noise_px2: Floats,
-) -> tuple[Floats, Floats | None]:
+) -> tuple[Floats, Floats]:
     """Return the (3, 3) covariance of an attitude with the focal length's error as common to all stars, and its part.
-
-    The second is None if the focal length is known exactly.
 
     Parameters
     ----------
@@ -197,8 +195,6 @@ def with_focal_error(
     noise_px2
         (K,) variances of the frame's noise alone
     """
-    if not camera.focal_sigma:
-        return covariance_rad2, None
     view = geometry(seen_cam, seen_cam)
     # The limit guards against rounding.
     noise_rad2 = np.maximum(noise_px2 / camera.focal_px**2, (0.01 * sigma_rad) ** 2)

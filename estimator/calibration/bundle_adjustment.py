@@ -7,7 +7,7 @@ residuals (p_measured - p) / sigma by Levenberg-Marquardt:
 
 1. Linearize: residuals e and Jacobian J by lights, rotations, lever and lens (`linearize`).
 2. Sum the normal equations J^T W J d = J^T W e, with Cauchy's weights W, which down-weight wrong identifications, and
-   with the priors (`normal_equations`).
+   with the priors (`Bundle.equations`).
 3. Damp the diagonal and eliminate the lights (`eliminate_lights`). Lights are coupled to one another only through
    frames, so each light's 3 x 3 block is eliminated by the Schur complement, and a dense system of frames, lever and
    lens remains (Triggs et al. 2000, Bundle adjustment: a modern synthesis, section 6).
@@ -24,8 +24,9 @@ with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduce
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -35,7 +36,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.rotation_fit import tangent_gradients
 from estimator.core.camera import Camera, distorted, distortion_slopes
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 
 # Newton decrement g^T N^-1 g at convergence: the squared step in standard deviations. It is small enough for a
 # relative accuracy of 1e-9 in lengths.
@@ -47,7 +48,7 @@ EXACT = 1e-6
 MEDIAN_RADIUS = np.sqrt(2 * np.log(2))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sightings:
     """Observations of M lights in all frames.
 
@@ -65,6 +66,22 @@ class Sightings:
     led: Ints
     xy_px: Floats
     sigma_px: Floats
+
+    @classmethod
+    def of(cls, frames: Sequence[Any], led: Ints) -> Sightings:
+        """Return the sightings in frames with `xy_px` and `sigma_px`; led: (M,) rows of their lights."""
+        frame = np.repeat(np.arange(len(frames)), [len(one.xy_px) for one in frames])
+        xy_px, sigma_px = (
+            np.concatenate([getattr(one, name) for one in frames])
+            for name in ("xy_px", "sigma_px")
+        )
+        return cls(frame, led, xy_px, sigma_px)
+
+    @property
+    def in_frames(self) -> Ints:
+        """(M, 2) frame of each sighting and its number in the frame, where the frames are in order."""
+        first = np.searchsorted(self.frame, self.frame)
+        return np.column_stack([self.frame, np.arange(len(self.frame)) - first])
 
     def take(self, which: np.ndarray) -> Sightings:
         """Select sightings by mask or index."""
@@ -109,7 +126,7 @@ class Assumed(NamedTuple):
         return np.array([lever_m, lever_m, lever_m, focal_px]) ** -2.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Bundle:
     """Parameters of the model, on which the pixels depend, and their priors.
 
@@ -176,8 +193,44 @@ class Bundle:
         return loss, weight
 
     def equations(self, sightings: Sightings, weight: Floats) -> NormalEquations:
-        """Return the `normal_equations`; the lights are the unknowns in separate blocks."""
-        return normal_equations(self, sightings, weight)
+        """Return the normal equations: J^T W J and J^T W e of the pixels, plus the priors.
+
+        The lights are the unknowns in separate blocks.
+        A prior x ~ N(x_0, sigma^2) adds 1 / sigma^2 to the diagonal and (x_0 - x) / sigma^2 to the right-hand side.
+
+        Parameters
+        ----------
+        weight
+            (M,) robust weight W of each sighting
+        """
+        # Steps 1 and 2 of the module. Rows of the Jacobian and residuals are multiplied by the root of the weight.
+        terms = linearize(self, sightings)
+        root = np.sqrt(weight)[:, None, None]
+        count = len(weight)
+        frames = len(self.R_body_from_lab)
+        lights = len(self.position_m)
+        by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
+        by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
+        shared = (terms.by_shared * root).reshape(2 * count, -1)
+        by_rest = hstack([by_rotation, csr_array(shared)], format="csr")
+        residual = (terms.residual * root[:, 0]).ravel()
+        # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
+        products = np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
+        blocks = summed(products, sightings.led, lights)
+        rest = (by_rest.T @ by_rest).toarray()
+        rhs_rest = by_rest.T @ residual
+        # Prior of the map
+        blocks += np.eye(3) / self.map_sigma_m**2
+        from_map = (self.map_m - self.position_m).ravel() / self.map_sigma_m**2
+        # Prior of lever and focal length, which follow the rotations
+        if self.assumed:
+            known = 3 * frames + np.arange(4)
+            rest[known, known] += self.assumed.weight
+            rhs_rest[known] += self.assumed.weight * self.assumed.less(self)
+        coupling = csr_array(by_rest.T @ by_led)
+        return NormalEquations(
+            blocks, coupling, rest, by_led.T @ residual + from_map, rhs_rest
+        )
 
     def apply_step(self, led: Floats, rest: Floats) -> Bundle:
         """Return the bundle after a step.
@@ -299,44 +352,6 @@ class NormalEquations(NamedTuple):
     rhs_rest: Floats
 
 
-def normal_equations(bundle: Bundle, sightings: Sightings, weight: Floats) -> NormalEquations:
-    """Return the normal equations: J^T W J and J^T W e of the pixels, plus the priors.
-
-    A prior x ~ N(x_0, sigma^2) adds 1 / sigma^2 to the diagonal and (x_0 - x) / sigma^2 to the right-hand side.
-
-    Parameters
-    ----------
-    weight
-        (M,) robust weight W of each sighting
-    """
-    # Steps 1 and 2 of the module. Rows of the Jacobian and residuals are multiplied by the root of the weight.
-    terms = linearize(bundle, sightings)
-    root = np.sqrt(weight)[:, None, None]
-    count = len(weight)
-    frames = len(bundle.R_body_from_lab)
-    lights = len(bundle.position_m)
-    by_led = _block_matrix(terms.by_led * root, sightings.led, 3 * lights)
-    by_rotation = _block_matrix(terms.by_rotation * root, sightings.frame, 3 * frames)
-    shared = (terms.by_shared * root).reshape(2 * count, -1)
-    by_rest = hstack([by_rotation, csr_array(shared)], format="csr")
-    residual = (terms.residual * root[:, 0]).ravel()
-    # The lights' own normal matrix is block diagonal, so that only its blocks are accumulated.
-    products = np.einsum("mai,maj->mij", terms.by_led, terms.by_led) * root**2
-    blocks = summed(products, sightings.led, lights)
-    rest = (by_rest.T @ by_rest).toarray()
-    rhs_rest = by_rest.T @ residual
-    # Prior of the map
-    blocks += np.eye(3) / bundle.map_sigma_m**2
-    from_map = (bundle.map_m - bundle.position_m).ravel() / bundle.map_sigma_m**2
-    # Prior of lever and focal length, which follow the rotations
-    if bundle.assumed:
-        known = 3 * frames + np.arange(4)
-        rest[known, known] += bundle.assumed.weight
-        rhs_rest[known] += bundle.assumed.weight * bundle.assumed.less(bundle)
-    coupling = csr_array(by_rest.T @ by_led)
-    return NormalEquations(blocks, coupling, rest, by_led.T @ residual + from_map, rhs_rest)
-
-
 def summed(parts: Floats, row: Ints, count: int) -> Floats:
     """Return the (count, ...) sums of the (M, ...) parts that belong to each row."""
     total = np.zeros((count, *parts.shape[1:]))
@@ -430,10 +445,10 @@ def robust_scale(bundle: Bundle, sightings: Sightings) -> float:
 
 def adjust(
     bundle: Bundle, sightings: Sightings, width: float, decrement: float = DECREMENT
-) -> tuple[Bundle, bool]:
-    """Minimize the loss over all unknowns by Levenberg-Marquardt; return the bundle and whether it converged.
+) -> tuple[Bundle, str]:
+    """Minimize the loss over all unknowns by Levenberg-Marquardt; return the bundle and the status of the fit.
 
-    The numbered steps are those of the module.
+    The status is "converged", or "stopped ..." without convergence. The numbered steps are those of the module.
 
     Parameters
     ----------
@@ -470,13 +485,13 @@ def adjust(
             damping = max(damping / 10, 1e-12)
             # 6. Convergence
             if slope < decrement:
-                return bundle, True
+                return bundle, "converged"
             terms = bundle.equations(sightings, new_weight)
         else:
             damping *= 10
             if damping > 1e12:
                 break
-    return bundle, False
+    return bundle, f"stopped after {STEPS} steps without convergence"
 
 
 def attitude_equations(

@@ -27,14 +27,14 @@ then wrong by about 0.1 percent, whatever the number of lights. The start map co
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map
+from estimator.attitude.dome_map import LedMap, Lever, check_lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
@@ -42,7 +42,7 @@ from estimator.calibration.bundle_covariance import Covariances
 from estimator.calibration.survey_subset import Subset, connected_subset
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
@@ -55,7 +55,7 @@ NOISE_ROUNDS = 8
 NOISE_TOLERANCE = 0.01
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeFrame:
     """One frame of a survey: identified LEDs and their centroids.
 
@@ -78,7 +78,7 @@ class DomeFrame:
     body_from_lab: Rotation
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeSurvey:
     """Result of a dome survey.
 
@@ -207,7 +207,6 @@ def survey(
         raise ValueError(f"survey: leds_sigma_m is {leds_sigma_m}; allowed: finite, above 0")
     checks.each_of_type("survey: frames", frames, DomeFrame)
     checks.of_type("survey: camera_start", camera_start, Camera)
-    check_map(leds_start)
     check_lever(leds_start, lever_start)
     sightings = _collect(frames, len(leds_start.position_m))
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
@@ -215,8 +214,7 @@ def survey(
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
     fit = _fit(start, sightings, fit_noise)
     # The frame, and the row in it, of each rejected sighting.
-    row = np.concatenate([np.arange(len(frame.led)) for frame in frames])
-    outliers = np.column_stack([sightings.frame, row])[~fit.keep]
+    outliers = sightings.in_frames[~fit.keep]
     return _report(fit, start, outliers, leds_start, camera_start)
 
 
@@ -225,7 +223,7 @@ class _Fit(NamedTuple):
 
     subset: Subset
     keep: np.ndarray
-    converged: bool
+    status: str
     covariances: Covariances
     misfit: float
     noise_scale: float
@@ -252,7 +250,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             scaled = replace(
                 subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index]
             )
-            fitted, converged = ba.adjust(subset.bundle, scaled, np.inf)
+            fitted, status = ba.adjust(subset.bundle, scaled, np.inf)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 4. Covariances, misfit, and noise
             covariances = bundle_covariance.covariance(subset.terms, fitted)
@@ -270,7 +268,7 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
-    return _Fit(subset, keep, converged, covariances, misfit, scale, common)
+    return _Fit(subset, keep, status, covariances, misfit, scale, common)
 
 
 def _misfit(subset: Subset, covariances: Covariances) -> float:
@@ -326,12 +324,8 @@ def _collect(frames: Sequence[DomeFrame], lights: int) -> Sightings:
             raise ValueError(
                 f"survey: frame {k} has a pixel that is not finite or a sigma_px not above 0"
             )
-    return Sightings(
-        np.repeat(np.arange(len(frames)), [len(frame.led) for frame in frames]),
-        np.concatenate([frame.led for frame in frames]).astype(np.int64),
-        np.concatenate([frame.xy_px for frame in frames]),
-        np.concatenate([frame.sigma_px for frame in frames]),
-    )
+    led = np.concatenate([frame.led for frame in frames]).astype(np.int64)
+    return Sightings.of(frames, led)
 
 
 def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, np.ndarray]:
@@ -388,11 +382,6 @@ def _report(
     fit: _Fit, start: Bundle, outliers: Ints, leds: LedMap, camera: Camera
 ) -> DomeSurvey:
     """Return the survey's result: the fitted subset in the full set of lights and frames."""
-    status = (
-        "converged"
-        if fit.converged
-        else f"stopped after {ba.STEPS} steps without convergence"
-    )
     subset = fit.subset
     full = subset.insert_into(start, subset.bundle)
     lights = len(full.position_m)
@@ -410,7 +399,7 @@ def _report(
     common_m[:, subset.led], by_camera = fit.common
     common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
     return DomeSurvey(
-        status,
+        fit.status,
         replace(leds, position_m=full.position_m),
         surveyed,
         Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),

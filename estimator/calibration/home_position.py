@@ -11,7 +11,6 @@ takes these steps:
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,12 +21,12 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.bundle_adjustment import summed
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sighting:
     """One frame with identified lights.
 
@@ -53,7 +52,7 @@ class Sighting:
     brightness: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class HomeCatalog:
     """LED catalog about the bearing, in the lab frame, brightest first (section 3.6.4).
 
@@ -108,7 +107,7 @@ def body_positions(xy_px: Floats, camera: Camera, surface: LedMap, lever: Lever)
         If eq. 44 has no root.
     """
     point_cam, _ = thesis_points(camera.rays(xy_px), surface, lever)
-    return lever.cam_from_body.inv().apply(point_cam) + lever.camera_body_m
+    return lever.body_from_cam.apply(point_cam) + lever.camera_body_m
 
 
 def separation_rad(first: Floats, second: Floats) -> Floats:

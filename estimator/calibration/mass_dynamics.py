@@ -28,13 +28,13 @@ Arrays have their components first, (3, B) for B motions. `transition` integrate
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 
 # Measurements of a motion on an air bearing, assumptions, and the parameters that are estimated.
@@ -51,7 +51,7 @@ TRIANGLE = ((0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2))
 MIN_ATTITUDES = 4
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BearingRecord:
     """One motion without contact: attitudes of the star tracker, and momenta of the wheels from their speeds.
 
@@ -123,7 +123,7 @@ class BearingRecord:
         return replace(self, covariance_rad2=self.covariance_rad2 + added)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LabConstants:
     """Known constants of the lab and of the wheels.
 
@@ -152,7 +152,7 @@ class LabConstants:
     wheel_sigma_nms: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Prior:
     """Prior values of the parameters, (P,), and their standard deviations.
 
@@ -172,7 +172,7 @@ class Prior:
             )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MassEstimate:
     """The nine mass properties with their covariance, and the other parameters.
 

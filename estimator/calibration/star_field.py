@@ -21,7 +21,7 @@ by the square of the field angle, and k2 and k3 resemble k1 over a narrow field.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -39,7 +39,7 @@ from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
@@ -52,7 +52,7 @@ CALIBRATION_ROUNDS = 8  # greatest number of rounds of self_calibrate
 MIN_STAR_FRACTION = 0.9
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StarFrame:
     """Identified stars of one frame.
 
@@ -79,7 +79,7 @@ class StarFrame:
     exposure_s: float = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LensPrior:
     """Prior standard deviations of the lens parameters about the start camera.
 
@@ -106,7 +106,7 @@ class LensPrior:
         return np.array([np.inf, center, center, k1, k1 / r**2, p, p, k1 / r**4])
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FieldReport:
     """Diagnostics of a calibration.
 
@@ -171,12 +171,10 @@ def calibrate(
     checks.of_type("calibrate: camera_start", camera_start, Camera)
     checks.of_type("calibrate: prior", prior, LensPrior)
     sightings = _collect(frames)
-    row = np.concatenate([np.arange(len(frame.xy_px)) for frame in frames])
-    counts = np.array([len(frame.xy_px) for frame in frames])
     vectors = np.concatenate([frame.vectors_ref for frame in frames])
     # 1. Start attitudes
     fit = _start(sightings, vectors, camera_start, prior, len(frames))
-    enough = counts[sightings.frame] >= LEAST_STARS
+    enough = np.bincount(sightings.frame)[sightings.frame] >= LEAST_STARS
     used = sightings.take(enough)
     _check_enough(used)
     try:
@@ -190,19 +188,14 @@ def calibrate(
         # 4. Wrong identifications
         distance = np.linalg.norm(ba.residuals(fit, sightings), axis=1)
         keep = enough & (distance < GATE * ba.robust_scale(fit, used))
-        outliers = np.column_stack([sightings.frame, row])[~keep & enough]
+        outliers = sightings.in_frames[~keep & enough]
         tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
         keep &= tied[sightings.frame]
         # 5. Least squares
         used = sightings.take(keep)
         _check_enough(used)
-        fit, converged = ba.adjust(fit, used, np.inf)
+        fit, status = ba.adjust(fit, used, np.inf)
         # 6. Covariance and diagnostics
-        status = (
-            "converged"
-            if converged
-            else f"stopped after {ba.STEPS} steps without convergence"
-        )
         return _report(status, fit, used, tied, outliers, keep, frames, camera_start)
     except LinAlgError:
         raise ValueError(
@@ -280,7 +273,7 @@ def self_calibrate(
     return best
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class _StarBundle(Bundle):
     """Bundle with the stars as lights at distance 1, whose unknowns in separate blocks are the attitudes.
 
@@ -339,13 +332,7 @@ def _collect(frames: Sequence[StarFrame]) -> Sightings:
             raise ValueError(
                 f"calibrate: frame {k} has a pixel or direction that is not finite or a sigma_px not above 0"
             )
-    counts = [len(frame.xy_px) for frame in frames]
-    return Sightings(
-        np.repeat(np.arange(len(frames)), counts),
-        np.arange(sum(counts)),
-        np.concatenate([frame.xy_px for frame in frames]),
-        np.concatenate([frame.sigma_px for frame in frames]),
-    )
+    return Sightings.of(frames, np.arange(sum(len(frame.xy_px) for frame in frames)))
 
 
 def _check_enough(sightings: Sightings) -> None:

@@ -10,8 +10,6 @@ A fault is reported only if chance would make it in fewer than FALSE_ALARMS surv
 together (Bonferroni: each of N LEDs is tested at FALSE_ALARMS / N).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
@@ -21,7 +19,7 @@ from scipy.special import gammainccinv
 from estimator.attitude.dome_map import LedMap, Lever, on_surface, project
 from estimator.catalog.catalog import close_groups
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.vectors import normalized
 
@@ -38,7 +36,7 @@ CHANCE = 0.02
 FORBIDDEN = 1e7  # cost of a name that is not allowed
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class HeldFrames:
     """Attitudes of a survey's F frames, and the model that it found."""
 
@@ -79,12 +77,12 @@ class HeldFrames:
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
         """Return the (M, 3) origins and unit directions, in the lab, of the rays to pixels (M, 2) of frames (M,)."""
         lab_from_body = self.body_from_lab[frame].inv()
-        rays_body = self.lever.cam_from_body.inv().apply(self.camera.rays(xy_px))
+        rays_body = self.lever.body_from_cam.apply(self.camera.rays(xy_px))
         origins = lab_from_body.apply(np.tile(self.lever.camera_body_m, (len(frame), 1)))
         return origins, lab_from_body.apply(rays_body)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StrayLight:
     """A light at rest in the lab where no LED is expected.
 
@@ -138,7 +136,7 @@ def displaced(list_m: Floats, found_m: Floats, covariance_m2: Floats) -> tuple[I
         (N, 3, 3) covariance of the positions found; NaN for LEDs that are not measured
     """
     # 1. Squared distances along the axes of each covariance
-    rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    rows = _measured(covariance_m2)
     if not len(rows):
         return rows, 0.0
     eigenvalue, axes = np.linalg.eigh(covariance_m2[rows])
@@ -171,9 +169,14 @@ def found_displacements_m(covariance_m2: Floats, sigma_m: float) -> Floats:
     covariance_m2, sigma_m
         As of `displaced`: covariances, NaN for LEDs that are not measured, and the list's error s
     """
-    measured = covariance_m2[np.isfinite(covariance_m2).all(axis=(1, 2))]
+    measured = covariance_m2[_measured(covariance_m2)]
     greatest_m2 = np.linalg.eigvalsh(measured)[:, 2] + sigma_m**2
     return (np.sqrt(_limit(len(measured))) + 1.645) * np.sqrt(greatest_m2)
+
+
+def _measured(covariance_m2: Floats) -> Ints:
+    """Return the rows of the lights with a covariance."""
+    return np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
 
 
 def _limit(count: int) -> float:
@@ -293,7 +296,7 @@ def name_strays(
     return list(zip(leds, columns[inside].tolist(), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LightTable:
     """Light of a survey's LEDs in its frames.
 
@@ -313,7 +316,7 @@ class LightTable:
     expected: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Exchange:
     """An LED that shines at the place of another one.
 
@@ -396,7 +399,7 @@ def names(
         (N, 3), (N, 3) and (N, 3, 3) positions in the list, as found, and their covariance, as of
         `displaced`
     """
-    rows = np.flatnonzero(np.isfinite(covariance_m2).all(axis=(1, 2)))
+    rows = _measured(covariance_m2)
     if not len(rows):
         return rows, rows
     # 1. Error of the list

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.dome_map import LedMap, Lever, check_lever, check_map, project
+from estimator.attitude.dome_map import LedMap, Lever, check_lever, project
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints, frozen
 
 MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
@@ -33,7 +33,7 @@ PLANNED_RAD = 1.7 * CONNECTING_RAD
 ATTITUDE_SIGMA_RAD = 0.05
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SurveyModel:
     """Model that is assumed before a survey, or known from the frames taken so far.
 
@@ -62,7 +62,6 @@ class SurveyModel:
     fit_distortion: bool = False
 
     def __post_init__(self) -> None:
-        check_map(self.leds)
         check_lever(self.leds, self.lever)
         for name in ("sigma_px", "leds_sigma_m"):
             if not 0 < getattr(self, name) < np.inf:
@@ -84,7 +83,7 @@ class SurveyModel:
         return np.array(rows)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SurveyAccuracy:
     """Standard deviations that a survey leaves, or will leave.
 

@@ -1,13 +1,13 @@
 """Connected subset of a dome survey: the lights and frames that the sightings determine."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_array
 
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Bundle, Sightings
-from estimator.core.checks import Ints
+from estimator.core.checks import Ints, frozen
 from estimator.core.vectors import normalized
 
 # Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
@@ -16,7 +16,7 @@ CROSSING_RAD = 0.005
 CONNECTING_RAD = 2 * CROSSING_RAD
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Subset:
     """Connected subset of lights, frames and sightings, renumbered from 0.
 
@@ -37,7 +37,7 @@ class Subset:
     @property
     def terms(self) -> ba.NormalEquations:
         """Normal equations of its least-squares fit."""
-        return ba.normal_equations(self.bundle, self.sightings, np.ones(len(self.index)))
+        return self.bundle.equations(self.sightings, np.ones(len(self.index)))
 
     def insert_into(self, full: Bundle, fitted: Bundle) -> Bundle:
         """Return the full bundle with the adjusted values of this subset inserted."""

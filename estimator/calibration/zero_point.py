@@ -4,17 +4,15 @@ The instrumental magnitude of a star is -2.5 log10(flux / exposure). Its differe
 point plus the star's color term, which is unknown but constant.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, frozen
 from estimator.core.constants import SIGMA_PER_MAD
 from estimator.core.errors import ImageError
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MagnitudeZero:
     """Zero point: median over the stars of V minus the instrumental magnitude -2.5 log10(flux / exposure).
 

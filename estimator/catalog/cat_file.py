@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.catalog.catalog import StarCatalog
+from estimator.catalog.catalog import StarCatalog, from_angles
 from estimator.catalog.published_catalogs import BYTES_PER_ENTRY, OnBoard
-from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 
 HEADER = np.dtype([("magic", "S12"), ("epoch_milliyear", "<u4"), ("entries", "<u4")])
@@ -79,11 +78,7 @@ def read(path: str | Path) -> OnBoard:
     damaged = np.flatnonzero(_word_sums(entries) % 2**16)
     if len(damaged):
         raise _not_cat(path, f"wrong checksum of entry {damaged[0]}")
-    ra = entries["ra"] / UNITS_RAD
-    dec = entries["dec"] / UNITS_RAD
-    vectors: Floats = np.column_stack(
-        [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
-    )
+    vectors = from_angles(entries["ra"] / UNITS_RAD, entries["dec"] / UNITS_RAD)
     return OnBoard(
         entries["id"].astype(np.int64),
         vectors,

@@ -10,7 +10,7 @@ import datetime
 import functools
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from estimator.core import checks
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import (
     DAY_S,
     J2000,
@@ -36,7 +36,7 @@ from estimator.core.vectors import normalized
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StarCatalog:
     """Stars as given in the file, at its epoch in the ICRS, brightest first.
 
@@ -130,7 +130,7 @@ class StarCatalog:
 
     def take(self, which: NDArray) -> StarCatalog:
         """Select stars by mask or index."""
-        columns = [name for name in self.__slots__ if name != "epoch_yr"]
+        columns = [name for name in self.__dataclass_fields__ if name != "epoch_yr"]
         return replace(self, **{name: getattr(self, name)[which] for name in columns})
 
     def brightest_first(self) -> StarCatalog:
@@ -138,7 +138,7 @@ class StarCatalog:
         return self.take(np.argsort(self.v_mag, kind="stable"))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Observer:
     """State of the observer, barycentric, in ICRS axes.
 
@@ -412,13 +412,20 @@ def from_columns(
     sa = np.sin(ra_rad)
     ca = np.cos(ra_rad)
     sd = np.sin(dec_rad)
-    cd = np.cos(dec_rad)
-    vectors = np.column_stack([cd * ca, cd * sa, sd])
+    vectors = from_angles(ra_rad, dec_rad)
     east = np.column_stack([-sa, ca, np.zeros_like(sa)])
-    north = np.column_stack([-sd * ca, -sd * sa, cd])
+    north = np.column_stack([-sd * ca, -sd * sa, np.cos(dec_rad)])
     drift = MAS_RAD * (pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north)
     parallax_rad = MAS_RAD * parallax_mas
     return StarCatalog(hip.astype(np.int64), vectors, drift, parallax_rad, v_mag, epoch_yr)
+
+
+def from_angles(east_rad: Floats | float, north_rad: Floats | float) -> Floats:
+    """Return the (..., 3) unit vectors at angles east along the equator and north of it."""
+    cosine = np.cos(north_rad)
+    return np.stack(
+        [cosine * np.cos(east_rad), cosine * np.sin(east_rad), np.sin(north_rad)], axis=-1
+    )
 
 
 def at_epoch(stars: StarCatalog, epoch_yr: float) -> Floats:

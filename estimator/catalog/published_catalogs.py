@@ -20,7 +20,6 @@ thinning).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 from estimator.catalog import catalog, sky_index
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import Cells, within
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.vectors import normalized
@@ -51,7 +50,7 @@ class Color(NamedTuple):
     v_i: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class OnBoard:
     """A catalog at one epoch, as a tracker stores it.
 

@@ -9,15 +9,15 @@ low-precision sidereal time and precession; the simulator integrates the refract
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.catalog.catalog import days_after_j2000, utc
+from estimator.catalog.catalog import days_after_j2000, from_angles, utc
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats
+from estimator.core.checks import Allowed, Floats, frozen
 from estimator.core.constants import (
     ARCSEC_RAD,
     DAY_S,
@@ -42,7 +42,7 @@ NUMBERS = {
 RAISING_STEPS = 6  # iterations of `raised`
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SiteAir:
     """The air over a site, as a tracker there knows it.
 
@@ -112,13 +112,7 @@ def zenith_icrs(days: float, latitude_rad: float, longitude_rad: float) -> Float
     # Zenith in the mean equator of date.
     sidereal_deg = 280.46061837 + 360.98564736629 * days + 0.000387933 * centuries**2
     hour = np.radians(sidereal_deg % 360) + longitude_rad
-    of_date = np.array(
-        [
-            np.cos(latitude_rad) * np.cos(hour),
-            np.cos(latitude_rad) * np.sin(hour),
-            np.sin(latitude_rad),
-        ]
-    )
+    of_date = from_angles(hour, latitude_rad)
     # Precession from the equator of date to that of J2000.0.
     zeta, z, theta = ARCSEC_RAD * np.array(
         [

@@ -10,12 +10,12 @@ length f in pixels along x, the aspect a, the principal point c and the distorte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Allowed, Floats
+from estimator.core.checks import Allowed, Floats, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -39,7 +39,7 @@ NUMBERS = {
 _FIELDS = f"fov_deg from {NARROWEST_DEG} to {math.degrees(WIDEST_RAD):.0f}, or fov_rad above 0 to {WIDEST_RAD}"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Camera:
     """A pinhole with Brown-Conrady distortion, in camera axes +x right, +y down, +z boresight.
 

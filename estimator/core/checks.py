@@ -7,8 +7,9 @@ array, or an int in place of a float, would cause a compilation of seconds.
 
 import difflib
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -20,6 +21,13 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Step = tuple[float, float]  # (dx, dy) in pixels
+Kind = TypeVar("Kind")
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def frozen(kind: type[Kind]) -> type[Kind]:
+    """Return the class as a dataclass whose objects have its fields only, and cannot be changed."""
+    return dataclass(frozen=True, slots=True)(kind)
 
 
 def known(what: str, name: object, allowed: Iterable[str]) -> None:

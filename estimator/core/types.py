@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -25,7 +25,7 @@ PRIORS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FramePriors:
     """Prior information about a frame, known before it is processed.
 
@@ -65,7 +65,7 @@ class FramePriors:
 NO_PRIORS = FramePriors()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class RateEstimate:
     """Angular rate of the camera, with its error.
 
@@ -104,7 +104,7 @@ class RateEstimate:
 SIGN_CHI2 = 16.0  # least difference of the chi-squares of both signs of a rate that determines the sign
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Background:
     """Sky level and noise of an image, on a coarse grid of tile centers.
 
@@ -122,7 +122,7 @@ class Background:
     tile_px: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Blobs:
     """Connected pixels above the threshold, brightest first.
 
@@ -183,7 +183,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Centroids:
     """Measured positions of the blobs, brightest first: the search begins with the first ones.
 
@@ -237,7 +237,11 @@ class Centroids:
                 )
 
     def check_values(self) -> None:
-        """Raise ImageError unless positions are finite, sigmas in range and fluxes above 0; it takes a microsecond."""
+        """Raise ImageError unless positions are finite, sigmas in range and fluxes above 0; it takes a microsecond.
+
+        The trackers call it for any object, `Centroids.check_values(centroids)`, and it refuses all other types.
+        """
+        checks.of_type("centroids", self, Centroids)
         spread = self.covariance_px2
         row, fault = _first_fault(
             self.xy_px, self.sigma_px, self.flux, NO_SPREAD if spread is None else spread
@@ -257,7 +261,7 @@ class Centroids:
 
     def take(self, which: NDArray) -> Centroids:
         """Select centroids by mask or index."""
-        arrays = {name: getattr(self, name) for name in self.__slots__}
+        arrays = {name: getattr(self, name) for name in self.__dataclass_fields__}
         taken = {name: one[which] for name, one in arrays.items() if one is not None}
         return replace(self, **taken)
 
@@ -301,7 +305,7 @@ def _first_fault(
     return 0, 0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StarMatch:
     """Correspondence between centroids and catalog stars.
 
@@ -326,7 +330,7 @@ class StarMatch:
     v_mag: Floats | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Attitude:
     """The tracker's solution, or the reason why there is none.
 
@@ -391,7 +395,7 @@ class Attitude:
         return float(ra), float(dec), float(roll)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FilterState:
     """State estimate of the attitude filter at one time.
 

@@ -170,9 +170,7 @@ def _local(
 ) -> Blobs:
     """Detect blobs `threshold_sigma` above the local sky, or one for the frame, after a 3x3 binomial filter."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
-    sky = estimate_background(image)
-    if flat:
-        sky = flat_background(sky, image.shape)
+    sky = flat_background(image) if flat else estimate_background(image)
     return detect_blobs(image, sky, threshold_sigma * sky.noise, min_area_px, max_blobs)
 
 
@@ -212,7 +210,7 @@ def thesis(
                 f"pixels of type {pixel} have no full scale; allowed: unsigned integers, or a known saturation"
             )
         full_scale = float(np.iinfo(pixel).max)
-    flat = flat_background(estimate_background(image), image.shape)
+    flat = flat_background(image)
     threshold = priors.intensity_threshold * full_scale
     if flat.level[0, 0] >= threshold:
         raise ImageError(
@@ -236,7 +234,7 @@ def _scan(
     """Run one of SHEFEX's scans and convert its table to Blobs."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
     # One level for the frame, and the noise of a raw pixel
-    flat = flat_background(estimate_background(image), image.shape)
+    flat = flat_background(image)
     level = float(flat.level[0, 0])
     noise = float(flat.noise[0, 0]) / FILTERED_NOISE
     boxes, sums = scan(image, level, level + threshold_sigma * noise, min_area_px, max_blobs)
@@ -391,11 +389,12 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     return repaired
 
 
-def flat_background(background: Background, shape: tuple[int, ...]) -> Background:
+def flat_background(image: NDArray) -> Background:
     """Return one level and noise for the whole frame: the medians over the tiles."""
+    background = estimate_background(image)
     level = median(background.level)
     noise = median(background.noise)
-    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(shape))
+    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(image.shape))
 
 
 def detect_blobs(

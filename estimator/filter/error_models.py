@@ -1,14 +1,15 @@
 """Error models of the gyro, of the star tracker, and of jumps. A standard deviation of 0 removes its state."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 
 from estimator.core import checks
+from estimator.core.checks import frozen
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class GyroModel:
     """Error model of a gyro, the same for each axis: measured rate = (I + M) rate + bias + white noise.
 
@@ -55,7 +56,7 @@ class GyroModel:
         _check(self, "gyro", above_0=("bias_time_s", "limit_rad_s"))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TrackerModel:
     """Errors that successive solutions of a star tracker share: they do not average out.
 
@@ -95,7 +96,7 @@ class TrackerModel:
             raise ValueError("tracker: mounting_drift_rad_sqrt_s needs mounting_rad above 0")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class JumpModel:
     """Probabilities of wrong solutions and of motions that a gyro misses, for `consistency.log_odds`; all `assumed`.
 

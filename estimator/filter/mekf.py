@@ -23,7 +23,6 @@ its discrete transition; Markley & Crassidis, Fundamentals of Spacecraft Attitud
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc, chdtri
 
 from estimator.core import checks
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, frozen
 from estimator.core.types import FilterState
 from estimator.filter.consistency import (
     CONFIRMATIONS,
@@ -68,7 +67,7 @@ HISTORY_S = 10.0
 ROUNDING_S = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Update:
     """Result of an update with a star tracker's solution.
 

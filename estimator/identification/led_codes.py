@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats, Ints
+from estimator.core.checks import Allowed, Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import Centroids
@@ -41,7 +41,7 @@ LIKELY = 40.0  # `likely`: greatest misfit in excess of the best word's
 PHASES_PER_BIT = 8  # phases that a free-running receiver tries
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LedCode:
     """The words of a dome's LEDs, as the tracker knows them.
 

@@ -4,17 +4,15 @@ The published methods need different things: a magnitude, a prior direction, a t
 keywords, of which each method uses some, so that one method can replace another.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 
 ACCEPTANCES = ("evidence", "thesis")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Options:
     """Keyword arguments of an identifier. A method ignores those that it does not use.
 

@@ -11,7 +11,7 @@ For each frame:
 A frame without enough bits, or whose lights contradict each other, has no attitude.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats
+from estimator.core.checks import Allowed, Floats, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
@@ -45,7 +45,7 @@ DECODER = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DecoderSettings:
     """Settings of the decoder.
 
@@ -154,8 +154,7 @@ class CodedTracker(DomeTracker):
         frame
             Number of the frame
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         clock = clock or Clock()
         exposure_s = exposure_s or 0.0
         # 2. Tracks

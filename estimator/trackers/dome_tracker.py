@@ -24,7 +24,6 @@ from estimator.attitude.dome_map import (
     LedMap,
     Lever,
     check_lever,
-    check_map,
     common_images_px,
     common_shifts_m,
     led_sigma_rad,
@@ -148,7 +147,7 @@ def assumed_directions(
     light i along its ray b_i depends on the attitude A, and follows from the surface at an assumed A.
     """
     lab_from_body = Rotation.from_euler("ZYX", assumed_deg[::-1], degrees=True)
-    lab_from_cam = lab_from_body * lever.cam_from_body.inv()
+    lab_from_cam = lab_from_body * lever.body_from_cam
     origin_m = lab_from_body.apply(lever.camera_body_m)
     points_m = on_surface(lab_from_cam.apply(rays_cam), origin_m, leds)
     return lab_from_cam.inv().apply(normalized(points_m))
@@ -198,7 +197,6 @@ class DomeTracker(FrameTracker):
             if getattr(settings, stage, "") == "default":
                 settings = replace(settings, **{stage: getattr(SETTINGS, stage)})
         check_algorithms(settings, IDENTIFIERS, SOLVERS)
-        check_map(leds)
         check_lever(leds, lever)
         self.camera = camera
         self.leds = leds
@@ -223,7 +221,7 @@ class DomeTracker(FrameTracker):
         position_m = self.leds.position_m
         for toward_m in position_m[:: max(len(position_m) // 40, 1)]:
             cam_from_lab, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [toward_m])
-            body_from_lab = self.lever.cam_from_body.inv() * cam_from_lab
+            body_from_lab = self.lever.body_from_cam * cam_from_lab
             xy_px = project(body_from_lab, position_m, self.lever, self.camera)
             fields.append(xy_px[self.camera.contains(xy_px, 2.0)])
         xy_px = max(fields, key=len)
@@ -244,8 +242,7 @@ class DomeTracker(FrameTracker):
         rate, exposure_s
             Rate and exposure time as in `solve`
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         clock = clock or Clock()
         lever_cam_m = self.lever.pupil_cam_m
         lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
@@ -296,7 +293,7 @@ class DomeTracker(FrameTracker):
         for _ in range(2):
             try:
                 tracker = tracker._with_fitted_focal(centroids, match)
-            except (ValueError, np.linalg.LinAlgError) as error:
+            except ValueError as error:
                 return Attitude(f"no attitude: {error}")
             attitude = tracker._solve_calibrated(centroids, match)
             if attitude.match is None:
@@ -311,7 +308,7 @@ class DomeTracker(FrameTracker):
         rays = self.camera.rays(centroids.xy_px[observed])
         pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
         sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
-        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         ratio = fit_focal_ratio(
             rays, sigma_rad, self.leds.position_m[star], self.lever, body_from_lab
         )
@@ -349,7 +346,7 @@ class DomeTracker(FrameTracker):
         """
         observed = match.observed
         star = match.star
-        body_from_lab = self.lever.cam_from_body.inv() * match.cam_from_ref
+        body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         rays = self.camera.rays(centroids.xy_px)
         pixel_rad = self._pixel_rad(centroids)
         # Matching radius: four standard deviations, at least 4 px
@@ -361,7 +358,12 @@ class DomeTracker(FrameTracker):
                 body_from_lab, _, _ = self._solve(
                     "rotation_only", rays, pixel_rad, observed, star, body_from_lab
                 )
-                observed, star = self._nearest(centroids, body_from_lab, factor * radius_px)
+                xy_px = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
+                # An LED whose center is just off the chip may still have light on it.
+                inside = np.flatnonzero(self.camera.contains(xy_px, -30.0))
+                observed, star = mutual_nearest(
+                    centroids.xy_px, xy_px[inside], factor * radius_px, inside
+                )
                 # The exact geometry must confirm as many matches as identification found.
                 if len(observed) < len(match.observed):
                     return Attitude(NO_MATCH)
@@ -374,7 +376,7 @@ class DomeTracker(FrameTracker):
             body_from_lab, covariance, sigma_rad = self._solve(
                 self.settings.solver, rays, pixel_rad, observed, star, body_from_lab
             )
-        except (ValueError, np.linalg.LinAlgError) as error:
+        except ValueError as error:
             return Attitude(f"no attitude: {error}")
         # 6. Covariance in camera axes
         cam_from_lab = self.lever.cam_from_body * body_from_lab
@@ -552,12 +554,3 @@ class DomeTracker(FrameTracker):
             seen, sigma_rad, position_m, self.leds, self.lever, body_from_lab
         )
         return *solved, sigma_rad
-
-    def _nearest(
-        self, centroids: Centroids, body_from_lab: Rotation, radius_px: float
-    ) -> tuple[NDArray, NDArray]:
-        """Return mutual nearest neighbors of centroids and LEDs within a radius: rows of both."""
-        xy = project(body_from_lab, self.leds.position_m, self.lever, self.camera)
-        # An LED whose center is just off the chip may still have light on it.
-        inside = np.flatnonzero(self.camera.contains(xy, -30.0))
-        return mutual_nearest(centroids.xy_px, xy[inside], radius_px, inside)

@@ -12,13 +12,12 @@ exposure. `no_stars`: there are fewer than four objects, too few to identify. A 
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core import checks
-from estimator.core.checks import Ints
+from estimator.core.checks import Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
@@ -29,7 +28,7 @@ CAMERA_LONGEST_S = 10.0
 INCREMENT_S = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Control:
     """Parameters of the control. The defaults are the paper's; it does not state mean_dn.
 
@@ -84,7 +83,7 @@ class Control:
             raise ValueError("exposure: mean_dn is NaN; allowed: a mean, inf for none")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Observation:
     """Measurements of one frame for the exposure control.
 
@@ -103,7 +102,7 @@ class Observation:
     overexposed: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class NextExposure:
     """Next exposure time, and the flags of the frame on which it is based."""
 

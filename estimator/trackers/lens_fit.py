@@ -28,7 +28,7 @@ s. The roll is therefore ambiguous by s, which is added to the covariance; beyon
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import exp
 
 import numpy as np
@@ -37,7 +37,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera, distorted, distortion_slopes
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, frozen
 from estimator.core.least_squares import variance_factor
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 
@@ -83,7 +83,7 @@ def prior_sigma(camera: Camera, focal_uncertainty: float) -> Floats:
     )
 
 
-@dataclass(frozen=True)
+@frozen
 class FittedCamera:
     """A fitted attitude and camera.
 
@@ -171,7 +171,7 @@ class FittedCamera:
         return keep
 
 
-@dataclass(frozen=True)
+@frozen
 class Sights:
     """Centroids and stars of a field.
 

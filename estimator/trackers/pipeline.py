@@ -16,7 +16,6 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from estimator.attitude.rate import center_streak_px, image_paths
 from estimator.centroiding.centroid import CENTROIDERS, known_streaks
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Allowed, Floats, Ints, Step
+from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
@@ -78,7 +77,7 @@ ALLOWED = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Settings:
     """Algorithm of each stage, and its parameters.
 
@@ -159,7 +158,7 @@ class Settings:
 
     def __new__(cls, *args: Any, **named: Any) -> Settings:
         for name in named:
-            checks.known("settings", name, cls.__slots__)
+            checks.known("settings", name, cls.__dataclass_fields__)
         return object.__new__(cls)
 
     @property
@@ -338,30 +337,6 @@ def inflate_uncertainty(centroids: Centroids, blobs: Blobs, settings: Settings) 
     )
 
 
-def process_frame(
-    image: NDArray,
-    camera: Camera,
-    settings: Settings,
-    solve: Callable[[Centroids, Clock], Attitude],
-    streak_px: Step | None = None,
-    rate: RateEstimate | None = None,
-    exposure_s: float | None = None,
-) -> Report:
-    """Process a frame through all stages: detect, centroid, then `solve`; return the report with timings.
-
-    Without streak_px, a rate of known sign and the exposure time give the streak and the turn.
-    """
-    clock = Clock()
-    turn_rad = 0.0
-    if streak_px is None and rate is not None and rate.sign_known and exposure_s is not None:
-        streak_px = center_streak_px(camera, rate, exposure_s)
-        turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
-    centroids = detect_and_centroid(
-        image, camera, settings, clock, streak_px, turn_rad, exposure_s
-    )
-    return Report(solve(centroids, clock), centroids, clock.seconds)
-
-
 class FrameTracker:
     """What the trackers do with a frame: detection and centroiding, then `solve_centroids` of each kind.
 
@@ -392,7 +367,8 @@ class FrameTracker:
         Parameters
         ----------
         streak_px
-            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or from `rate`
+            (dx, dy) by which lights move during the exposure, from the gyro; None: unknown, or from a rate of known
+            sign and the exposure time, which also give the turn
         rate
             Rate of the camera, from the gyro; None: with a rolling shutter it is estimated from the frame
         exposure_s
@@ -400,10 +376,18 @@ class FrameTracker:
         when
             Time `t_s` and number `frame` of the frame, as far as `solve_centroids` of the tracker takes them
         """
-        solve = partial(self.solve_centroids, rate=rate, exposure_s=exposure_s, **when)
-        return process_frame(
-            image, self.camera, self.settings, solve, streak_px, rate, exposure_s
+        clock = Clock()
+        turn_rad = 0.0
+        if streak_px is None and rate and rate.sign_known and exposure_s is not None:
+            streak_px = center_streak_px(self.camera, rate, exposure_s)
+            turn_rad = -float(rate.rate_rad_s[2]) * exposure_s
+        centroids = detect_and_centroid(
+            image, self.camera, self.settings, clock, streak_px, turn_rad, exposure_s
         )
+        attitude = self.solve_centroids(
+            centroids, clock, rate=rate, exposure_s=exposure_s, **when
+        )
+        return Report(attitude, centroids, clock.seconds)
 
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:

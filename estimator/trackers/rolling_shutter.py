@@ -1,6 +1,6 @@
 """Frames of a rolling shutter: move every light to the time of the middle row, and solve as a global shutter's frame.
 
-The rate of the camera moves the lights (`attitude.rate`). `solve_rolling` takes these steps:
+The rate of the camera moves the lights (`attitude.rate`). `solve_lights` takes these steps:
 
 1. Choose candidates of the rate (`candidates`): from a gyro; otherwise from the streaks, in both signs; without
    streaks a slow one, with an error that covers streaks too short to be measured.
@@ -82,26 +82,11 @@ def solve_lights(
     rate: RateEstimate | None,
     exposure_s: float | None,
 ) -> Attitude:
-    """Return attitude and rate by either shutter, or the refusal of too few lights; see `solve_rolling`."""
-    if len(centroids) < MIN_EVIDENCE_MATCHES:
-        return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
-    if camera.row_time_s:
-        return solve_rolling(camera, lights, centroids, solve_global, rate, exposure_s)
-    return with_streak_rate(solve_global(centroids), centroids, exposure_s, rate, lights)
+    """Return attitude and rate by either shutter, or the refusal of too few lights.
 
-
-def solve_rolling(
-    camera: Camera,
-    lights: Lights,
-    centroids: Centroids,
-    solve_global: Callable[[Centroids], Attitude],
-    rate: RateEstimate | None = None,
-    exposure_s: float | None = None,
-) -> Attitude:
-    """Return attitude and rate at the middle row of a rolling shutter; the last refusal if no candidate solves.
-
-    The numbered steps are those of the module. Where streaks leave the sign of the rate open, some stars may match with
-    the wrong one as well: both signs are tried, and the one with more evidence is kept.
+    With a rolling shutter they are those at the middle row, or the last refusal if no candidate solves. The numbered
+    steps are those of the module. Where streaks leave the sign of the rate open, some stars may match with the wrong
+    one as well: both signs are tried, and the one with more evidence is kept.
 
     Parameters
     ----------
@@ -112,6 +97,10 @@ def solve_rolling(
     exposure_s
         Exposure time; None: streaks do not determine the rate
     """
+    if len(centroids) < MIN_EVIDENCE_MATCHES:
+        return Attitude(NO_STARS if len(centroids) else NO_LIGHTS)
+    if not camera.row_time_s:
+        return with_streak_rate(solve_global(centroids), centroids, exposure_s, rate, lights)
     best: Attitude | None = None
     # 1. Candidates of the rate
     for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):

@@ -242,18 +242,17 @@ class StarTracker(FrameTracker):
         cam_from_ref, xy_px, light = self.rich_field()
         warm_up.run(self.camera, xy_px, light, dtype, self.solve)
         # Every error model of the search
-        clean = Centroids(xy_px, np.full(len(xy_px), 0.1), light)
+        sigma_px = np.full(len(xy_px), 0.1)
+        clean = Centroids(xy_px, sigma_px, light)
         for effort in range(self.efforts):
             self.solve_centroids(clean, effort=effort)
         # Residuals of two and of four standard deviations cause a new match and a new fit of the errors.
         for step_px in 0.2, 0.4:
             moved_px = xy_px + step_px * (-1.0) ** np.arange(len(xy_px))[:, None]
-            self.solve_centroids(Centroids(moved_px, np.full(len(xy_px), 0.1), light))
+            self.solve_centroids(replace(clean, xy_px=moved_px))
         # As many false lights as stars cause a test whether the camera model fits the field.
         xy_px = np.concatenate([xy_px, xy_px[:, ::-1]])
-        centroids = Centroids(
-            xy_px, np.full(len(xy_px), 0.1), np.concatenate([light, light / 2])
-        )
+        centroids = Centroids(xy_px, np.tile(sigma_px, 2), np.concatenate([light, light / 2]))
         self.solve_centroids(centroids)
         rows, _ = self.field_matcher.in_field(self.camera, cam_from_ref)
         self.solve_matches(centroids, np.arange(min(len(rows), 3)), rows[:3])
@@ -307,8 +306,7 @@ class StarTracker(FrameTracker):
                 exposure_s=exposure_s,
             )
             return solve_through_air(solve, self.camera, self.air, t_s, centroids)
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         if effort is not None:
             effort = checks.number(
                 "effort",
@@ -432,8 +430,7 @@ class StarTracker(FrameTracker):
         ImageError
             For rows outside of the centroids or stars.
         """
-        checks.of_type("centroids", centroids, Centroids)
-        centroids.check_values()
+        Centroids.check_values(centroids)
         observed = checks.row_numbers("observed", observed, len(centroids))
         star = checks.row_numbers("star", star, len(self.stars))
         if len(observed) != len(star):
@@ -519,9 +516,13 @@ class StarTracker(FrameTracker):
         most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
         lights = lights_of(centroids, camera.width_px, camera.height_px, most)
         attitude = self._identify_by_evidence(lights.centroids, searches, clock)
-        unnamed = names_scale and attitude.status in (BUDGET, FALSE_LIGHTS)
-        if unnamed and self._is_wrong_scale(lights.centroids):
-            return Attitude(WRONG_SCALE)
+        if names_scale and attitude.status in (BUDGET, FALSE_LIGHTS):
+            # A short search whose focal length is hardly known may find a decisive one out of range.
+            sigma_px = self.sigma_px(lights.centroids)
+            found, _ = self._search(lights.centroids, sigma_px, WRONG_SCALE_SEARCH)
+            is_decisive = found.dex >= star_search.DECISIVE_DEX
+            if is_decisive and abs(found.focal_ratio - 1) > self.focal_uncertainty:
+                return Attitude(WRONG_SCALE)
         attitude = self._with_rivals(attitude, lights.centroids, clock)
         if len(lights.rows) == len(centroids):
             return attitude
@@ -575,12 +576,6 @@ class StarTracker(FrameTracker):
         if status == NO_MATCH:
             status = BUDGET if np.isnan(solution.dex) else FALSE_LIGHTS
         return Attitude(status)
-
-    def _is_wrong_scale(self, centroids: Centroids) -> bool:
-        """Return whether a short search with a focal length that is hardly known finds a decisive one out of range."""
-        found, _ = self._search(centroids, self.sigma_px(centroids), WRONG_SCALE_SEARCH)
-        is_decisive = found.dex >= star_search.DECISIVE_DEX
-        return is_decisive and abs(found.focal_ratio - 1) > self.focal_uncertainty
 
     def _search(
         self, centroids: Centroids, sigma_px: Floats, model: SearchModel

@@ -20,7 +20,7 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
-from estimator.core.checks import Allowed, Floats, Step
+from estimator.core.checks import Allowed, Floats, Step, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.background import cleaned
@@ -93,7 +93,7 @@ class TrackedReport(Report):
     expected: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LastSolution:
     """The last attitude.
 
@@ -305,7 +305,8 @@ class TrackingMode:
         # 1. Detections
         tracker = self.tracker
         window_centers_px = self.window_centers_px(predicted)
-        if len(window_centers_px) < MIN_EVIDENCE_MATCHES:
+        windows = len(window_centers_px)
+        if windows < MIN_EVIDENCE_MATCHES:
             return None
         centroids, saturated = self._in_windows(image, window_centers_px, streak_px, clock)
         if len(centroids) < MIN_EVIDENCE_MATCHES:
@@ -318,26 +319,24 @@ class TrackingMode:
         hypothesis = star_evidence.evaluate(
             detections, tracker.sky, predicted.as_matrix(), 1.0, gates, -np.inf
         )
-        if hypothesis.dex + self._window_dex(len(window_centers_px), hypothesis) < ACCEPT_DEX:
+        if self._tracked_dex(windows, hypothesis) < ACCEPT_DEX:
             return None
         # 3. Attitude
         solution = star_evidence.build_solution(detections, tracker.sky, hypothesis)
         refitted = tracker.refit(centroids, solution, sigma_px)
-        if refitted.sheared or len(refitted.solution.star) < LEAST_SHARE * len(
-            window_centers_px
-        ):
-            return None
         found = refitted.solution
-        dex = found.dex + self._window_dex(len(window_centers_px), found)
-        refitted = refitted._replace(solution=found._replace(dex=dex))
+        if refitted.sheared or len(found.star) < LEAST_SHARE * windows:
+            return None
+        tracked = found._replace(dex=self._tracked_dex(windows, found))
+        refitted = refitted._replace(solution=tracked)
         attitude = tracker.attitude_of(centroids, refitted, sigma_px)
         clock.lap("solve")
         return self._report(
-            attitude, centroids, sigma_px, clock, streak_px, len(window_centers_px), saturated
+            attitude, centroids, sigma_px, clock, streak_px, windows, saturated
         )
 
-    def _window_dex(self, windows: int, found: Hypothesis | Solution) -> float:
-        """Return log10 of the factor by which windows of a prediction change the evidence of an attitude.
+    def _tracked_dex(self, windows: int, found: Hypothesis | Solution) -> float:
+        """Return the evidence of an attitude, which the windows of a prediction change.
 
         - The prior volume of attitudes is not 8 pi^2 but that of the prediction: the boresight in a square of side
           2 reach, the roll in an interval of 2 reach over the half field.
@@ -350,7 +349,7 @@ class TrackingMode:
         half = min(right - left, bottom - top) / 2
         prior_volume = side_rad**2 * min(side_rad / half, 2 * pi)
         share = min(windows * side_rad**2 / ((right - left) * (bottom - top)), 1.0)
-        return log10(8 * pi**2 / prior_volume) + len(found.star) * log10(share)
+        return found.dex + (log10(8 * pi**2 / prior_volume) + len(found.star) * log10(share))
 
     def window_centers_px(self, cam_from_ref: Rotation) -> Floats:
         """Return the (N, 2) predicted pixels of the brightest stars whose windows are on the sensor.

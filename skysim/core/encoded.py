@@ -13,7 +13,6 @@ import struct
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from struct import calcsize
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
+from skysim.core.types import frozen
 
 # Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same structure.
 
@@ -62,7 +62,7 @@ class TiffEntry(NamedTuple):
     at: int
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Tiff:
     """The structure of a TIFF file (TIFF 6.0, section 2) or a BigTIFF. Methods raise struct.error beyond its end."""
 
@@ -189,13 +189,6 @@ def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
             f"{size} pixels of {size_bytes} bytes by its header",
             f"up to {MAX_BYTES} bytes",
         )
-
-
-def check_bytes(path: Path) -> None:
-    """Raise InputError for a file larger than the largest allowed image."""
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise InputError(path, f"{size} bytes", f"up to {MAX_BYTES}")
 
 
 @contextlib.contextmanager

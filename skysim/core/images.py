@@ -17,7 +17,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 
 from skysim.core import encoded
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.encoded import check_bytes, check_pixels, silent_opencv
+from skysim.core.encoded import check_pixels, silent_opencv
 from skysim.core.errors import InputError
 from skysim.core.guarded import run_guarded
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
+from skysim.core.yaml_reader import check_bytes
 
 # FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
 # row order and date.
@@ -264,7 +265,7 @@ LUMINANCE = np.array(
 )  # of blue, green and red (ITU-R BT.601), OpenCV's order
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ViewedImage:
     """An image as a person sees it: turned as EXIF says, the highest row first.
 
@@ -478,7 +479,7 @@ def check_name(path: Path) -> None:
         raise InputError(path, "no such file")
     if not image_suffix(path.name):
         raise InputError(path, "unknown image suffix", ", ".join(IMAGE_SUFFIXES))
-    check_bytes(path)
+    check_bytes(path, encoded.MAX_BYTES)
 
 
 def check_numbers(path: Path, pixels: NDArray) -> None:

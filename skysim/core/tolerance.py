@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic import BeforeValidator, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.errors import InputError
@@ -120,8 +120,7 @@ class ToleranceConfig(ConfigModel):
         )
         return half_width, sigma
 
-    @model_validator(mode="after")
-    def check_distribution(self) -> Self:
+    def check(self) -> None:
         """Check that tolerance and sigma fit the distribution."""
         half_width, sigma = self.numbers()
         if half_width is None:
@@ -131,7 +130,7 @@ class ToleranceConfig(ConfigModel):
                     f"{self.distribution or 'an error'} requires a tolerance",
                     "tolerance, or sigma",
                 )
-            return self
+            return
         if self.distribution == "normal":
             raise InputError(
                 "tolerance", "a normal distribution has none", "uniform, truncated_normal"
@@ -142,7 +141,6 @@ class ToleranceConfig(ConfigModel):
             )
         if sigma is not None and not 0.01 <= half_width / sigma <= 100:
             raise InputError("sigma", "", "a hundredth to a hundred times the tolerance")
-        return self
 
     def error(self) -> float:
         """The size of the error: a plain standard deviation, or a `Tolerance`."""

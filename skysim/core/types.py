@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +31,16 @@ def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
-Columns = TypeVar("Columns")
+Kind = TypeVar("Kind")
 
 
-def joined(parts: Sequence[Columns]) -> Columns:
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+def frozen(kind: type[Kind]) -> type[Kind]:
+    """The class as a dataclass whose objects have its fields only, and cannot be changed."""
+    return dataclass(frozen=True, slots=True)(kind)
+
+
+def joined(parts: Sequence[Kind]) -> Kind:
     """Objects of one class, whose fields are columns of equal length, as one: the rows of all, in their order."""
     kind: Any = type(parts[0])
     names = getattr(kind, "_fields", kind.__slots__)
@@ -51,7 +57,7 @@ def taken(columns: Columns, which: Any) -> Columns:
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Mount:
     """Position and orientation of the camera on the vehicle.
 
@@ -181,7 +187,7 @@ class Mounting(NamedTuple):
     true_rad: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Telemetry:
     """True and estimated states of the vehicle at the starts of K control periods; None for missing hardware.
 
@@ -254,7 +260,7 @@ class Telemetry:
     readings: dict[str, Floats] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sources:
     """All light sources, stars and LEDs alike, in lab axes.
 
@@ -304,7 +310,7 @@ class Sources:
     def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
-        columns = (getattr(self, name) for name in Sources.__slots__)
+        columns = (getattr(self, name) for name in Sources.__dataclass_fields__)
         chosen: list[Any] = [
             None if column is None else column.take(rows, axis=0) for column in columns
         ]
@@ -340,7 +346,7 @@ class StarSources(Sources):
         return np.sort(order[first:last][near])
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SourceTruth:
     """The true image of every source that contributed light to the frame.
 
@@ -384,7 +390,7 @@ class SourceTruth:
     streak_xy_px: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BodyTruth:
     """Sun, Moon or a planet in a frame; `id` is its number in the truth of the sources.
 
@@ -405,7 +411,7 @@ class BodyTruth:
     phase_deg: float
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SatelliteTruth:
     """An artificial satellite in a frame at mid-exposure; `id` is its number in the truth of the sources.
 
@@ -440,7 +446,7 @@ class SatelliteTruth:
 ATTITUDES = ("lab_from_body", "cam_from_lab", "mean_lab_from_body", "mean_cam_from_lab")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Truth:
     """The true state behind a frame.
 
@@ -486,7 +492,7 @@ class Truth:
         return self.cam_from_lab * self.lab_from_body * self.mean_lab_from_body.inv()
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Frame:
     """One camera frame.
 
@@ -511,7 +517,7 @@ class Frame:
     saturation_dn: float
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FrameRow:
     """One frame of a run for the report: angles in degrees, errors in arcseconds, times in ms.
 

@@ -9,7 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Self, get_args
+from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -138,6 +138,13 @@ def finite(value: float) -> float:
     return value
 
 
+# Of any type: a value above zero, and one of zero or more; lists of one or more, two or more, three.
+Item = TypeVar("Item")
+AboveZero = Annotated[Item, Field(gt=0)]
+ZeroOrMore = Annotated[Item, Field(ge=0)]
+NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
+Several = Annotated[tuple[Item, ...], Field(min_length=2)]
+Three = tuple[Item, Item, Item]
 Number = Annotated[float, AfterValidator(finite)]
 Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
 Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
@@ -156,29 +163,31 @@ QuadraticDrag = Annotated[
 ]
 Stiffness = Annotated[Number, with_unit("N m rad-1", "torque per angle", '"1e-3 N m / rad"')]
 Imbalance = Annotated[Number, with_unit("kg m", "mass times offset", '"1 g cm"')]
-PositiveLength = Annotated[Length, Field(gt=0)]
-Position = tuple[Length, Length, Length]
-Duration = Annotated[Time, Field(gt=0)]
-Delay = Annotated[Time, Field(ge=0)]
+PositiveLength = AboveZero[Length]
+Position = Three[Length]
+Duration = AboveZero[Time]
+Delay = ZeroOrMore[Time]
 TimeLimit = Annotated[Time, Field(ge=1e-3, le=3600)]
 # An angle or a rate.
 Spin = Annotated[Number, Field(ge=-360, le=360)]
-Spins = tuple[Spin, Spin, Spin]
+Spins = Three[Spin]
 RightAscension = Annotated[Number, Field(ge=0, lt=360)]
 Declination = Annotated[Number, Field(ge=-90, le=90)]
-Triple = tuple[Number, Number, Number]
+Triple = Three[Number]
 Angles = Triple
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
-Seed = Annotated[int, Field(ge=0)]
+Seed = ZeroOrMore[int]
 PositiveInt = Annotated[int, Field(ge=1)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
-Fractions = Annotated[tuple[Fraction, ...], Field(min_length=2)]
 PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
-Positive = Annotated[Number, Field(gt=0)]
-NotNegative = Annotated[Number, Field(ge=0)]
-Ascending = Annotated[tuple[Number, ...], Field(min_length=2)]
+Positive = AboveZero[Number]
+NotNegative = ZeroOrMore[Number]
+Fractions = Several[Fraction]
+Ascending = Several[Number]
+# Chooses the class of a section by its key `kind`.
+BY_KIND = Field(discriminator="kind")
 
 
 # SI unit, name, example, least and greatest value of a quantity.
@@ -249,6 +258,12 @@ class ConfigModel(BaseModel):
             if value is not None or key not in fields or keeps_null(fields[key])
         }
 
+    def model_post_init(self, _context: Any) -> None:
+        """Call the method `check` of each class, the base first: whether the keys, which are valid, suit each other."""
+        for kind in reversed(type(self).__mro__):
+            if check := vars(kind).get("check"):
+                check(self)
+
 
 def keeps_null(field: FieldInfo) -> bool:
     """Whether null is a value of a field, or the field is required."""
@@ -274,8 +289,6 @@ def check_table(
 class TableConfig(ConfigModel):
     """Base of a section whose last two keys are the columns of a table: of equal length, the first ascending."""
 
-    @model_validator(mode="after")
-    def check_columns(self) -> Self:
+    def check(self) -> None:
         *_, first, second = type(self).model_fields
         check_table(getattr(self, first), getattr(self, second), second, first)
-        return self

@@ -16,10 +16,10 @@ import json
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
@@ -126,6 +126,9 @@ def existing_file(value: str) -> str:
     return value
 
 
+ExistingFile = Annotated[str, AfterValidator(existing_file)]
+
+
 def find_file(name: str, folder: Path, what: str) -> Path:
     """The path of a .yaml file given by its path, or by its name in a folder. Raises InputError."""
     path = Path(name)
@@ -228,12 +231,17 @@ def as_tree(keys: Keys) -> tuple[Tree, str]:
     return tree, yaml.safe_dump(tree, sort_keys=False)
 
 
+def check_bytes(path: Path, limit_bytes: int) -> None:
+    """Raise InputError for a file of more than limit_bytes."""
+    size = path.stat().st_size
+    if size > limit_bytes:
+        raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+
+
 def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
     """The text of a file. Raises InputError if it is too large, cannot be read or is not UTF-8."""
     try:
-        size = path.stat().st_size
-        if size > limit_bytes:
-            raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
+        check_bytes(path, limit_bytes)
         return path.read_text(encoding)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(

@@ -43,6 +43,7 @@ from skysim.scene import unused
 from skysim.scene.opencv_calibration import read as read_calibration
 from skysim.scene.scene import HEAD_SECTIONS, NAME_ALIAS, RawKeys, Scene
 from skysim.scene.sections.camera import CameraConfig, focus_distance
+from skysim.scene.sections.tracker import ASSUMED_KEYS, SURVEYED_KEYS
 
 PRESETS = DATA / "cameras"
 
@@ -202,8 +203,6 @@ def over_base(base: Tree, own: Tree) -> Tree:
 # Keys that remove others of the base, see `over_base`.
 REPLACING = ("camera.preset", "motion.start", "vehicle.model", "tracker.map")
 MASS_KEYS = ("mass", "inertia", "center_of_mass")
-ASSUMED_KEYS = ("assumed_focal_length", "assumed_camera_body", "assumed_distortion")
-SURVEYED_KEYS = ("led_sigma", "lever_sigma", "focal_length_sigma", "instrument")
 # Further keys about the vehicle's body, which those of a base may not suit.
 BODY_KEYS = (
     "camera",

@@ -2,7 +2,6 @@
 
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import yaml
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
+from skysim.core.types import frozen
 from skysim.core.yaml_reader import StrictLoader, Tree, excerpt, parse_yaml
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
@@ -20,7 +20,7 @@ MAX_SIDE_PX = 20000  # a side of the detector, as in a scene's camera
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class OpencvCalibration:
     """A pinhole with square pixels and the distortion of Brown (1971); camera axes +x right, +y down, +z boresight.
 

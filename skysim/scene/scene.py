@@ -19,6 +19,7 @@ from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import check_year
 from skysim.core.tolerance import TimeError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Delay,
     Position,
@@ -68,8 +69,7 @@ class ExposureConfig(ConfigModel):
     time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
-    @model_validator(mode="after")
-    def check_period(self) -> "ExposureConfig":
+    def check(self) -> None:
         """Check that an exposure ends before the next begins, and that the run is not too long."""
         if self.time_s + self.trigger_jitter_s > 1 / self.rate_hz:
             jitter = (
@@ -88,7 +88,6 @@ class ExposureConfig(ConfigModel):
                 f"{self.frames} frames over {duration_s:g} s",
                 f"up to {MAX_FRAMES}, over a day ({MAX_DURATION_S:g} s)",
             )
-        return self
 
 
 class HeadConfig(ConfigModel):
@@ -206,7 +205,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     orbit: Orbit | None = None
     vehicle: VehicleConfig
     motion: MotionConfig
-    light: Annotated[Light, Field(discriminator="kind")]
+    light: Annotated[Light, BY_KIND]
     background: tuple[Glow, ...] = ()
     lights: tuple[FurtherLight, ...] = ()
     camera: CameraConfig
@@ -222,8 +221,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     # Keys as loaded, see `loader.keys_of`.
     _source: RawKeys = RawKeys()
 
-    @model_validator(mode="after")
-    def check_light_source(self) -> "Scene":
+    def check(self) -> None:
         """Check keys that depend on the kind of light, and that the shutter reads all rows within a frame period."""
         sky = self.light.kind == "stars"
         tracker = self.tracker
@@ -272,7 +270,6 @@ class Scene(ConfigModel, metaclass=SceneKind):
                 "the rows of a rolling shutter show different bits",
                 "frame, or another camera.shutter",
             )
-        return self
 
     @model_validator(mode="after")
     def complete_layout(self) -> "Scene":

@@ -28,7 +28,7 @@ lattice of LEDs, use `saa`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import sqrt
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, frozen
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
@@ -64,7 +64,7 @@ MIN_FRACTION_BASIC = 0.5
 MIN_FRACTION_FALSE_STARS = 0.3
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MagnitudeMatch(StarMatch):
     """A match with the errors of its magnitudes.
 

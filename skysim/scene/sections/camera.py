@@ -10,13 +10,13 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    field_validator,
-    model_validator,
 )
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA
 from skysim.core.units import (
+    BY_KIND,
+    AboveZero,
     Ascending,
     ConfigModel,
     Duration,
@@ -27,6 +27,7 @@ from skysim.core.units import (
     Number,
     PositiveFraction,
     Seed,
+    Several,
     TableConfig,
     Temperature,
     check_table,
@@ -115,7 +116,7 @@ class MeasuredPsfConfig(PsfConfig):
 
 Psf = Annotated[
     GaussianPsfConfig | MoffatPsfConfig | AiryPsfConfig | DiskPsfConfig | MeasuredPsfConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -148,20 +149,11 @@ class ChromaticConfig(ConfigModel):
         distance from the principal point
     """
 
-    wavelength_m: Annotated[tuple[Wavelength, ...], Field(min_length=2)]
-    focus_m: (
-        Annotated[
-            tuple[Annotated[Length, Field(ge=-1e-3, le=1e-3)], ...], Field(min_length=2)
-        ]
-        | None
-    ) = None
-    corner_px: (
-        Annotated[tuple[Annotated[Number, Field(ge=-100, le=100)], ...], Field(min_length=2)]
-        | None
-    ) = None
+    wavelength_m: Several[Wavelength]
+    focus_m: Several[Annotated[Length, Field(ge=-1e-3, le=1e-3)]] | None = None
+    corner_px: Several[Annotated[Number, Field(ge=-100, le=100)]] | None = None
 
-    @model_validator(mode="after")
-    def check_columns(self) -> "ChromaticConfig":
+    def check(self) -> None:
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
         for name, column in columns.items():
             if column is not None:
@@ -170,7 +162,6 @@ class ChromaticConfig(ConfigModel):
             raise InputError(
                 "", "nothing depends on the wavelength", "focus or corner_px other than 0"
             )
-        return self
 
 
 class GhostConfig(ConfigModel):
@@ -188,17 +179,16 @@ class GhostConfig(ConfigModel):
     """
 
     magnification: Annotated[Number, Field(ge=-20, le=20)]
-    share: Annotated[Fraction, Field(gt=0)]
+    share: AboveZero[Fraction]
     radius_px: DiskRadius
 
-    @field_validator("magnification")
-    @classmethod
-    def check_magnification(cls, value: float) -> float:
-        if abs(value) < 0.05:
+    def check(self) -> None:
+        if abs(self.magnification) < 0.05:
             raise InputError(
-                "", f"{value:g} images half of space on the chip", "from 0.05 or to -0.05"
+                "magnification",
+                f"{self.magnification:g} images half of space on the chip",
+                "from 0.05 or to -0.05",
             )
-        return value
 
 
 class GlareConfig(ConfigModel):
@@ -232,11 +222,9 @@ class BaffleConfig(TableConfig):
     angle_deg: Ascending
     pst: Fractions
 
-    @model_validator(mode="after")
-    def check_angles(self) -> "BaffleConfig":
+    def check(self) -> None:
         if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
             raise InputError("angle_deg", "outside of half a circle", "0 to 180")
-        return self
 
 
 class GlobalShutterConfig(ConfigModel):
@@ -269,7 +257,7 @@ class InterlineConfig(ConfigModel):
 
 Shutter = Annotated[
     GlobalShutterConfig | RollingShutterConfig | FrameTransferConfig | InterlineConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -433,8 +421,7 @@ class DetectorConfig(ConfigModel):
             return 0.0
         return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
 
-    @model_validator(mode="after")
-    def check_values(self) -> "DetectorConfig":
+    def check(self) -> None:
         if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):
             raise InputError(
                 "quantum_efficiency",
@@ -451,7 +438,6 @@ class DetectorConfig(ConfigModel):
             raise InputError(
                 "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"
             )
-        return self
 
 
 class CameraConfig(ConfigModel):
@@ -477,9 +463,7 @@ class CameraConfig(ConfigModel):
         float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)
     ] = math.inf
     transmission: Transmission = 1.0
-    vignetting: (
-        Annotated[TwoStopsConfig | VignettingTableConfig, Field(discriminator="kind")] | None
-    ) = None
+    vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, BY_KIND] | None = None
     distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (
         0.0,
         0.0,
@@ -496,14 +480,12 @@ class CameraConfig(ConfigModel):
     shutter: Shutter = GlobalShutterConfig()
     detector: DetectorConfig
 
-    @model_validator(mode="after")
-    def check_focus(self) -> "CameraConfig":
+    def check(self) -> None:
         if self.focus_m <= 2 * self.focal_length_m:
             raise InputError(
                 "focus",
                 f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m",
             )
-        return self
 
     @property
     def pupil_m(self) -> float:

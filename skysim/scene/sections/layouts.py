@@ -3,18 +3,20 @@
 import datetime
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Fractions,
     Length,
     Magnitude,
+    NotEmpty,
     Number,
     Position,
     Positive,
@@ -27,9 +29,9 @@ from skysim.core.units import (
 
 HOLES = 9  # holes of a patch board, 3x3
 Level = PositiveFraction
-Levels = Annotated[tuple[Level, ...], Field(min_length=1)]
-Magnitudes = Annotated[tuple[Magnitude, ...], Field(min_length=1)]
-TypeNames = Annotated[tuple[str, ...], Field(min_length=1)]
+Levels = NotEmpty[Level]
+Magnitudes = NotEmpty[Magnitude]
+TypeNames = NotEmpty[str]
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
 Count = Annotated[int, Field(ge=1, le=100_000)]
@@ -62,18 +64,16 @@ class BoardConfig(ConfigModel):
     azimuth_deg: Number
     tilt_deg: Annotated[Number, Field(ge=0, le=90)]
     rotation_deg: Number = 0.0
-    leds: Annotated[tuple[Annotated[int, Field(ge=0, lt=HOLES)], ...], Field(min_length=1)]
+    leds: NotEmpty[Annotated[int, Field(ge=0, lt=HOLES)]]
     levels: Levels | None = None
     types: TypeNames | None = None
 
-    @model_validator(mode="after")
-    def check_leds(self) -> "BoardConfig":
+    def check(self) -> None:
         if len(set(self.leds)) < len(self.leds):
             raise InputError("leds", f"{list(self.leds)} has a duplicate hole")
         for name, values in (("levels", self.levels), ("types", self.types)):
             if values is not None and len(values) != len(self.leds):
                 raise InputError("", f"leds has {len(self.leds)} holes, {name} {len(values)}")
-        return self
 
 
 class PatchBoardsConfig(ConfigModel):
@@ -111,8 +111,7 @@ class PatchBoardsConfig(ConfigModel):
     glue_tilt_deg: Annotated[Number, Field(ge=0, le=30)] = 0.0
     hardware_seed: Seed = 0
 
-    @model_validator(mode="after")
-    def check_boards(self) -> "PatchBoardsConfig":
+    def check(self) -> None:
         if not 1 <= self.lit[0] <= self.lit[1] <= HOLES:
             raise InputError(
                 "lit",
@@ -126,7 +125,6 @@ class PatchBoardsConfig(ConfigModel):
                 "spacing",
                 f"{self.spacing_m:g} m: boards of three LEDs at {self.pitch_m:g} m would overlap",
             )
-        return self
 
 
 class DimmedConfig(ConfigModel):
@@ -153,8 +151,7 @@ class DimmedConfig(ConfigModel):
         """The levels, given as levels or as magnitudes."""
         return relative_levels(self.magnitudes) if self.magnitudes else self.levels or (1.0,)
 
-    @model_validator(mode="after")
-    def check_brightness(self) -> Self:
+    def check(self) -> None:
         if self.levels is not None and self.magnitudes is not None:
             raise InputError("", "a layout takes either levels or magnitudes")
         if self.unique_neighbors and len(set(self.dimming)) < 2:
@@ -163,7 +160,6 @@ class DimmedConfig(ConfigModel):
                 "all LEDs are equally bright",
                 "two levels or magnitudes, or more",
             )
-        return self
 
 
 class FibonacciConfig(DimmedConfig):
@@ -180,11 +176,9 @@ class PoissonDiskConfig(DimmedConfig):
     spacing_m: PositiveLength | None = None
     count: Annotated[int, Field(ge=1, le=20_000)] | None = None
 
-    @model_validator(mode="after")
-    def check_density(self) -> Self:
+    def check(self) -> None:
         if (self.spacing_m is None) == (self.count is None):
             raise InputError("", "poisson_disk takes either spacing or count")
-        return self
 
 
 class RandomPlacesConfig(DimmedConfig):
@@ -223,11 +217,9 @@ class GeodesicConfig(LitConfig):
     class_: Annotated[Literal["I", "II"], Field(alias="class")] = "I"
     rotation_deg: Number = 0.0
 
-    @model_validator(mode="after")
-    def check_frequency(self) -> "GeodesicConfig":
+    def check(self) -> None:
         if self.class_ == "II" and self.frequency % 2:
             raise InputError("frequency", f"{self.frequency} is odd, with class: II", "even")
-        return self
 
 
 class StringConfig(LitConfig):
@@ -324,13 +316,11 @@ class CelestialConfig(ConfigModel):
     epoch: datetime.datetime = datetime.datetime(2000, 1, 1, 12)
     hardware_seed: Seed = 0
 
-    @model_validator(mode="after")
-    def check_star_selection(self) -> "CelestialConfig":
+    def check(self) -> None:
         if (self.count is None) == (self.limit_mag is None):
             raise InputError("", "celestial takes either count or limit_mag")
         if not 1900 <= self.epoch.year <= 2100:
             raise InputError("epoch", f"{self.epoch.isoformat()} is outside 1900 to 2100")
-        return self
 
 
 class ListedConfig(DimmedConfig):
@@ -350,15 +340,12 @@ class ListedConfig(DimmedConfig):
     """
 
     kind: Literal["listed"]
-    positions_m: Annotated[tuple[Position, ...], Field(min_length=1)] | None = None
-    directions_deg: (
-        Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None
-    ) = None
+    positions_m: NotEmpty[Position] | None = None
+    directions_deg: NotEmpty[tuple[Number, Number]] | None = None
     file: str | None = None
     types: TypeNames | None = None
 
-    @model_validator(mode="after")
-    def check_positions(self) -> "ListedConfig":
+    def check(self) -> None:
         lists = [
             each
             for each in (self.positions_m, self.directions_deg, self.file)
@@ -377,7 +364,6 @@ class ListedConfig(DimmedConfig):
             )
         if dimmed and dimmed != len(lists[0]):
             raise InputError("", f"{len(lists[0])} LEDs, but {dimmed} levels or magnitudes")
-        return self
 
 
 SingleLeds = (
@@ -390,7 +376,7 @@ SingleLeds = (
     | CelestialConfig
     | ListedConfig
 )
-Points = Annotated[SingleLeds, Field(discriminator="kind")]
+Points = Annotated[SingleLeds, BY_KIND]
 
 
 class AimingConfig(ConfigModel):
@@ -434,8 +420,7 @@ class FibersConfig(ConfigModel):
     radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
     aiming: AimingConfig | None = None
 
-    @model_validator(mode="after")
-    def check_aiming(self) -> "FibersConfig":
+    def check(self) -> None:
         laser = self.aiming
         if laser and not (
             self.radius_variation
@@ -447,7 +432,6 @@ class FibersConfig(ConfigModel):
                 "the laser's place has no effect",
                 "an error of its pointing or orientation, or a radius_variation",
             )
-        return self
 
 
 class PixelsConfig(ConfigModel):
@@ -475,23 +459,17 @@ class PixelsConfig(ConfigModel):
     gamma: Annotated[Number, Field(gt=0, le=10)] | Literal["srgb"] | Fractions = 2.2
     contrast: Annotated[Number, Field(ge=2)] | None = None
 
-    @model_validator(mode="after")
-    def check_block(self) -> Self:
+    def check(self) -> None:
         if self.block > min(self.pixels):
             raise InputError(
                 "block",
                 f"{self.block} is wider than the display",
                 f"up to {min(self.pixels)} pixels",
             )
-        return self
-
-    @model_validator(mode="after")
-    def check_gamma(self) -> Self:
         gamma = self.gamma
         # A rise from 0 to 1 is what a sorted set of it with both ends is.
         if isinstance(gamma, tuple) and tuple(sorted({0.0, 1.0, *gamma})) != gamma:
             raise InputError("gamma", "not a rise from 0 to 1", "0 first, 1 last, increasing")
-        return self
 
 
 class LensDisplayConfig(PixelsConfig):
@@ -509,8 +487,7 @@ class LensDisplayConfig(PixelsConfig):
     focal_length_m: PositiveLength
     distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
 
-    @model_validator(mode="after")
-    def check_fold(self) -> Self:
+    def check(self) -> None:
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
         # t (1 + k t^2) has its maximum 2 t / 3 at t^2 = -1 / (3 k).
         if self.distortion < 0 and 2 / 3 / math.sqrt(-3 * self.distortion) <= corner:
@@ -519,7 +496,6 @@ class LensDisplayConfig(PixelsConfig):
                 f"{self.distortion:g} folds the picture's corners back",
                 "nearer to 0",
             )
-        return self
 
 
 class LcdConfig(PixelsConfig):
@@ -569,18 +545,16 @@ class ProjectorConfig(LensDisplayConfig):
     focus_m: PositiveLength | None = None
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
 
-    @model_validator(mode="after")
-    def check_aim(self) -> "ProjectorConfig":
+    def check(self) -> None:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]
         if not any(sight[1:]):
             raise InputError(
                 "aim", "straight along x from the position", "any other direction"
             )
-        return self
 
 
 OnPoints = (
     FibersConfig | LcdConfig | ProjectorConfig
 )  # layouts that show the points of another one
 
-Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, Field(discriminator="kind")]
+Layout = Annotated[PatchBoardsConfig | SingleLeds | OnPoints, BY_KIND]

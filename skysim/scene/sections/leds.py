@@ -1,20 +1,21 @@
 """Schema of the LED type of a dome: emission lobe, drive, brightness."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
     Tag,
-    model_validator,
 )
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
+    BY_KIND,
+    AboveZero,
     Ascending,
     ConfigModel,
     Duration,
@@ -27,6 +28,7 @@ from skysim.core.units import (
     PositiveFraction,
     PositiveInt,
     RadiantIntensity,
+    Several,
     TableConfig,
     Time,
     with_unit,
@@ -48,16 +50,14 @@ class LobeTableConfig(TableConfig):
 
     kind: Literal["table"]
     angle_deg: Ascending
-    intensity: Annotated[tuple[NotNegative, ...], Field(min_length=2)]
+    intensity: Several[NotNegative]
 
-    @model_validator(mode="after")
-    def check_axis(self) -> "LobeTableConfig":
+    def check(self) -> None:
         if self.angle_deg[0] != 0 or abs(self.intensity[0] - 1) > 1e-6:
             raise InputError("", "the table does not begin with an intensity of 1 at 0 deg")
-        return self
 
 
-Lobe = Annotated[CosineLobeConfig | LobeTableConfig, Field(discriminator="kind")]
+Lobe = Annotated[CosineLobeConfig | LobeTableConfig, BY_KIND]
 
 
 class DirectConfig(ConfigModel):
@@ -127,9 +127,7 @@ class RefreshConfig(ConfigModel):
     duty: PositiveFraction = 1.0
 
 
-Drive = Annotated[
-    DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, Field(discriminator="kind")
-]
+Drive = Annotated[DirectConfig | PwmConfig | SequentialConfig | RefreshConfig, BY_KIND]
 
 
 class ClockConfig(ConfigModel):
@@ -179,15 +177,13 @@ class TriggeredCodeConfig(CodeConfig):
 
     levels: Literal[2, 4, 8] = 2
 
-    @model_validator(mode="after")
-    def check_levels(self) -> Self:
+    def check(self) -> None:
         if self.levels > 2 and self.depth == 1:
             raise InputError(
                 "levels",
                 f"{self.levels} with depth 1, equally spaced in magnitude",
                 "depth below 1",
             )
-        return self
 
 
 class PlainCodeConfig(TriggeredCodeConfig):
@@ -218,9 +214,7 @@ class CyclicCodeConfig(CodeConfig):
     distance: Distance = 7
 
 
-Code = Annotated[
-    PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, Field(discriminator="kind")
-]
+Code = Annotated[PlainCodeConfig | BchCodeConfig | CyclicCodeConfig, BY_KIND]
 
 
 def below_one(effect: str) -> AfterValidator:
@@ -321,14 +315,13 @@ class LedLightConfig(ConfigModel):
         by the layout's hardware_seed
     """
 
-    intensity_cd: Annotated[Intensity, Field(gt=0)] | None = None
-    radiant_intensity_w_sr: Annotated[RadiantIntensity, Field(gt=0)] | None = None
+    intensity_cd: AboveZero[Intensity] | None = None
+    radiant_intensity_w_sr: AboveZero[RadiantIntensity] | None = None
     spectrum: LedSpectrum = "white"
     fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
-    @model_validator(mode="after")
-    def check_light(self) -> Self:
+    def check(self) -> None:
         if (self.intensity_cd is None) == (self.radiant_intensity_w_sr is None):
             raise InputError("", "an LED takes either intensity or radiant_intensity")
         if isinstance(self.spectrum, str) and (
@@ -338,7 +331,6 @@ class LedLightConfig(ConfigModel):
             raise InputError(
                 key, f"{self.spectrum} is a whole spectrum", "a wavelength as spectrum"
             )
-        return self
 
 
 class LedTypeConfig(LedLightConfig):
@@ -385,12 +377,10 @@ class LedConfig(LedLightConfig):
         """The LED with brightness and color of one of its types; itself for an empty name."""
         return self.model_copy(update=dict(self.types[name])) if name else self
 
-    @model_validator(mode="after")
-    def check_code(self) -> "LedConfig":
+    def check(self) -> None:
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":
             raise InputError(
                 "code.bit_time",
                 f"a {self.code.kind} code cannot be read without the camera's trigger",
                 "frame, or kind cyclic",
             )
-        return self

@@ -8,7 +8,7 @@ point of the group `skysim.lights` with the name of the kind, which names the mo
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -16,7 +16,6 @@ from pydantic import (
     Field,
     ModelWrapValidatorHandler,
     SerializeAsAny,
-    field_validator,
     model_validator,
 )
 
@@ -24,6 +23,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.tolerance import LengthError
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Fraction,
@@ -35,6 +35,8 @@ from skysim.core.units import (
     PositiveLength,
     RightAscension,
     Seed,
+    Three,
+    ZeroOrMore,
 )
 from skysim.scene.sections.layouts import (
     Layout,
@@ -73,14 +75,12 @@ class SurfaceConfig(ConfigModel):
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 
-    @model_validator(mode="after")
-    def check_below_apex(self) -> Self:
+    def check(self) -> None:
         rim_m = getattr(self, "rim_height_m", None)
         if rim_m is not None and rim_m >= getattr(self, "apex_m", math.inf):
             raise InputError(
                 "rim_height", f"{rim_m:g} m is not below the apex", "less than apex"
             )
-        return self
 
 
 class RimmedConfig(SurfaceConfig):
@@ -89,11 +89,9 @@ class RimmedConfig(SurfaceConfig):
     rim_height_m: Length | None = None
     rim_deg: Annotated[Number, Field(gt=0, lt=180)] | None = None
 
-    @model_validator(mode="after")
-    def check_rim(self) -> Self:
+    def check(self) -> None:
         if self.rim_height_m is not None and self.rim_deg is not None:
             raise InputError("", "rim_height and rim_deg conflict", "one of the two")
-        return self
 
 
 class WallConfig(ConfigModel):
@@ -124,8 +122,7 @@ class SphereSurfaceConfig(RimmedConfig):
     radius_m: PositiveLength
     wall: WallConfig | None = None
 
-    @model_validator(mode="after")
-    def check_wall(self) -> Self:
+    def check(self) -> None:
         thickest = (
             max(self.wall.thickness_apex_m, self.wall.thickness_base_m) if self.wall else 0.0
         )
@@ -133,7 +130,6 @@ class SphereSurfaceConfig(RimmedConfig):
             raise InputError(
                 "", f"a wall of {thickest:g} m is too thick", "up to a tenth of the radius"
             )
-        return self
 
 
 class EllipsoidSurfaceConfig(RimmedConfig):
@@ -141,7 +137,7 @@ class EllipsoidSurfaceConfig(RimmedConfig):
 
     kind: Literal["ellipsoid"]
     apex_m: PositiveLength
-    semi_axes_m: tuple[PositiveLength, PositiveLength, PositiveLength]
+    semi_axes_m: Three[PositiveLength]
 
 
 class FlatSurfaceConfig(SurfaceConfig):
@@ -163,11 +159,9 @@ class CylinderSurfaceConfig(SurfaceConfig):
     length_m: PositiveLength | None = None
     rim_height_m: Length | None = None
 
-    @model_validator(mode="after")
-    def check_extent(self) -> Self:
+    def check(self) -> None:
         if self.axis == "z" and self.length_m is None:
             raise InputError("", "a cylinder about z requires length, from apex down")
-        return self
 
 
 class SurveyedSurfaceConfig(RimmedConfig):
@@ -189,12 +183,9 @@ class SurveyedSurfaceConfig(RimmedConfig):
     degree: Annotated[int, Field(ge=0, le=12)] = 6
     rms_limit_m: PositiveLength = 1e-3
 
-    @field_validator("file")
-    @classmethod
-    def check_file(cls, value: str) -> str:
-        if not value.endswith(".csv") or not Path(value).is_file():
-            raise InputError("", f"{value!r} is not a file", "a .csv file of x, y, z")
-        return value
+    def check(self) -> None:
+        if not self.file.endswith(".csv") or not Path(self.file).is_file():
+            raise InputError("file", f"{self.file!r} is not a file", "a .csv file of x, y, z")
 
 
 AnySurface = Annotated[
@@ -203,7 +194,7 @@ AnySurface = Annotated[
     | FlatSurfaceConfig
     | CylinderSurfaceConfig
     | SurveyedSurfaceConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -231,15 +222,14 @@ class RoomConfig(ConfigModel):
     """
 
     height_m: PositiveLength | None = None
-    bearing_height_m: Annotated[Length, Field(ge=0)] | None = None
+    bearing_height_m: ZeroOrMore[Length] | None = None
     width_m: PositiveLength | None = None
     length_m: PositiveLength | None = None
     door_m: tuple[PositiveLength, PositiveLength] | None = None
     segments: Annotated[int, Field(ge=1, le=100)] = 1
-    thickness_m: Annotated[Length, Field(ge=0)] = 0.0
+    thickness_m: ZeroOrMore[Length] = 0.0
 
-    @model_validator(mode="after")
-    def check_limits(self) -> "RoomConfig":
+    def check(self) -> None:
         if self.height_m is not None and self.bearing_height_m is None:
             raise InputError(
                 "", "height requires bearing_height, the bearing's center above the floor"
@@ -248,7 +238,6 @@ class RoomConfig(ConfigModel):
             raise InputError(
                 "segments", "have no effect without a door", "door, or no segments"
             )
-        return self
 
 
 class FloorConfig(ConfigModel):
@@ -290,8 +279,7 @@ class ReflectionConfig(ConfigModel):
     refractive_index: Annotated[Number, Field(gt=1, le=4)] | None = None
     floor: FloorConfig | None = None
 
-    @model_validator(mode="after")
-    def check_shares(self) -> Self:
+    def check(self) -> None:
         if self.specular and self.refractive_index is not None:
             raise InputError("", "specular and refractive_index conflict", "one of the two")
         if self.diffuse + self.specular >= 1:
@@ -306,7 +294,6 @@ class ReflectionConfig(ConfigModel):
                 "nothing reflects",
                 "diffuse, specular, refractive_index or floor, or no reflection",
             )
-        return self
 
     @property
     def mirrors(self) -> bool:
@@ -340,8 +327,7 @@ class DomeConfig(ConfigModel):
         """The layout of single LEDs or boards: of fibers and displays, that of the points that they show."""
         return self.layout.points if isinstance(self.layout, OnPoints) else self.layout
 
-    @model_validator(mode="after")
-    def check_layout(self) -> "DomeConfig":
+    def check(self) -> None:
         """Check that the layout fits the LEDs' controller, types and drive, and the surface."""
         layout = self.layout
         kind = layout.kind
@@ -379,7 +365,6 @@ class DomeConfig(ConfigModel):
                 "led.drive",
                 f"refresh requires a layout of kind lcd or projector, not {kind}",
             )
-        return self
 
 
 class BodiesConfig(ConfigModel):
@@ -395,11 +380,9 @@ class BodiesConfig(ConfigModel):
     moon: bool = True
     planets: bool = True
 
-    @model_validator(mode="after")
-    def check_any(self) -> Self:
+    def check(self) -> None:
         if not (self.sun or self.moon or self.planets):
             raise InputError("", "no body is left", "sun, moon or planets, or no bodies")
-        return self
 
 
 class StarsConfig(ConfigModel):

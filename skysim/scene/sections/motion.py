@@ -3,29 +3,31 @@
 from typing import Annotated, Any, Literal
 
 from pydantic import (
-    AfterValidator,
     BeforeValidator,
     Discriminator,
     Field,
     Tag,
-    model_validator,
 )
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    BY_KIND,
+    AboveZero,
     ConfigModel,
     Declination,
     Duration,
     Momentum,
+    NotEmpty,
     NotNegative,
     Number,
     Positive,
     RightAscension,
     Spins,
+    Three,
     TimeLimit,
     Triple,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile
 from skysim.scene.sections.vehicle import ActuatorsName
 
 SIDEREAL = "sidereal"  # the rate of a vehicle that stands on the Earth, under the stars
@@ -73,7 +75,7 @@ Start = Annotated[
 ]
 
 
-AxesRms = tuple[NotNegative, NotNegative, NotNegative]
+AxesRms = Three[NotNegative]
 
 
 class JitterLineConfig(ConfigModel):
@@ -93,14 +95,12 @@ class JitterBandConfig(ConfigModel):
     rms_arcsec: AxesRms
     slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
 
-    @model_validator(mode="after")
-    def check_frequencies(self) -> "JitterBandConfig":
+    def check(self) -> None:
         if self.from_hz >= self.to_hz:
             raise InputError("from_hz", f"{self.from_hz:g} is not below to_hz {self.to_hz:g}")
-        return self
 
 
-JitterPart = Annotated[JitterLineConfig | JitterBandConfig, Field(discriminator="kind")]
+JitterPart = Annotated[JitterLineConfig | JitterBandConfig, BY_KIND]
 
 
 class HoldConfig(ConfigModel):
@@ -137,11 +137,9 @@ class SlewConfig(AttitudeConfig):
     acceleration_deg_s2: Positive = 0.5
     duration_s: Duration | None = None
 
-    @model_validator(mode="after")
-    def check_rate(self) -> "SlewConfig":
+    def check(self) -> None:
         if self.rate_deg_s is not None and self.duration_s is not None:
             raise InputError("duration", "given beside rate_deg_s", "one of the two")
-        return self
 
 
 class RateConfig(ConfigModel):
@@ -187,8 +185,7 @@ class ChirpConfig(ConfigModel):
     duration_s: Duration
     sweep: Literal["linear", "log"] = "linear"
 
-    @model_validator(mode="after")
-    def check_frequencies(self) -> "ChirpConfig":
+    def check(self) -> None:
         if self.from_hz == self.to_hz:
             raise InputError(
                 "",
@@ -201,7 +198,6 @@ class ChirpConfig(ConfigModel):
                 f"{self.duration_s:g} s is shorter than a period of from_hz and one of to_hz,"
                 f" {1 / self.from_hz + 1 / self.to_hz:g} s",
             )
-        return self
 
 
 # The rotation of a profile's quaternions.
@@ -230,7 +226,7 @@ class ProfileConfig(ConfigModel):
     """
 
     kind: Literal["profile"]
-    file: Annotated[str, AfterValidator(existing_file)]
+    file: ExistingFile
     begin: Literal["zero", "first_sample"] = "zero"
     rotation: RotationName | None = None
 
@@ -240,7 +236,7 @@ class ShakeConfig(ConfigModel):
 
     kind: Literal["jitter"]
     duration_s: Duration
-    components: Annotated[tuple[JitterPart, ...], Field(min_length=1)]
+    components: NotEmpty[JitterPart]
 
 
 class BumpConfig(ConfigModel):
@@ -261,13 +257,11 @@ class BumpConfig(ConfigModel):
     duration_s: Duration
     caught_after_s: Duration | None = None
 
-    @model_validator(mode="after")
-    def check_catch_time(self) -> "BumpConfig":
+    def check(self) -> None:
         if self.caught_after_s is not None and self.caught_after_s < self.duration_s:
             raise InputError(
                 "caught_after", f"{self.caught_after_s:g} s is before the impulse ends"
             )
-        return self
 
 
 Maneuver = Annotated[
@@ -281,11 +275,11 @@ Maneuver = Annotated[
     | ProfileConfig
     | ShakeConfig
     | BumpConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
-Stored = Annotated[Momentum, Field(gt=0)]
+Stored = AboveZero[Momentum]
 
 
 class DesaturationConfig(ConfigModel):
@@ -303,13 +297,11 @@ class DesaturationConfig(ConfigModel):
     stop_nms: Stored
     time_s: Duration = 10.0
 
-    @model_validator(mode="after")
-    def check_thresholds(self) -> "DesaturationConfig":
+    def check(self) -> None:
         if self.stop_nms >= self.start_nms:
             raise InputError(
                 "stop", f"{self.stop_nms:g} N m s is not below start {self.start_nms:g} N m s"
             )
-        return self
 
 
 class ControlConfig(ConfigModel):
@@ -349,8 +341,7 @@ class ControlConfig(ConfigModel):
     integral_rad_s: Positive = 0.6
     desaturation: DesaturationConfig | None = None
 
-    @model_validator(mode="after")
-    def check_options(self) -> "ControlConfig":
+    def check(self) -> None:
         """Refuse keys that have no effect with the law."""
         unused = []
         if self.law in BUILT_IN_LAWS:
@@ -364,7 +355,6 @@ class ControlConfig(ConfigModel):
             if getattr(self, name) != default:
                 key = name.removesuffix("_s")
                 raise InputError("", f"{key} has no effect with law {self.law}", "none")
-        return self
 
 
 def expand_control(value: Any) -> Any:
@@ -408,8 +398,7 @@ class MotionConfig(ConfigModel):
         """Whether the vehicle moves exactly along the maneuver, without dynamics."""
         return self.control is not None and self.control.law == PRESCRIBED
 
-    @model_validator(mode="after")
-    def check_motion(self) -> "MotionConfig":
+    def check(self) -> None:
         if self.rate_deg_s == SIDEREAL and self.control is not None:
             raise InputError(
                 "rate_deg_s", "sidereal conflicts with a controller", "no control"
@@ -430,7 +419,7 @@ class MotionConfig(ConfigModel):
                 "control: pid",
             )
         if self.start != "profile":
-            return self
+            return
         if not self.maneuver or self.maneuver[0].kind != "profile":
             raise InputError("start", "profile requires a first maneuver of kind profile")
         if any(self.rate_deg_s):
@@ -439,4 +428,3 @@ class MotionConfig(ConfigModel):
                 "has no effect with start: profile, which gives the rate",
                 "[0, 0, 0]",
             )
-        return self

@@ -1,13 +1,14 @@
 """Schema of the surroundings of camera and laboratory: `light.air`, `thermal`, `orbit`, satellites, `background`."""
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    BY_KIND,
     Ascending,
     ConfigModel,
     Declination,
@@ -20,11 +21,14 @@ from skysim.core.units import (
     Position,
     RightAscension,
     Seed,
+    Several,
     Spin,
     TableConfig,
     Temperature,
+    Three,
+    ZeroOrMore,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile
 
 # The scene section `light.air`: the atmosphere between the camera of a sky scene and the stars.
 
@@ -39,13 +43,11 @@ class HorizonConfig(TableConfig):
     """
 
     azimuth_deg: Ascending
-    altitude_deg: Annotated[tuple[Altitude, ...], Field(min_length=2)]
+    altitude_deg: Several[Altitude]
 
-    @model_validator(mode="after")
-    def check_azimuths(self) -> Self:
+    def check(self) -> None:
         if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
             raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
-        return self
 
 
 class AirGlowConfig(ConfigModel):
@@ -109,7 +111,7 @@ class AirConfig(ConfigModel):
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
 Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
-Coefficients = tuple[Coefficient, Coefficient, Coefficient]
+Coefficients = Three[Coefficient]
 
 
 class SteadyTemperatureConfig(ConfigModel):
@@ -142,7 +144,7 @@ class TemperatureTableConfig(TableConfig):
 
     kind: Literal["table"]
     hours: Ascending
-    temperature_c: Annotated[tuple[Temperature, ...], Field(min_length=2)]
+    temperature_c: Several[Temperature]
 
 
 Temperatures = Annotated[
@@ -150,7 +152,7 @@ Temperatures = Annotated[
     | LinearTemperatureConfig
     | SineTemperatureConfig
     | TemperatureTableConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]
 
 
@@ -188,20 +190,17 @@ class ThermalConfig(ConfigModel):
         """Whether anything depends on the temperature."""
         return bool(self.dome_ppm_k or any(self.mount_arcsec_k) or self.lens_ppm_k)
 
-    @model_validator(mode="after")
-    def check_effect(self) -> "ThermalConfig":
+    def check(self) -> None:
         if not self.has_effect:
             raise InputError(
                 "",
                 "nothing depends on the temperature",
                 "dome_ppm_k, mount_arcsec_k or lens_ppm_k, or no thermal",
             )
-        return self
 
 
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
-ElementsFile = Annotated[str, AfterValidator(existing_file)]
 ExclusionAngle = Annotated[Number, Field(ge=0, lt=180)]
 Rate = Annotated[Number, Field(gt=0, le=30)]
 
@@ -226,15 +225,13 @@ class RandomSatellitesConfig(ConfigModel):
     v_mag: tuple[Magnitude, Magnitude] = (2.0, 8.0)
     seed: Seed
 
-    @model_validator(mode="after")
-    def check_ranges(self) -> Self:
+    def check(self) -> None:
         for name in ("rate_deg_s", "v_mag"):
             low, high = getattr(self, name)
             if low > high:
                 raise InputError(
                     name, f"{low:g} is above {high:g}", "the least, then the greatest"
                 )
-        return self
 
 
 class SatellitesConfig(ConfigModel):
@@ -250,15 +247,13 @@ class SatellitesConfig(ConfigModel):
         Further satellites on random paths
     """
 
-    file: ElementsFile | None = None
+    file: ExistingFile | None = None
     standard_mag: Magnitude = 6.0
     random: RandomSatellitesConfig | None = None
 
-    @model_validator(mode="after")
-    def check_any(self) -> Self:
+    def check(self) -> None:
         if self.file is None and self.random is None:
             raise InputError("", "no satellite is left", "file or random, or no satellites")
-        return self
 
 
 class ExclusionConfig(ConfigModel):
@@ -277,7 +272,7 @@ class ExclusionConfig(ConfigModel):
     sun_deg: ExclusionAngle = 0.0
     earth_deg: ExclusionAngle = 0.0
     moon_deg: ExclusionAngle = 0.0
-    stars: Annotated[int, Field(ge=0)] = 4
+    stars: ZeroOrMore[int] = 4
 
 
 class EarthConfig(ConfigModel):
@@ -338,7 +333,7 @@ class TleOrbitConfig(OrbitConfig):
     """
 
     kind: Literal["tle"]
-    file: ElementsFile
+    file: ExistingFile
     number: Annotated[int, Field(ge=0, le=999_999_999)] | None = None
 
 
@@ -346,12 +341,10 @@ class OemOrbitConfig(OrbitConfig):
     """An orbit of a CCSDS Orbit Ephemeris Message (OEM) in keyword = value notation."""
 
     kind: Literal["oem"]
-    file: ElementsFile
+    file: ExistingFile
 
 
-Orbit = Annotated[
-    CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, Field(discriminator="kind")
-]
+Orbit = Annotated[CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, BY_KIND]
 
 
 # The scene section `background`: glow.
@@ -437,5 +430,5 @@ Glow = Annotated[
     | MoonGlowConfig
     | StrayLightConfig
     | FaintStarsGlowConfig,
-    Field(discriminator="kind"),
+    BY_KIND,
 ]

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import LengthError, NumberError
@@ -21,8 +21,9 @@ from skysim.core.units import (
     Spins,
     Time,
     TimeLimit,
+    ZeroOrMore,
 )
-from skysim.core.yaml_reader import existing_file
+from skysim.core.yaml_reader import ExistingFile, value_at
 
 OWN = "own"  # skysim's tracker
 
@@ -125,15 +126,13 @@ class ExposureControlConfig(ConfigModel):
     step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
     min_stars: PositiveInt = 4
     overexposed_objects: PositiveInt = 4
-    saturated_px: Annotated[int, Field(ge=0)] = 1
+    saturated_px: ZeroOrMore[int] = 1
 
-    @model_validator(mode="after")
-    def check_limits(self) -> "ExposureControlConfig":
+    def check(self) -> None:
         if self.shortest_s > self.longest_s:
             raise InputError(
                 "shortest", f"{self.shortest_s:g} s is above longest {self.longest_s:g} s"
             )
-        return self
 
 
 class DecoderConfig(ConfigModel):
@@ -171,6 +170,11 @@ class ComputerConfig(ConfigModel):
     clock_mhz: Positive
     cycles_factor: Positive = 1.0
     host_clock_mhz: Positive | None = None
+
+
+# Keys of a tracker, and of its survey, whose values a map contains.
+ASSUMED_KEYS = ("assumed_focal_length", "assumed_camera_body", "assumed_distortion")
+SURVEYED_KEYS = ("led_sigma", "lever_sigma", "focal_length_sigma", "instrument")
 
 
 class TrackerConfig(ConfigModel):
@@ -265,10 +269,9 @@ class TrackerConfig(ConfigModel):
     assumed_attitude_deg: Spins | None = None
     magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
     computer: ComputerConfig | None = None
-    map: Annotated[str, AfterValidator(existing_file)] | None = None
+    map: ExistingFile | None = None
 
-    @model_validator(mode="after")
-    def check_assumed(self) -> "TrackerConfig":
+    def check(self) -> None:
         if self.assumed_camera_body_m is not None and self.survey.lever_sigma_m:
             raise InputError(
                 "survey.lever_sigma",
@@ -281,21 +284,12 @@ class TrackerConfig(ConfigModel):
                 "conflicts with assumed_focal_length",
                 "one of the two",
             )
-        values = {
-            "assumed_focal_length": self.assumed_focal_length_m,
-            "assumed_camera_body": self.assumed_camera_body_m,
-            "assumed_distortion": self.assumed_distortion,
-            "survey.led_sigma": self.survey.led_sigma_m,
-            "survey.lever_sigma": self.survey.lever_sigma_m,
-            "survey.focal_length_sigma": self.survey.focal_length_sigma_m,
-            "survey.instrument": self.survey.instrument,
-        }
-        conflicts = [key for key, value in values.items() if value]
-        if self.map and conflicts:
-            raise InputError(
-                conflicts[0], "conflicts with tracker.map, which contains it", "0, or no map"
-            )
-        return self
+        tree = self.model_dump(by_alias=True) if self.map else {}
+        for key in (*ASSUMED_KEYS, *(f"survey.{name}" for name in SURVEYED_KEYS)):
+            if value_at(tree, key):
+                raise InputError(
+                    key, "conflicts with tracker.map, which contains it", "0, or no map"
+                )
 
 
 class FilterConfig(ConfigModel):
@@ -373,10 +367,8 @@ class FilterConfig(ConfigModel):
     latency_s: Delay = 0.0
     time_tag_sigma_s: Delay = 0.0
 
-    @model_validator(mode="after")
-    def check_drift(self) -> "FilterConfig":
+    def check(self) -> None:
         if self.mounting_drift_arcsec_sqrt_h and not self.mounting_arcsec:
             raise InputError(
                 "mounting_drift_arcsec_sqrt_h", "requires mounting_arcsec above 0"
             )
-        return self

@@ -2,14 +2,16 @@
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
 from skysim.core.units import (
+    AboveZero,
     Angles,
     ConfigModel,
     Damping,
+    Delay,
     Duration,
     Force,
     Imbalance,
@@ -28,15 +30,17 @@ from skysim.core.units import (
     Spin,
     Spins,
     Stiffness,
+    Three,
     Time,
     Torque,
+    ZeroOrMore,
 )
 
 # Keys of `vehicle`, and the ideal torques.
 ActuatorsName = Literal["ideal", "wheels", "fans", "thrusters", "trims", "cmgs"]
-TorqueLimit = Annotated[Torque, Field(gt=0)]
-TorqueLevel = Annotated[Torque, Field(ge=0)]
-Friction = Annotated[Damping, Field(ge=0)]
+TorqueLimit = AboveZero[Torque]
+TorqueLevel = ZeroOrMore[Torque]
+Friction = ZeroOrMore[Damping]
 LagTime = Annotated[Time, Field(ge=5e-3)]
 
 
@@ -64,17 +68,15 @@ class WheelsConfig(ConfigModel):
     coulomb_nm: TorqueLevel = 0.0
     viscous_nms: Friction = 0.0
     stiction_nm: TorqueLevel = 0.0
-    static_imbalance_kg_m: Annotated[Imbalance, Field(ge=0)] = 0.0
-    dynamic_imbalance_kg_m2: Annotated[Inertia, Field(ge=0)] = 0.0
+    static_imbalance_kg_m: ZeroOrMore[Imbalance] = 0.0
+    dynamic_imbalance_kg_m2: ZeroOrMore[Inertia] = 0.0
     start_rpm: tuple[Number, ...] = ()
 
-    @model_validator(mode="after")
-    def check_speeds(self) -> "WheelsConfig":
+    def check(self) -> None:
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
             raise InputError("start_rpm", f"beyond speed_limit_rpm {self.speed_limit_rpm:g}")
         if 0 < self.stiction_nm < self.coulomb_nm:
             raise InputError("stiction", f"below coulomb {self.coulomb_nm:g} N m")
-        return self
 
 
 class FansConfig(ConfigModel):
@@ -88,7 +90,7 @@ class FansConfig(ConfigModel):
         Time constant of the first-order lag between command and thrust
     """
 
-    thrust_limit_n: Annotated[Force, Field(gt=0)] = 0.5
+    thrust_limit_n: AboveZero[Force] = 0.5
     time_constant_s: LagTime = 0.2
 
 
@@ -113,11 +115,11 @@ class ThrustersConfig(ConfigModel):
         `regulated`: the thrust is constant until the tank is empty; `blowdown`: proportional to the propellant left
     """
 
-    thrust_n: Annotated[Force, Field(gt=0)] = 0.5
-    minimum_impulse_ns: Annotated[LinearImpulse, Field(ge=0)] = 2.5e-3
-    time_constant_s: Annotated[Time, Field(ge=0)] = 3e-3
+    thrust_n: AboveZero[Force] = 0.5
+    minimum_impulse_ns: ZeroOrMore[LinearImpulse] = 2.5e-3
+    time_constant_s: Delay = 3e-3
     specific_impulse_s: Duration = 60.0
-    propellant_kg: Annotated[Mass, Field(gt=0)] = 0.3
+    propellant_kg: AboveZero[Mass] = 0.3
     supply: Literal["regulated", "blowdown"] = "regulated"
 
 
@@ -135,7 +137,7 @@ class TrimsConfig(ConfigModel):
     """
 
     travel_m: PositiveLength = 0.02
-    speed_limit_m_s: Annotated[Speed, Field(gt=0)] = 0.01
+    speed_limit_m_s: AboveZero[Speed] = 0.01
 
 
 class CmgsConfig(ConfigModel):
@@ -181,30 +183,28 @@ class TrimConfig(ConfigModel):
     travel_m: PositiveLength = 0.02
     step_m: PositiveLength = 1e-6
 
-    @model_validator(mode="after")
-    def check_positions(self) -> "TrimConfig":
+    def check(self) -> None:
         if any(abs(position_m) > self.travel_m for position_m in self.position_m):
             raise InputError("position", f"beyond travel {1e3 * self.travel_m:g} mm")
-        return self
 
 
 class DragConfig(ConfigModel):
     """Air drag about each body axis independently: T = -(viscous + quadratic |rate|) rate."""
 
     viscous_nms: Friction = 0.0
-    quadratic_nms2: Annotated[QuadraticDrag, Field(ge=0)] = 0.0
+    quadratic_nms2: ZeroOrMore[QuadraticDrag] = 0.0
 
 
 class CableConfig(ConfigModel):
     """A cable attached to the vehicle: a torsional spring that rotates it back to (0, 0, 0) by the shorter rotation."""
 
-    stiffness_nm_rad: Annotated[Stiffness, Field(gt=0)]
+    stiffness_nm_rad: AboveZero[Stiffness]
 
 
 class AirCurrentConfig(ConfigModel):
     """Air currents: a random torque about each lab axis, correlated over the correlation time."""
 
-    rms_nm: tuple[TorqueLevel, TorqueLevel, TorqueLevel]
+    rms_nm: Three[TorqueLevel]
     correlation_s: Duration = 2.0
 
 
@@ -221,7 +221,7 @@ class DisturbancesConfig(ConfigModel):
         Cable and air currents
     """
 
-    turbine_nm: tuple[Torque, Torque, Torque] = (0.0, 0.0, 0.0)
+    turbine_nm: Three[Torque] = (0.0, 0.0, 0.0)
     earth_rotation: bool = False
     cable: CableConfig | None = None
     air_current: AirCurrentConfig | None = None
@@ -343,8 +343,8 @@ class VehicleConfig(ConfigModel):
 
     model: str
     mount: Literal["air_bearing", "free", "two_axis"] = "air_bearing"
-    mass_kg: Annotated[Mass, Field(gt=0)] | None = None
-    inertia_kg_m2: tuple[Inertia, Inertia, Inertia] | None = None
+    mass_kg: AboveZero[Mass] | None = None
+    inertia_kg_m2: Three[Inertia] | None = None
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
     camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
@@ -361,8 +361,7 @@ class VehicleConfig(ConfigModel):
     imu: ImuConfig | None = None
     gimbals: GimbalsConfig | None = None
 
-    @model_validator(mode="after")
-    def check_body(self) -> "VehicleConfig":
+    def check(self) -> None:
         inertia = self.inertia_kg_m2
         if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
             raise InputError(
@@ -370,17 +369,18 @@ class VehicleConfig(ConfigModel):
                 f"{inertia} is not possible for a rigid body",
                 "positive, none above the sum of the others",
             )
-        if self.mount == "free" and self.disturbances != DisturbancesConfig():
+        if self.mount != "free":
+            return
+        if self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
-        if self.mount == "free" and self.imu and self.imu.earth_rate != "none":
+        if self.imu and self.imu.earth_rate != "none":
             raise InputError("imu.earth_rate", "a free vehicle is not on the Earth", "none")
-        if self.mount == "free" and (self.trim or self.trims):
+        if self.trim or self.trims:
             raise InputError(
                 "trim" if self.trim else "trims",
                 "a free vehicle rotates about its center of mass",
                 "mount: air_bearing",
             )
-        return self
 
 
 class SiteConfig(ConfigModel):

@@ -88,6 +88,25 @@ def whole_matrix(terms: ba.NormalEquations) -> Floats:
 # Bundle adjustment
 
 
+@law(Sightings.of, Sightings.in_frames)
+@given(rng=SEEDS)
+def test_sightings_are_those_of_the_frames_in_their_order(rng: np.random.Generator) -> None:
+    counts = rng.integers(0, 4, FRAMES)
+    frames = [
+        StarFrame(rng.uniform(0, 99, (count, 2)), rng.uniform(1, 2, count), units(rng, count))
+        for count in counts
+    ]
+    led = rng.permutation(counts.sum())
+    seen = Sightings.of(frames, led)
+    assert (seen.led == led).all()
+    for (frame, n), xy_px, sigma_px in zip(
+        seen.in_frames, seen.xy_px, seen.sigma_px, strict=True
+    ):
+        assert (frames[frame].xy_px[n] == xy_px).all()
+        assert frames[frame].sigma_px[n] == sigma_px
+    assert (np.bincount(seen.frame, minlength=FRAMES) == counts).all()
+
+
 @law(ba.linearize, ba.residuals, Bundle.start, Bundle.apply_step, Sightings.take)
 @given(rng=SEEDS)
 def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
@@ -115,7 +134,7 @@ def test_the_jacobian_rows_match_finite_differences_of_the_residuals(
 
 
 @law(
-    ba.normal_equations,
+    Bundle.equations,
     ba.eliminate_lights,
     ba.step,
     ba.cauchy,
@@ -129,7 +148,7 @@ def test_eliminating_the_lights_solves_the_whole_system(
     true, seen = dome(rng, 0.1)
     bundle = nudged(rng, true, 1e-3)
     weight = rng.uniform(0.1, 1, len(seen.led))
-    terms = ba.normal_equations(bundle, seen, weight)
+    terms = bundle.equations(seen, weight)
     whole = whole_matrix(terms)
     assert_covariance(whole)
     led, rest = ba.step(terms, ba.eliminate_lights(terms, damping))
@@ -178,7 +197,7 @@ def test_the_equations_of_an_attitude_are_those_of_its_own_sightings(
     assert (counts == np.bincount(seen.led, minlength=LIGHTS)[:, None]).all()
 
 
-@law(Assumed.less, Assumed.weight, Bundle.cost, ba.normal_equations)
+@law(Assumed.less, Assumed.weight, Bundle.cost, Bundle.equations)
 @given(
     rng=SEEDS,
     lever_m=some.floats(0, 0.1),
@@ -199,8 +218,8 @@ def test_an_assumption_acts_as_a_measurement_of_its_weight(
     bundle = replace(nudged(rng, true, 1e-3), map_sigma_m=list_m)
     known = replace(bundle, assumed=assumed)
     every = np.ones(len(seen.led))
-    terms = ba.normal_equations(known, seen, every)
-    more = np.diag(terms.rest - ba.normal_equations(bundle, seen, every).rest)
+    terms = known.equations(seen, every)
+    more = np.diag(terms.rest - bundle.equations(seen, every).rest)
     sigma = np.maximum(
         [lever_m] * 3 + [focal_px], ba.EXACT * np.array([1, 1, 1, assumed.focal_px])
     )
@@ -231,7 +250,7 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     true, seen = dome(rng, 0.1)
     seen = seen.take(rng.permutation(len(seen.led))[:rows])
     every = np.ones(rows)
-    pixels = whole_matrix(ba.normal_equations(true, seen, every))
+    pixels = whole_matrix(true.equations(seen, every))
     known = replace(
         true, map_sigma_m=list_m, assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0)
     )
@@ -265,7 +284,7 @@ def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_sh
         assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0),
     )
     np.testing.assert_array_equal(CAMERA.with_lens(2 * CAMERA.lens).lens, 2 * LENS)
-    terms = ba.normal_equations(known, seen, np.ones(len(seen.led)))
+    terms = known.equations(seen, np.ones(len(seen.led)))
     whole = whole_matrix(terms)
     scale = np.sqrt(np.diag(whole))
     inverse = np.linalg.inv(whole / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -302,10 +321,10 @@ def test_an_adjustment_converges_to_the_observed_pixels(
     start = replace(nudged(rng, true, by), map_sigma_m=0.01)
     turned = ba.fit_attitudes(start, seen, 3)
     assert turned.cost(seen, np.inf)[0] <= start.cost(seen, np.inf)[0] * (1 + 1e-9) + 1e-9
-    found, at_rest = ba.adjust(turned, seen, np.inf)
-    assert at_rest
+    found, status = ba.adjust(turned, seen, np.inf)
+    assert status == "converged"
     assert np.abs(ba.residuals(found, seen)).max() < 1e-5
-    terms = ba.normal_equations(found, seen, np.ones(len(seen.led)))
+    terms = found.equations(seen, np.ones(len(seen.led)))
     by_led, by_rotation, shared = bundle_covariance.covariance(terms, found)
     for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
@@ -314,14 +333,14 @@ def test_an_adjustment_converges_to_the_observed_pixels(
 @pytest.mark.slow
 def test_no_step_of_an_adjustment_raises_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levenberg-Marquardt takes a step only if the cost falls; from this far off the first steps often overshoot."""
-    normal_equations = ba.normal_equations
+    equations = Bundle.equations
     costs = list[float]()
 
     def recorded(bundle: Bundle, sightings: Sightings, weight: Floats) -> Any:
         costs.append(bundle.cost(sightings, np.inf)[0])
-        return normal_equations(bundle, sightings, weight)
+        return equations(bundle, sightings, weight)
 
-    monkeypatch.setattr(ba, "normal_equations", recorded)
+    monkeypatch.setattr(Bundle, "equations", recorded)
     for seed in range(12):
         rng = np.random.default_rng(seed)
         true, seen = dome(rng, 0.1)
@@ -433,7 +452,7 @@ def test_the_misfit_is_over_what_the_pixels_determine(
     determined = np.trace(np.linalg.solve(by_pixels + np.diag(before), by_pixels))
     wanted = np.sqrt(np.sum(every.residual**2) / (2 * len(seen.led) - determined))
     assert found.misfit == pytest.approx(wanted, rel=1e-3)
-    terms = ba.normal_equations(bundle, seen, np.ones(len(seen.led)))
+    terms = bundle.equations(seen, np.ones(len(seen.led)))
     led_step, rest_step = ba.step(terms, ba.eliminate_lights(terms, 0.0))
     # At rest where all measurements agree best.
     assert terms.rhs_led @ led_step + terms.rhs_rest @ rest_step < 1e-6

@@ -39,6 +39,16 @@ def apart(a: NDArray, b: NDArray) -> NDArray:
 # Catalog
 
 
+@law(catalog.from_angles)
+@given(east_rad=some.floats(-7, 7), north_rad=some.floats(-1.57, 1.57))
+def test_a_direction_has_the_angles_that_it_is_made_of(
+    east_rad: float, north_rad: float
+) -> None:
+    x, y, z = catalog.from_angles(east_rad, north_rad)
+    assert np.arcsin(z) == pytest.approx(north_rad, abs=1e-7)
+    assert np.hypot(x, y) * np.exp(1j * east_rad) == pytest.approx(x + 1j * y, abs=1e-15)
+
+
 @law(
     catalog.from_columns,
     catalog.StarCatalog.brightest_first,

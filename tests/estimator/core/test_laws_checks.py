@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+from dataclasses import FrozenInstanceError
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,6 +30,23 @@ from estimator.trackers.pipeline import Settings
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, drawn, law, turn, units
 
 WORDS = some.text(max_size=8)
+
+
+@checks.frozen
+class Frozen:
+    x: float
+
+
+@law(checks.frozen)
+@given(x=some.floats(allow_nan=False))
+def test_a_frozen_object_keeps_its_fields_and_takes_no_others(x: float) -> None:
+    one = Frozen(x)
+    assert one == Frozen(x)
+    with pytest.raises(FrozenInstanceError):
+        one.x = x  # type: ignore[misc]
+    assert not hasattr(one, "__dict__")
+
+
 THINGS: Any = (
     some.none()
     | some.booleans()

@@ -12,7 +12,7 @@ from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify, detect
 from estimator.detection.classify import NO_STAR, Flag
-from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid, process_frame
+from estimator.trackers.pipeline import Clock, FrameTracker, Settings, detect_and_centroid
 from tests.helpers import drawn_frames as frames
 
 SHAPE = (493, 659)
@@ -234,9 +234,11 @@ def test_streaks_that_differ_by_a_roll_are_stars(
         if rate_known
         else None
     )
-    seen = process_frame(
-        image, CAMERA, Settings(), lambda *_: Attitude("no_solution"), None, rate, 0.1
-    ).centroids
+    tracker = FrameTracker()
+    tracker.camera = CAMERA
+    tracker.settings = Settings()
+    tracker.solve_centroids = lambda *_, **__: Attitude("no_solution")
+    seen = tracker.solve(image, None, rate, 0.1).centroids
     assert len(seen) == 15
     assert off_px(seen, xy).max() < 0.15
     assert seen.covariance_px2 is not None

@@ -164,7 +164,7 @@ def test_a_lower_threshold_finds_fainter_objects(
 ) -> None:
     frame, _ = starry(rng)
     sky = background.estimate_background(frame)
-    flat = detect.flat_background(sky, frame.shape)
+    flat = detect.flat_background(frame)
     assert sky.level.min() <= flat.level.item() <= sky.level.max()
     found = [
         detect.detect_blobs(frame, flat, more * flat.noise, 1, 99)
@@ -452,7 +452,7 @@ def test_weights_are_the_inverse_of_all_the_errors(
     np.testing.assert_allclose(seen.sigma**2, greatest, rtol=1e-9)
 
 
-@law(pipeline.detect_and_centroid, pipeline.process_frame, Clock.lap, camera.check_frame)
+@law(pipeline.detect_and_centroid, pipeline.FrameTracker.solve, Clock.lap, camera.check_frame)
 @given(
     rng=SEEDS,
     hostile=FRAMES | arrays("f8", array_shapes(max_dims=3, max_side=90), fill=some.just(1)),
@@ -463,13 +463,11 @@ def test_processing_a_frame_gives_lights_on_the_chip_and_its_duration(
 ) -> None:
     fits = answered(lambda: camera.check_frame(hostile, CAMERA) or True, ImageError)
     assert bool(fits) == (hostile.shape == (HEIGHT, WIDTH))
-    nothing = Attitude("not solved")
-    answered(
-        lambda: pipeline.process_frame(
-            hostile, CAMERA, Settings(), lambda *_: nothing, streak_px
-        ),
-        ImageError,
-    )
+    tracker = pipeline.FrameTracker()
+    tracker.camera = CAMERA
+    tracker.settings = Settings()
+    tracker.solve_centroids = lambda *_, **__: Attitude("not solved")
+    answered(lambda: tracker.solve(hostile, streak_px), ImageError)
     frame, _ = starry(rng)
     clock = Clock()
     seen = pipeline.detect_and_centroid(frame, CAMERA, Settings(), clock, streak_px)

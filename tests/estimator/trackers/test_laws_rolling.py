@@ -202,7 +202,6 @@ def test_leds_of_a_rolling_shutter_frame_are_solved_at_the_middle_row_s_time() -
 
 
 @law(
-    rolling_shutter.solve_rolling,
     rolling_shutter.solve_lights,
     rolling_shutter.candidates,
     rolling_shutter.with_streak_rate,
