@@ -130,21 +130,6 @@ def select_responses(lines: PointTable, responses: Sequence[str]) -> PointTable:
     )
 
 
-def cells(rows: PointRows) -> tuple[list[str], list[list[str]]]:
-    """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
-    if not rows:
-        return [], []
-    texts = [
-        [
-            str(one.point),
-            *map(format_level, one.levels.values()),
-            *(format_response(one, name) for name in one.responses),
-        ]
-        for one in rows
-    ]
-    return ["point", *rows[0].levels, *rows[0].responses], texts
-
-
 def format_level(value: Any) -> str:
     """Text of a factor's level, numbers rounded to four digits."""
     if isinstance(value, float):

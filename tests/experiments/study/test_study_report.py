@@ -30,7 +30,8 @@ from skysim.experiments.study.table import (
     Index,
     PointRow,
     PointTable,
-    cells,
+    format_level,
+    format_response,
     has_few_values,
     table,
     without_responses,
@@ -199,12 +200,20 @@ def test_every_number_of_the_report_is_the_store_s(tmp_path: Path) -> None:
     path = filled(tmp_path / "s.sqlite", asked, failed=3)
     _, html = written(path, asked)
     with store.open_store(path) as kept:
-        counts, heads, rows = kept.counts(), *cells(table(kept, asked.responses))
+        counts, lines = kept.counts(), table(kept, asked.responses)
     said = f"{counts['done']} of {9 * 20} trials, {counts['failed']} failed, {counts['wrong']} wrong attitudes"
     assert html.said["verdict bad"].startswith(said)
     assert (counts["failed"], counts["wrong"]) == (3, 0)
     assert dict(html.tables["Scene"])["code version"] == "cafe0123"
-    assert html.tables[POINTS] == [heads, *rows]
+    assert html.tables[POINTS][0] == ["point", "dome", "tilt", *asked.responses]
+    assert html.tables[POINTS][1:] == [
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
+        for one in lines
+    ]
     assert html.tables["Runs"][1:] == [["pool", "2", "180", "4.0", "45"]]
     assert html.said["pre"] == "title: Which <dome>?"
     assert "Not finished" not in html.said["verdict bad"]

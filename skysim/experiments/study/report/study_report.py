@@ -18,7 +18,7 @@ from skysim.experiments.study.report.overview import Overview, overview
 from skysim.experiments.study.table import (
     Index,
     PointTable,
-    cells,
+    format_level,
     format_response,
     format_summary,
     indices,
@@ -301,18 +301,21 @@ def points_section(
     lines: PointTable, front: Sequence[int], costs: Mapping[int, float]
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
-    heads, texts = cells(lines)
+    heads = ["point", *lines.axes, *(lines[0].responses if lines else ())]
     named = [name for name, one in lines.axes.items() if not one.numeric]
     columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, row_texts in zip(lines[:ROWS], texts, strict=False):
-        keys = [line.point, *(one.at(line) for one in lines.axes.values())]
-        keys += [one.value for one in line.responses.values()]
-        row: list[Any] = [
-            Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)
+    for line in lines[:ROWS]:
+        tone: Tone = "marked" if line.point in front else ""
+        row: list[Any] = [Cell(str(line.point), tone, line.point)]
+        row += [
+            Cell(format_level(line.levels[name]), key=one.at(line))
+            for name, one in lines.axes.items()
         ]
-        if line.point in front:
-            row[0] = row[0]._replace(tone="marked")
+        row += [
+            Cell(format_response(line, name), key=one.value)
+            for name, one in line.responses.items()
+        ]
         if lines.study.optimize:
             row.append(costs.get(line.point))
         rows.append(row)
