@@ -34,7 +34,6 @@ from skysim.experiments.study.plan import (
     FlightTrial,
     FrameTrial,
     Plan,
-    TrialSpec,
     resolve_point,
 )
 from skysim.results import run_report, scoring, telemetry_report
@@ -99,39 +98,35 @@ class ChunkQueue:
         (M,) trial numbers in the order in which they run
     ends
         Where in them segments end: trial numbers are not consecutive, the point or the hardware is another
-    spec
-        Specification of the trials, if their hardware is drawn
     """
 
     def __init__(
         self,
+        plan: Plan,
         points: Sequence[Point],
-        replicates: int,
         missing: Ints,
         first: int = 0,
-        spec: TrialSpec | None = None,
-        seconds: float = CHUNK_S,
-        limited: bool = False,
+        workers: int = 1,
     ) -> None:
-        """Order the trials by point, or if time is `limited` by replicate, so that no point stays empty.
+        """Order the trials by point, or if the study's time is limited by replicate, so that no point stays empty.
 
         Then all points run one replicate before the next one. Beyond the sixth, rounds are a fifth of the replicates
         before them, because trials of a point that run together are faster.
         """
         self.points = points
-        self.replicates = replicates
-        if limited:
+        self.replicates = replicates = plan.study.replicates
+        if plan.study.budget.time_s is not None:
             rounds = np.floor(4 * np.log2(1 + missing % replicates))
             missing = missing[np.lexsort((missing, rounds))]
         self.missing = missing
         self.first = first
-        self.spec = spec
-        self.seconds = seconds
+        self.spec = plan.spec
+        self.seconds = chunk_seconds(workers)
         self.position = 0
         self.size = 1
         apart = (np.diff(missing) != 1) | (missing[1:] % replicates == 0)
         self.ends = np.append(
-            np.flatnonzero(apart | bool(spec and spec.hardware)) + 1, len(missing)
+            np.flatnonzero(apart | bool(plan.spec.hardware)) + 1, len(missing)
         )
 
     def next(self) -> Chunk:
@@ -151,8 +146,7 @@ class ChunkQueue:
     def _segment(self, trials: Ints) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
-        if self.spec:
-            settings = self.spec.trial_settings(settings, replicate)
+        settings = self.spec.trial_settings(settings, replicate)
         return Segment(
             point, settings, int(trials[0]), range(replicate, replicate + len(trials))
         )
@@ -301,15 +295,7 @@ def run(
     failed_before = store.counts()["failed"]
     progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
     budget = plan.study.budget
-    queue = ChunkQueue(
-        points,
-        replicates,
-        missing,
-        first,
-        plan.spec,
-        chunk_seconds(engine.workers),
-        budget.time_s is not None,
-    )
+    queue = ChunkQueue(plan, points, missing, first, engine.workers)
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
         for batch in rows:
@@ -386,9 +372,8 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
         raise InputError(
             f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}"
         )
-    point, replicate = divmod(trial, each)
-    settings = plan.spec.trial_settings(points[point].settings, replicate)
-    return Segment(point, settings, trial, range(replicate, replicate + 1))
+    (segment,) = ChunkQueue(plan, points, np.array([trial])).next()
+    return segment
 
 
 def replay(
