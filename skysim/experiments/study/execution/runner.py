@@ -30,6 +30,7 @@ from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import (
+    Budget,
     CentroidTrial,
     FlightTrial,
     FrameTrial,
@@ -62,6 +63,8 @@ class Progress:
         Numbers of trials in the store: all, failed ones, and those with a wrong attitude
     now
         Number of trials done by this run since `began`
+    uncounted
+        Number of failed trials that the budget does not count
     """
 
     trials: int
@@ -70,11 +73,23 @@ class Progress:
     wrong: int = 0
     now: int = 0
     began: float = field(default_factory=time.perf_counter)
+    uncounted: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Time since this run began."""
+        return time.perf_counter() - self.began
 
     @property
     def rate(self) -> float:
         """Trials per second of this run."""
-        return self.now / max(time.perf_counter() - self.began, 1e-9)
+        return self.now / max(self.seconds, 1e-9)
+
+    def exceeds(self, budget: Budget) -> bool:
+        """Whether the time or the failures of a budget are spent."""
+        return (budget.time_s is not None and self.seconds > budget.time_s) or (
+            budget.failures is not None and self.failed - self.uncounted >= budget.failures
+        )
 
     def add(self, rows: list[Row]) -> None:
         """Count finished rows."""
@@ -283,18 +298,25 @@ def run(
     watch: Watch | None = None,
     points: Sequence[Point] = (),
     first: int = 0,
+    total: Progress | None = None,
 ) -> Progress:
     """Run all missing trials of a plan, or of these `points` numbered from `first`, within its time and failures.
 
     Rows are stored before they are counted, so a killed run loses at most the chunks in flight.
+
+    Parameters
+    ----------
+    total
+        Progress of the search that these points are part of
     """
     points = points or plan.points
     replicates = plan.study.replicates
     numbers = np.arange(first * replicates, (first + len(points)) * replicates)
     missing = numbers[~store.done(int(numbers[-1]) + 1)[numbers]]
-    failed_before = store.counts()["failed"]
-    progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
-    budget = plan.study.budget
+    failed = store.counts()["failed"]
+    own = Progress(len(numbers), len(numbers) - len(missing), failed, uncounted=failed)
+    progress = total or own
+    before = progress.now
     queue = ChunkQueue(plan, points, missing, first, engine.workers)
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
@@ -303,25 +325,13 @@ def run(
             progress.add(batch)
             if watch:
                 watch(progress)
-            out_of_time = (
-                budget.time_s is not None
-                and time.perf_counter() - progress.began > budget.time_s
-            )
-            if out_of_time or (
-                budget.failures is not None
-                and progress.failed - failed_before >= budget.failures
-            ):
+            if progress.exceeds(plan.study.budget):
                 break
     finally:
         if hasattr(rows, "close"):
             rows.close()
-        if progress.now:
-            store.record_run(
-                engine.name,
-                engine.workers,
-                progress.now,
-                time.perf_counter() - progress.began,
-            )
+        if done := progress.now - before:
+            store.record_run(engine.name, engine.workers, done, own.seconds)
     return progress
 
 
