@@ -163,9 +163,11 @@ def format_response(row: PointRow, name: str) -> str:
 def to_columns(rows: PointRows) -> dict[str, list[Any]]:
     """The rows as columns: point, factors, and value, low, high and trial count of each response."""
     columns: dict[str, list[Any]] = {"point": [one.point for one in rows]}
-    for name in rows[0].levels if rows else ():
+    if not rows:
+        return columns
+    for name in rows[0].levels:
         columns[name] = [one.levels[name] for one in rows]
-    for name in rows[0].responses if rows else ():
+    for name in rows[0].responses:
         for field in Summary._fields:
             key = name if field == "value" else f"{name}_{field}"
             columns[key] = [getattr(one.responses[name], field) for one in rows]

@@ -42,7 +42,6 @@ from skysim.results.files import recording
 from skysim.results.run import Recorder
 from skysim.simulation.checks import check
 from skysim.simulation.lab import Lab
-from skysim.tracking import factory
 
 # Run time of a chunk: long relative to its overhead, short in case a worker dies.
 CHUNK_S = 0.25
@@ -473,8 +472,7 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
             assert shot.report is not None
             return shot.frame, shot.truth, shot.report
     frame, truth, streak_px = trials.render_trial_frame(setup, seed)
-    rate = trials.gyro_rate(setup, truth)
-    solve = partial(factory.solve_frame, setup.estimator, frame, streak_px, rate)
+    solve = partial(trials.lost_in_space, setup, frame, truth, streak_px)
     return frame, truth, solve_or_failed(solve)
 
 

@@ -257,9 +257,7 @@ def run_frame_trial(setup: TrialSetup, seed: int) -> Outcome:
     if moving.tracked:
         report = tracked_report(setup, moving, frame)
     else:
-        report = factory.solve_frame(
-            setup.estimator, frame, moving.streak_px, gyro_rate(setup, truth)
-        )
+        report = lost_in_space(setup, frame, truth, moving.streak_px)
     return score(setup.lab, setup.estimator, report, true_lights(truth))
 
 
@@ -479,14 +477,14 @@ def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotat
     return now * then.inv()
 
 
-def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
-    """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
-    assert isinstance(setup.trial, FrameTrial)
-    return (
-        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3))
-        if setup.trial.gyro
-        else None
+def lost_in_space(
+    setup: TrialSetup, frame: Frame, truth: Truth, streak_px: tuple[float, float] | None
+) -> Report:
+    """The report on a frame trial's frame alone. The trial's gyro measures the rate without an error."""
+    rate = (
+        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if streak_px else None
     )
+    return factory.solve_frame(setup.estimator, frame, streak_px, rate)
 
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:

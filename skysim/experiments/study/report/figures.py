@@ -53,8 +53,11 @@ def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> Non
 
 
 def color_scale(values: Floats, figure: Heat | Map) -> Record:
-    """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
-    from matplotlib.colors import Normalize
+    """Color map and normalization of a response: every proportion has the same, from 0 to 1.
+
+    Others extend over the finite values; a valid default range if all are equal or there are none.
+    """
+    from matplotlib.colors import LogNorm, Normalize
 
     share = is_proportion(figure.response)
     if share and not figure.log:
@@ -62,19 +65,13 @@ def color_scale(values: Floats, figure: Heat | Map) -> Record:
     colors = SHARE_COLORS if share else COLORS
     if split_name(figure.response)[0] in MORE_IS_BETTER:
         colors += "_r"
-    return {"cmap": colors, "norm": color_norm(values, figure.log)}
-
-
-def color_norm(values: Floats, log: bool) -> Any:
-    """Color normalization over the finite values; a valid default range if all are equal or there are none."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    finite = values[np.isfinite(values) & ((values > 0) | (not log))]
+    finite = values[np.isfinite(values) & ((values > 0) | (not figure.log))]
     low = float(finite.min()) if len(finite) else 0.5
     high = float(finite.max()) if len(finite) else 1.0
     if high <= low:
         high = low + (abs(low) or 1.0)
-    return LogNorm(low, high, clip=True) if log else Normalize(low, high)
+    norm = LogNorm(low, high, clip=True) if figure.log else Normalize(low, high)
+    return {"cmap": colors, "norm": norm}
 
 
 def ticks(low: float, high: float) -> tuple[Any, Any]:
@@ -145,7 +142,7 @@ def draw_curve(fig: Any, lines: PointTable, figure: Curve) -> None:
     axes = fig.subplots()
     x_axis = lines.axes[figure.x]
     shown = series(lines, figure)
-    dots = draws_medians(lines.study, x_axis, sum(len(one.x) for one in shown))
+    dots = draws_medians(lines, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_axis(axes, "x", x_axis)
     if (expected := expected_value(figure.y)) is not None:

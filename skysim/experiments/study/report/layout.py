@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.types import Bools, Floats, Ints
-from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.plan import Curve, Figure, Heat, Search
 from skysim.experiments.study.table import (
     Axis,
     PointRows,
@@ -82,9 +82,9 @@ class Panel(NamedTuple):
     bounds: list[float]
 
 
-def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
+def draws_medians(lines: PointTable, x_axis: Axis, count: int) -> bool:
     """Whether medians are drawn instead of intervals: sampled points that are many or share a non-numeric axis."""
-    return study.is_sampled and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)
+    return lines.study.is_sampled and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)
 
 
 # Selection of figures and of their points.
@@ -286,7 +286,7 @@ def fixed_text(figure: Figure, lines: PointTable) -> str:
 def curve_note(figure: Curve, lines: PointTable, summaries: Sequence[metrics.Summary]) -> str:
     """The meaning of the lines and bars of a curve."""
     x_axis = lines.axes[figure.x]
-    if draws_medians(lines.study, x_axis, len(summaries)):
+    if draws_medians(lines, x_axis, len(summaries)):
         return f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points"
     if np.isnan([one.low for one in summaries]).all():
         return ""
