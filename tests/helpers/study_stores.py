@@ -6,8 +6,12 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
-from skysim.experiments.study import plan
+import yaml
+
+from skysim.core.types import Ints
+from skysim.experiments.study import plan, study_file
 from skysim.experiments.study.execution import engines, runner, store
+from skysim.experiments.study.factors import Point
 
 STRAYS = """
 schema: 1
@@ -31,6 +35,24 @@ def contents(path: Path) -> str:
     ]
     db.close()
     return repr(tables)
+
+
+def queue_of(
+    points: list[Point],
+    replicates: int,
+    missing: Ints,
+    first: int = 0,
+    workers: int = 1,
+    budget: str = "{}",
+) -> runner.ChunkQueue:
+    """The chunks of a study of these points."""
+    tree = yaml.safe_load(STRAYS) | {
+        "replicates": replicates,
+        "budget": yaml.safe_load(budget),
+    }
+    study = plan.Study.model_validate(tree)
+    made = study_file.make_plan(Path("strays.yaml"), study, tree["trial"], {}, "")
+    return runner.ChunkQueue(made, points, missing, first, workers)
 
 
 def done(

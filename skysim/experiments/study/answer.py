@@ -11,17 +11,12 @@ import numpy as np
 import scipy
 
 from skysim.experiments.study import thresholds
-from skysim.experiments.study.factors import Value
-from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import (
-    Place,
     PointRow,
     PointRows,
-    axis,
-    format_level,
+    PointTable,
     format_summary,
     has_few_values,
-    varied_factors,
 )
 from skysim.results.metrics import (
     CONFIDENCE,
@@ -49,7 +44,7 @@ CLAIMED = "Are the claimed errors true?"
 POWER = 0.8  # probability with which a stated factor is noticed
 
 
-def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sentences:
+def claimed_errors(lines: PointTable, survey_share: float) -> Sentences:
     """Sentences on whether the claimed errors are true at all points, by the intervals of the mean NEES.
 
     Trials that share a survey cannot decide it if `survey_share` of the variance is the survey's, unless the mean NEES
@@ -90,7 +85,7 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sente
         if all(one.low >= low and one.high <= high for one, _ in found):
             return [f"{CLAIMED} Yes: NEES is {low:g} to {high:g}{at}{together}."]
         widest, line = max(found, key=lambda pair: pair[0].high - pair[0].low)
-        named = f" at {place(line)}{together}" if len(known) > 1 else ""
+        named = f" at {lines.place(line)}{together}" if len(known) > 1 else ""
         between = f"{widest.low:.3g} to {widest.high:.3g}"
         factor = noticed(widest, len(known))
         return [
@@ -101,7 +96,7 @@ def claimed_errors(lines: PointRows, place: Place, survey_share: float) -> Sente
     factor = math.sqrt(worst.value / 3)
     size = "small" if factor >= 1 else "large"
     factor = max(factor, 1 / factor)
-    at = f" at {place(line)}" if len(known) > 1 else ""
+    at = f" at {lines.place(line)}" if len(known) > 1 else ""
     count = f", at {len(false)} of {len(known)} points" if len(known) > 1 else ""
     wrong = line.responses.get("wrong", NO_VALUE).value
     cause = ", wrong attitudes included" if wrong > 0 else ""
@@ -138,7 +133,7 @@ def noticed(nees: Summary, points: int) -> float:
     return math.sqrt(TRUE_NEES[1] / 3 * (nees.value / nees.low) ** ratio)
 
 
-def effect_of_wrong_matches(lines: PointRows, place: Place) -> Sentences:
+def effect_of_wrong_matches(lines: PointTable) -> Sentences:
     """Sentences on wrong matches, and on whether they make the attitude err more than claimed; none without them."""
     known = [line.responses.get("mismatched", NO_VALUE) for line in lines]
     shares = [one for one in known if one.value > 0]
@@ -154,7 +149,7 @@ def effect_of_wrong_matches(lines: PointRows, place: Place) -> Sentences:
     most = line.responses["misled"]
     at = " in"
     if len(lines) > 1:
-        at = f" at {len(misled)} of {len(lines)} points, most at {place(line)}:"
+        at = f" at {len(misled)} of {len(lines)} points, most at {lines.place(line)}:"
     share = f"{percent(most.value)} of the frames ({interval(most)})"
     return [f"{text}; the attitude errs more than claimed{at} {share}."]
 
@@ -195,8 +190,7 @@ RESPONSES = (*SHARES, "mismatched", "nees")
 
 
 def headline(
-    study: Study,
-    lines: PointRows,
+    lines: PointTable,
     may_be_ambiguous: bool,
     worst: str = "skysim study worst STUDY",
     judged: Sequence[Sequence[Judgment]] = (),
@@ -220,33 +214,31 @@ def headline(
     done = answered(lines)
     if not done:
         return []
-    place = placer(study, done)
-    found = [thresholds.requirement_text(one, done, place) for one in judged]
-    for threshold in study.thresholds:
-        found += thresholds.sentences(threshold, study, done)
-    found.append(solved_everywhere(study, done, place, worst))
+    found = [thresholds.requirement_text(one, done) for one in judged]
+    for threshold in lines.study.thresholds:
+        found += thresholds.sentences(threshold, done)
+    found.append(solved_everywhere(done, worst))
     if may_be_ambiguous:
-        found.append(ambiguity(study, done, place))
+        found.append(ambiguity(done))
     for name, text in EVENTS.items():
-        found.append(event(text, [line.responses[name] for line in done], done, place))
-        found += effect_of_wrong_matches(done, place) if name == "misidentified" else []
+        found.append(event(text, [line.responses[name] for line in done], done))
+        found += effect_of_wrong_matches(done) if name == "misidentified" else []
     return [
         *found,
         *runs_needed(done, list(EVENTS)),
-        *claimed_errors(done, place, survey_share),
+        *claimed_errors(done, survey_share),
     ]
 
 
-def answered(lines: PointRows) -> list[PointRow]:
+def answered(lines: PointTable) -> PointTable:
     """The points with a trial that has an answer."""
-    return [
+    return lines.with_rows(
         line for line in lines if line.trials and np.isfinite(line.responses["wrong"].value)
-    ]
+    )
 
 
 def verdict(
-    study: Study,
-    lines: PointRows,
+    lines: PointTable,
     judged: Sequence[Sequence[Judgment]] = (),
     survey_share: float = 0.0,
 ) -> str:
@@ -258,34 +250,28 @@ def verdict(
     done = answered(lines)
     if not done:
         return ""
-    place = placer(study, done)
+    study = lines.study
     frame = "attitude" if study.trial.kind == "centroids" else "frame"
     sentences = []
     for one in judged:
         worst, where = thresholds.decisive(one)
         sentences.append(f"`{one[worst].claim}` is {one[worst].answer}{where}.")
-    sentences += [thresholds.brief(threshold, study, done) for threshold in study.thresholds]
+    sentences += [thresholds.brief(threshold, done) for threshold in study.thresholds]
     sentences += [
         worst_share(
-            "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done, place
+            "refused", f"Every {frame} is solved", f"of the {frame}s are refused", done
         ),
         worst_share(
-            "wrong",
-            "No attitude is wrong",
-            f"of the {frame}s give a wrong attitude",
-            done,
-            place,
+            "wrong", "No attitude is wrong", f"of the {frame}s give a wrong attitude", done
         ),
     ]
     sentences += [
-        one
-        for one in claimed_errors(done, place, survey_share)
-        if one.startswith(f"{CLAIMED} No:")
+        one for one in claimed_errors(done, survey_share) if one.startswith(f"{CLAIMED} No:")
     ]
     return " ".join(sentence[:1].upper() + sentence[1:] for sentence in sentences if sentence)
 
 
-def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place) -> str:
+def worst_share(name: str, never: str, text: str, lines: PointTable) -> str:
     """A sentence such as "No attitude is wrong (in 12,000).", or the fraction at the point where it is largest."""
     worst = max(lines, key=lambda line: np.nan_to_num(line.responses[name].value))
     share = worst.responses[name]
@@ -300,31 +286,17 @@ def worst_share(name: str, never: str, text: str, lines: PointRows, place: Place
         return f"{never} (in {count})."
     if len(lines) == 1:
         return f"{percent(share.value)} {text} ({interval(share)})."
-    return f"Up to {percent(share.value)} {text}, most at {place(worst)}."
+    return f"Up to {percent(share.value)} {text}, most at {lines.place(worst)}."
 
 
-def ranges(study: Study, lines: PointRows) -> Sentences:
+def ranges(lines: PointTable) -> Sentences:
     """Smallest and largest value over the points of each response that the headline is not about."""
-    done = [line for line in lines if line.trials]
+    done = lines.with_rows(line for line in lines if line.trials)
     if not done:
         return []
-    place = placer(study, done)
     return [
-        response_range(name, done, place) for name in study.responses if name not in SHARES
+        response_range(name, done) for name in lines.study.responses if name not in SHARES
     ]
-
-
-def placer(study: Study, lines: PointRows) -> Place:
-    """The function that names a point by the levels that vary: "leds = 900, rate = 8 deg/s"."""
-    varied = varied_factors(study, lines)
-    units = {name: axis(study, lines, name).unit for name in varied}
-
-    def named(name: str, level: Value) -> str:
-        return f"{name} = {format_level(level)}" + (
-            "" if isinstance(level, str) else units[name]
-        )
-
-    return lambda line: ", ".join(named(name, line.levels[name]) for name in varied)
 
 
 def valued(name: str, lines: PointRows) -> list[PointRow]:
@@ -343,7 +315,7 @@ def extremes(name: str, lines: PointRows) -> list[tuple[PointRow, str]]:
     return [(line, format_summary(line.responses[name])) for line in ends]
 
 
-def response_range(name: str, lines: PointRows, place: Place) -> str:
+def response_range(name: str, lines: PointTable) -> str:
     """Smallest and largest value of a response over the points, as a sentence."""
     points = valued(name, lines)
     if not points:
@@ -353,22 +325,21 @@ def response_range(name: str, lines: PointRows, place: Place) -> str:
         return f"{name}: {low}" + (
             f" at all {len(points)} points." if len(points) > 1 else "."
         )
-    return f"{name}: {low} at {place(least)}, to {high} at {place(most)}."
+    return f"{name}: {low} at {lines.place(least)}, to {high} at {lines.place(most)}."
 
 
-def range_rows(study: Study, lines: PointRows) -> list[list[str]]:
+def range_rows(lines: PointTable) -> list[list[str]]:
     """A row per response: name, least value and its point, largest value and its point."""
-    done = [line for line in lines if line.trials]
-    place = placer(study, done)
+    done = lines.with_rows(line for line in lines if line.trials)
     rows = []
-    for name in study.responses:
+    for name in lines.study.responses:
         if points := valued(name, done):
             (least, low), (most, high) = extremes(name, points)
-            rows.append([name, low, place(least), high, place(most)])
+            rows.append([name, low, done.place(least), high, done.place(most)])
     return rows
 
 
-def event(text: str, shares: Sequence[Summary], lines: PointRows, place: Place) -> str:
+def event(text: str, shares: Sequence[Summary], lines: PointTable) -> str:
     """How often an event happens: the point where it is most frequent, and an upper bound where it was never seen."""
     pairs = zip(shares, lines, strict=True)
     known = [(share, line) for share, line in pairs if np.isfinite(share.value)]
@@ -380,14 +351,12 @@ def event(text: str, shares: Sequence[Summary], lines: PointRows, place: Place) 
     most, line = max(known, key=lambda pair: pair[0].value)
     where = ""
     if len(known) > 1:
-        where = (
-            f" at {len(known) - len(never)} of {len(known)} points, most at {place(line)}:"
-        )
+        where = f" at {len(known) - len(never)} of {len(known)} points, most at {lines.place(line)}:"
     found = f"{text}:{where} {percent(most.value)} of the frames ({interval(most)})"
     return f"{found}; {none_of(never)} at the other points." if never else f"{found}."
 
 
-def ambiguity(study: Study, lines: PointRows, place: Place) -> str:
+def ambiguity(lines: PointTable) -> str:
     """A sentence on attitudes whose lights fit another attitude as well: refused as ambiguous, or misled."""
     shares = []
     for line in lines:
@@ -395,17 +364,17 @@ def ambiguity(study: Study, lines: PointRows, place: Place) -> str:
         either = refused.value + np.nan_to_num(line.responses["misled"].value)
         share = proportion(round(either * refused.trials), refused.trials)
         shares.append(share._replace(value=either))
-    unit = ", each with hardware of its own" if study.hardware else ""
-    text = event("Ambiguous or misled", shares, lines, place)
+    unit = ", each with hardware of its own" if lines.study.hardware else ""
+    text = event("Ambiguous or misled", shares, lines)
     never = all(share.value == 0 for share in shares)
     return f"Is it ambiguous anywhere{unit}? {'No' if never else 'Yes'}. {text}"
 
 
-def solved_everywhere(study: Study, lines: PointRows, place: Place, worst: str) -> str:
+def solved_everywhere(lines: PointTable, worst: str) -> str:
     """A sentence on whether every attitude is solved, and how often and where the tracker refuses one."""
     shares = [line.responses["refused"] for line in lines]
-    text = event("Refused (no attitude is returned)", shares, lines, place)
-    what = "attitude" if study.trial.kind == "centroids" else "frame"
+    text = event("Refused (no attitude is returned)", shares, lines)
+    what = "attitude" if lines.study.trial.kind == "centroids" else "frame"
     if all(share.value == 0 for share in shares):
         return f"Is every {what} solved? Yes. {text}"
     return f"Is every {what} solved? No. {text} `{worst} --response refused` names the worst."

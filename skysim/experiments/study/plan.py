@@ -36,7 +36,14 @@ from skysim.core.units import (
     Triple,
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
-from skysim.experiments.study.factors import Design, Factor, Point, Settings, Value
+from skysim.experiments.study.factors import (
+    SAMPLED_DESIGNS,
+    Design,
+    Factor,
+    Point,
+    Settings,
+    Value,
+)
 from skysim.results.files.parts import Prices
 from skysim.scene import loader
 from skysim.scene.scene import Requirements, Scene
@@ -449,6 +456,11 @@ class Study(ConfigModel):
         if isinstance(design, dict) and design.get("kind") in ("lhs", "sobol"):
             return {"paired": False} | tree
         return tree
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether no two points share a level: a design in SAMPLED_DESIGNS, or an optimization."""
+        return self.optimize is not None or self.design.kind in SAMPLED_DESIGNS
 
     @property
     def search(self) -> Search:

@@ -7,9 +7,7 @@ them. The result is the feasible candidate with the best objective or, with two 
 
 import json
 import math
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -312,10 +310,12 @@ def search(
                 f"candidate {n} is {stored[n].levels}, the sampler now proposes {point.levels}",
                 "the version of optuna that started the search, or another store",
             )
-        refused = study.replicates * sum(one.refused for one in evaluated.values())
-        if not run_candidate(plan, store, engine, n, point, total, refused, watch):
+        total.uncounted = study.replicates * sum(one.refused for one in evaluated.values())
+        run_candidate(plan, store, engine, n, point, total, watch)
+        columns = store.point_columns(n)
+        if len(columns["trial"]) < study.replicates:  # the budget is spent
             return collect_result(plan, store)
-        evaluated[key_of(point)] = evaluate_candidate(plan, n, point, store.point_columns(n))
+        evaluated[key_of(point)] = evaluate_candidate(plan, n, point, columns)
         report_to_sampler(sampler, proposal, config, evaluated[key_of(point)])
     return collect_result(plan, store)
 
@@ -396,48 +396,37 @@ def report_to_sampler(
 
 
 def run_candidate(
-    plan: Plan, store: Store, engine: Engine, number: int, point: Point, total: Progress, refused: int,
+    plan: Plan,
+    store: Store,
+    engine: Engine,
+    number: int,
+    point: Point,
+    total: Progress,
     watch: Watch | None,
-) -> bool:  # fmt: skip
-    """Run the missing replicates of a candidate. Returns False if the budget is spent before all are in the store.
+) -> None:
+    """Run the missing replicates of a candidate, until the budget of the whole search is spent.
 
     Parameters
     ----------
     total
-        Progress of the whole search, passed to `watch`
-    refused
-        Number of failed trials of invalid scenes, which the budget does not count
+        Progress of the whole search; failed trials of invalid scenes are uncounted in it
     """
-    # Budgets are for the whole search: subtract the time spent, and the failures of earlier candidates.
-    before = replace(total)
-    budget = plan.study.budget
-    left_s = (
-        None if budget.time_s is None else budget.time_s - (time.perf_counter() - total.began)
-    )
-    if left_s is not None and left_s <= 0:
-        return False
-    failures = budget.failures and budget.failures + refused - before.failed
-    budget = budget.model_copy(update={"time_s": left_s, "failures": failures})
-    limited = replace(plan, study=plan.study.model_copy(update={"budget": budget}))
+    time_s = plan.study.budget.time_s
+    if time_s is not None and total.seconds >= time_s:
+        return
 
     def watch_candidate(progress: Progress) -> None:
-        total.done = before.done + progress.now
-        total.now = before.now + progress.now
-        total.failed = progress.failed
-        total.wrong = before.wrong + progress.wrong
         if watch:
-            watch(total)
-        if progress.failed > refused and scene_error(store.point_columns(number)):
+            watch(progress)
+        if progress.failed > progress.uncounted and scene_error(store.point_columns(number)):
             raise InvalidScene
 
     try:
-        progress = run(limited, store, engine, watch_candidate, [point], number)
+        run(plan, store, engine, watch_candidate, [point], number, total)
     except InvalidScene:
         rows = failed_rows(plan, store, number)
         store.add(rows)
         total.add(rows)
-        return True
-    return progress.done == progress.trials
 
 
 def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:

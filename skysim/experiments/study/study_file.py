@@ -209,10 +209,9 @@ def check(plan: Plan, to_run: bool) -> None:
 def check_figures(plan: Plan) -> None:
     """Raise InputError for a figure or threshold of an unknown factor, level or response."""
     from skysim.experiments.study import table, thresholds
-    from skysim.experiments.study.table import PointRow
 
     study = plan.study
-    rows = [PointRow(k, point.levels, {}) for k, point in enumerate(plan.points)]
+    lines = table.without_responses(study, plan.points)
     for where, one in named_sections(study):
         for key, factor in one.axes.items():
             if factor is not None:
@@ -225,10 +224,10 @@ def check_figures(plan: Plan) -> None:
                 "curve, heat",
             )
         if isinstance(one, Threshold):
-            thresholds.check(one, where, study, rows)
+            thresholds.check(one, where, lines)
         if plan.points:
             try:
-                table.fixed_levels(one, study, rows)
+                lines.fixed_levels(one)
             except InputError as error:
                 raise error.under(where) from None
 

@@ -1,9 +1,12 @@
 """Result tables of a study: one line per point with every response and its interval, and one row per trial."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,9 +17,10 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
-    SAMPLED_DESIGNS,
     Distribution,
+    Factor,
     Levels,
+    Point,
     Range,
     Value,
     split_quantity,
@@ -41,7 +45,6 @@ class PointRow(NamedTuple):
 
 
 PointRows = Sequence[PointRow]
-Place = Callable[[PointRow], str]  # names a point in words
 
 
 def table(store: Store, responses: Sequence[str]) -> list[PointRow]:
@@ -92,9 +95,8 @@ def rank_correlations(plan: Plan, columns: Columns) -> list[tuple[str, str, Summ
     The interval is tanh(atanh r +- z sqrt((1 + r^2 / 2) / (n - 3))) (Bonett & Wright 2000), for all correlations
     together; none of fewer than FEWEST trials, or of equal values.
     """
-    lines = [PointRow(n, one.levels, {}) for n, one in enumerate(plan.points)]
-    axes = {name: axis(plan.study, lines, name) for name in plan.study.factors}
-    numeric = [name for name, one in axes.items() if one.numeric]
+    lines = without_responses(plan.study, plan.points)
+    numeric = [name for name, one in lines.axes.items() if one.numeric]
     pairs = list(itertools.product(quantities(plan.study.responses), numeric))
     found = []
     for quantity, name in pairs:
@@ -103,7 +105,7 @@ def rank_correlations(plan: Plan, columns: Columns) -> list[tuple[str, str, Summ
         count = int(known.sum())
         if count < metrics.FEWEST or np.ptp(y[known]) == 0:
             continue
-        x = [axes[name].at(lines[n]) for n in columns["point"][known]]
+        x = [lines.axes[name].at(lines[n]) for n in columns["point"][known]]
         r = float(scipy.stats.spearmanr(x, y[known]).statistic)
         half = metrics.joint_sigmas(len(pairs)) * math.sqrt((1 + r**2 / 2) / (count - 3))
         low, high = np.tanh(np.arctanh(np.clip(r, -1, 1)) + np.array([-half, half])).tolist()
@@ -120,27 +122,12 @@ def has_few_values(row: PointRow, response: str) -> bool:
     return 0 < values < max(row.trials / 2, min(MIN_VALUES, row.trials))
 
 
-def select_responses(rows: PointRows, responses: Sequence[str]) -> list[PointRow]:
-    """The rows with only these responses."""
-    return [
+def select_responses(lines: PointTable, responses: Sequence[str]) -> PointTable:
+    """The points with only these responses."""
+    return lines.with_rows(
         one._replace(responses={name: one.responses[name] for name in responses})
-        for one in rows
-    ]
-
-
-def cells(rows: PointRows) -> tuple[list[str], list[list[str]]]:
-    """Column heads and cell texts of a table, such as `0.97 (0.95..0.98)`."""
-    if not rows:
-        return [], []
-    texts = [
-        [
-            str(one.point),
-            *map(format_level, one.levels.values()),
-            *(format_response(one, name) for name in one.responses),
-        ]
-        for one in rows
-    ]
-    return ["point", *rows[0].levels, *rows[0].responses], texts
+        for one in lines
+    )
 
 
 def format_level(value: Any) -> str:
@@ -176,9 +163,11 @@ def format_response(row: PointRow, name: str) -> str:
 def to_columns(rows: PointRows) -> dict[str, list[Any]]:
     """The rows as columns: point, factors, and value, low, high and trial count of each response."""
     columns: dict[str, list[Any]] = {"point": [one.point for one in rows]}
-    for name in rows[0].levels if rows else ():
+    if not rows:
+        return columns
+    for name in rows[0].levels:
         columns[name] = [one.levels[name] for one in rows]
-    for name in rows[0].responses if rows else ():
+    for name in rows[0].responses:
         for field in Summary._fields:
             key = name if field == "value" else f"{name}_{field}"
             columns[key] = [getattr(one.responses[name], field) for one in rows]
@@ -246,7 +235,7 @@ def switches_causes(study: Study) -> bool:
     levels = [
         [is_off(one) for one, _ in factor.options()] for factor in study.factors.values()
     ]
-    return not is_sampled(study) and all(sorted(one) == [False, True] for one in levels)
+    return not study.is_sampled and all(sorted(one) == [False, True] for one in levels)
 
 
 # (3, 2, D) first and total indices of each factor: values, low ends, high ends; their count; variance about one axis.
@@ -418,11 +407,6 @@ class Axis(NamedTuple):
 # Names and axes.
 
 
-def is_sampled(study: Study) -> bool:
-    """Whether the points are sampled, so that no two share a level: a design in SAMPLED_DESIGNS, or an optimization."""
-    return study.optimize is not None or study.design.kind in SAMPLED_DESIGNS
-
-
 def same(one: Value, other: Value) -> bool:
     """Whether two levels are equal, as numbers where possible: 5 equals 5.0, and "5 m" equals "5.0 m"."""
     try:
@@ -434,15 +418,6 @@ def same(one: Value, other: Value) -> bool:
 def distinct(levels: Iterable[Value]) -> list[Value]:
     """The levels without duplicates, in order of first appearance."""
     return list({repr(one): one for one in levels}.values())
-
-
-def varied_factors(study: Study, lines: PointRows) -> list[str]:
-    """The factors with more than one level among some points."""
-    return [
-        name
-        for name in study.factors
-        if len(distinct(line.levels[name] for line in lines)) > 1
-    ]
 
 
 def label(name: str, unit: str = "") -> str:
@@ -459,10 +434,8 @@ def label(name: str, unit: str = "") -> str:
     return f"{text} [share]" if metrics.is_proportion(name) else text
 
 
-def axis(study: Study, lines: PointRows, name: str) -> Axis:
+def axis(name: str, factor: Factor, levels: list[Value]) -> Axis:
     """The axis of a factor, with the levels at which there are points."""
-    factor = study.factors[name]
-    levels = distinct(line.levels[name] for line in lines)
     key = "" if isinstance(factor, Levels) else factor.key or ""
     unit = next((unit for ending, unit in UNITS.items() if key.endswith(ending)), "")
     numbers, own_unit = as_numbers(levels)
@@ -512,72 +485,104 @@ def suits_log_scale(numbers: Floats) -> bool:
     return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
 
 
-# Selection of points.
+# The points of a study.
 
 
-def fixed_levels(shown: Shown, study: Study, lines: PointRows) -> dict[str, Value]:
-    """The levels at which a figure or threshold keeps factors fixed.
+class PointTable(list[PointRow]):
+    """Points of a study, as the lines of a table."""
 
-    They are those of its `where`, and the first level of the other factors that it does not show. Sampled points share
-    no levels, so only `where` applies to them. Raises InputError if `where` names an unknown factor or level.
-    """
-    check_levels(shown.where, study, lines)
-    if is_sampled(study):
-        return dict(shown.where)
-    axes = set(shown.axes.values())
-    return {
-        name: shown.where.get(name, factor.options()[0][0])
-        for name, factor in study.factors.items()
-        if name not in axes or name in shown.where
-    }
+    def __init__(self, study: Study, rows: Iterable[PointRow]) -> None:
+        super().__init__(rows)
+        self.study = study
+
+    def with_rows(self, rows: Iterable[PointRow]) -> PointTable:
+        """Some points of the same study, or points with other responses."""
+        return PointTable(self.study, rows)
+
+    @cached_property
+    def axes(self) -> dict[str, Axis]:
+        """The axis of each factor."""
+        return {
+            name: axis(name, factor, distinct(line.levels[name] for line in self))
+            for name, factor in self.study.factors.items()
+        }
+
+    @cached_property
+    def varied(self) -> dict[str, Axis]:
+        """The axes of the factors with more than one level among the points."""
+        return {name: one for name, one in self.axes.items() if len(one.levels) > 1}
+
+    def place(self, line: PointRow) -> str:
+        """The levels of a point that vary: "leds = 900, rate = 8 deg/s"."""
+        levels = [(one, line.levels[name]) for name, one in self.varied.items()]
+        return ", ".join(
+            f"{one.factor} = {format_level(level)}{'' if isinstance(level, str) else one.unit}"
+            for one, level in levels
+        )
+
+    def fixed_levels(self, shown: Shown) -> dict[str, Value]:
+        """The levels at which a figure or threshold keeps factors fixed.
+
+        They are those of its `where`, and the first level of the other factors that it does not show. Sampled points
+        share no levels, so only `where` applies to them. Raises InputError if `where` names an unknown factor or level.
+        """
+        self.check_levels(shown.where)
+        if self.study.is_sampled:
+            return dict(shown.where)
+        shown_factors = set(shown.axes.values())
+        return {
+            name: shown.where.get(name, factor.options()[0][0])
+            for name, factor in self.study.factors.items()
+            if name not in shown_factors or name in shown.where
+        }
+
+    def check_levels(self, levels: Mapping[str, Value]) -> None:
+        """Raise InputError for an unknown factor, or a level at which there is no point."""
+        for name, level in levels.items():
+            check_name("where", "factor", name, self.study.factors)
+            available = distinct(line.levels[name] for line in self)
+            if not any(same(level, one) for one in available):
+                allowed = ", ".join(map(format_level, available[:20]))
+                raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
+
+    def at(self, levels: Mapping[str, Value]) -> list[PointRow]:
+        """The points at these levels. Raises InputError for an unknown factor or level."""
+        self.check_levels(levels)
+        return [
+            line
+            for line in self
+            if all(same(line.levels[name], one) for name, one in levels.items())
+        ]
+
+    def shown_in(self, shown: Shown) -> list[PointRow]:
+        """The points of a figure or threshold."""
+        return self.at(self.fixed_levels(shown))
+
+    def groups(self, shown: Shown) -> dict[str, list[PointRow]]:
+        """The points of a figure or threshold by the level of its `by`; under "" if it has none."""
+        lines = self.shown_in(shown)
+        name = shown.axes.get("by")
+        if name is None:
+            return {"": lines}
+        by = self.axes[name]
+        # A sampled factor has about as many levels as points: its sorted points are divided into GROUPS equal groups.
+        if self.study.is_sampled and by.numeric and len(by.levels) > 2 * GROUPS:
+            ordered = sorted(lines, key=by.at)
+            bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
+            parts = [ordered[begin:end] for begin, end in itertools.pairwise(bounds)]
+            return {
+                f"{by.at(part[0]):.3g} to {by.at(part[-1]):.3g}": part
+                for part in parts
+                if part
+            }
+        return {
+            by.tick_label(one): [line for line in lines if same(line.levels[name], one)]
+            for one in by.levels
+        }
 
 
-def shown_points(lines: PointRows, shown: Shown, study: Study) -> list[PointRow]:
-    """The table lines (points) of a figure or threshold."""
-    return points_at(lines, study, fixed_levels(shown, study, lines))
-
-
-def check_levels(levels: Mapping[str, Value], study: Study, lines: PointRows) -> None:
-    """Raise InputError for an unknown factor, or a level at which there is no point."""
-    for name, level in levels.items():
-        check_name("where", "factor", name, study.factors)
-        available = distinct(line.levels[name] for line in lines)
-        if not any(same(level, one) for one in available):
-            allowed = ", ".join(map(format_level, available[:20]))
-            raise InputError(f"where.{name}", f"unknown level {level!r}", allowed)
-
-
-def points_at(lines: PointRows, study: Study, levels: Mapping[str, Value]) -> list[PointRow]:
-    """The table lines (points) at these levels. Raises InputError for an unknown factor or level."""
-    check_levels(levels, study, lines)
-    return [
-        line
-        for line in lines
-        if all(same(line.levels[name], one) for name, one in levels.items())
-    ]
-
-
-def group_points(
-    all_lines: PointRows, shown: Shown, study: Study
-) -> dict[str, list[PointRow]]:
-    """The table lines of a figure or threshold by the level of its `by`; under "" if it has none."""
-    lines = shown_points(all_lines, shown, study)
-    name = shown.axes.get("by")
-    if name is None:
-        return {"": lines}
-    group_axis = axis(study, all_lines, name)
-    # A sampled factor has about as many levels as points: divide the sorted points into GROUPS groups of equal size.
-    if is_sampled(study) and group_axis.numeric and len(group_axis.levels) > 2 * GROUPS:
-        ordered = sorted(lines, key=group_axis.at)
-        bounds = [round(n * len(ordered) / GROUPS) for n in range(GROUPS + 1)]
-        groups = {}
-        for begin, end in itertools.pairwise(bounds):
-            if begin < end:
-                low = group_axis.at(ordered[begin])
-                high = group_axis.at(ordered[end - 1])
-                groups[f"{low:.3g} to {high:.3g}"] = ordered[begin:end]
-        return groups
-    return {
-        group_axis.tick_label(one): [line for line in lines if same(line.levels[name], one)]
-        for one in group_axis.levels
-    }
+def without_responses(study: Study, points: Iterable[Point]) -> PointTable:
+    """The points of a study without their trials."""
+    return PointTable(
+        study, (PointRow(n, point.levels, {}) for n, point in enumerate(points))
+    )

@@ -15,9 +15,8 @@ import scipy
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study import table
-from skysim.experiments.study.plan import Curve, Study, Threshold
-from skysim.experiments.study.table import Axis, Place, PointRows
+from skysim.experiments.study.plan import Curve, Threshold
+from skysim.experiments.study.table import Axis, PointRows, PointTable
 from skysim.results import metrics
 from skysim.results.requirements import MET, NOT_MET, NOT_SHOWN, Judgment, judge, requirement
 
@@ -174,27 +173,30 @@ def decisive(found: Sequence[Judgment]) -> tuple[int, str]:
     return worst, f" at {'all' if same == len(found) else f'{same} of'} {len(found)} points"
 
 
-def requirement_text(found: Sequence[Judgment], lines: PointRows, place: Place) -> str:
+def requirement_text(found: Sequence[Judgment], lines: PointTable) -> str:
     """Whether a requirement is met at all points, in a sentence with the point that decides."""
     worst, where = decisive(found)
-    return found[worst].text(f"{where}, most at {place(lines[worst])}" if where else "") + "."
+    return (
+        found[worst].text(f"{where}, most at {lines.place(lines[worst])}" if where else "")
+        + "."
+    )
 
 
 # Thresholds of a study.
 
 
-def check(threshold: Threshold, where: str, study: Study, rows: PointRows) -> None:
+def check(threshold: Threshold, where: str, lines: PointTable) -> None:
     """Raise InputError if the response is not a proportion, or the factor has no numeric levels."""
     name = threshold.response
     if not metrics.is_proportion(name):
         raise InputError(
             f"{where}.response", f"{name} is no proportion", "identified, coverage_4, ..."
         )
-    if table.is_sampled(study):
+    if lines.study.is_sampled:
         raise InputError(
             where, "points are sampled, without levels", "design factorial or one_at_a_time"
         )
-    axis = table.axis(study, rows, threshold.along)
+    axis = lines.axes[threshold.along]
     if not axis.numeric or len(axis.levels) < 2:
         raise InputError(
             f"{where}.along",
@@ -203,25 +205,24 @@ def check(threshold: Threshold, where: str, study: Study, rows: PointRows) -> No
         )
 
 
-def thresholds_of(curve: Curve, study: Study, lines: PointRows) -> list[Threshold]:
+def thresholds_of(curve: Curve, lines: PointTable) -> list[Threshold]:
     """The study's thresholds of a curve's response, along its x, at its levels."""
-    levels = table.fixed_levels(curve, study, lines)
+    levels = lines.fixed_levels(curve)
     shown = (curve.y, curve.x, curve.by)
     return [
         one
-        for one in study.thresholds
-        if (one.response, one.along, one.by) == shown
-        and table.fixed_levels(one, study, lines) == levels
+        for one in lines.study.thresholds
+        if (one.response, one.along, one.by) == shown and lines.fixed_levels(one) == levels
     ]
 
 
-def crossings(
-    threshold: Threshold, study: Study, lines: PointRows
-) -> dict[str, Crossing | None]:
+def crossings(threshold: Threshold, lines: PointTable) -> dict[str, Crossing | None]:
     """The crossing for each level of `by`, by its label, or by "" without `by`; None without trials at two levels."""
-    axis = table.axis(study, lines, threshold.along)
-    groups = table.group_points(lines, threshold, study)
-    return {label: group_crossing(threshold, group, axis) for label, group in groups.items()}
+    axis = lines.axes[threshold.along]
+    return {
+        label: group_crossing(threshold, group, axis)
+        for label, group in lines.groups(threshold).items()
+    }
 
 
 def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossing | None:
@@ -236,14 +237,14 @@ def group_crossing(threshold: Threshold, lines: PointRows, axis: Axis) -> Crossi
     return crossing(x, hits, trials, threshold.limit, axis.log)
 
 
-def sentences(threshold: Threshold, study: Study, lines: PointRows) -> list[str]:
+def sentences(threshold: Threshold, lines: PointTable) -> list[str]:
     """The threshold in words, one sentence for each level of `by`."""
-    axis = table.axis(study, lines, threshold.along)
+    axis = lines.axes[threshold.along]
     by = threshold.by
-    unit = table.axis(study, lines, by).unit if by is not None else ""
+    unit = lines.axes[by].unit if by is not None else ""
     return [
         (f"{by} = {label}{unit}: " if label else "") + describe(one, threshold, axis)
-        for label, one in crossings(threshold, study, lines).items()
+        for label, one in crossings(threshold, lines).items()
     ]
 
 
@@ -292,13 +293,12 @@ def span(found: Crossing) -> str:
     return f"below {high:.4g}" if math.isfinite(high) else "no level is certain"
 
 
-def brief(threshold: Threshold, study: Study, lines: PointRows) -> str:
+def brief(threshold: Threshold, lines: PointTable) -> str:
     """The threshold in one sentence with its intervals, all levels of `by` together; "" without trials."""
-    axis = table.axis(study, lines, threshold.along)
-    unit = axis.unit
+    unit = lines.axes[threshold.along].unit
     found = [
         (f" ({label})" if label else "", one)
-        for label, one in crossings(threshold, study, lines).items()
+        for label, one in crossings(threshold, lines).items()
         if one is not None
     ]
     if not found:

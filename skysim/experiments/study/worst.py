@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.types import Floats, Ints
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
-from skysim.experiments.study.table import PointRow, points_at
+from skysim.experiments.study.table import without_responses
 from skysim.results.files.row_parts import Array, row_of, subset
 from skysim.results.metrics import (
     COVERAGE,
@@ -213,7 +213,6 @@ def worst_of_levels(
     study: Study, store: Store, response: str, levels: Mapping[str, Any], count: int = COUNT
 ) -> list[WorstTrial]:
     """The worst trials of the points at some levels. Raises InputError for an unknown factor or level."""
-    rows = [PointRow(n, point.levels, {}) for n, point in enumerate(store.points())]
-    chosen = points_at(rows, study, levels)
+    chosen = without_responses(study, store.points()).at(levels)
     columns = store.point_columns(*(row.point for row in chosen))
     return worst_trials(columns, response, count, study.trial.kind == "flight")

@@ -16,7 +16,7 @@ from skysim.experiments.study import answer, study_file, thresholds
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.plan import Study, resolve_point
 from skysim.experiments.study.report import overview, study_report
-from skysim.experiments.study.table import PointRow, format_summary
+from skysim.experiments.study.table import PointRow, PointTable, format_summary
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.simulation import checks
@@ -86,21 +86,23 @@ def test_a_requirement_is_answered_for_all_points_by_the_one_that_decides(
         for n, (leds, count) in enumerate(zip((500, 900), wrong, strict=True))
     ]
     judged = thresholds.judged({"wrong": 0.001}, lines)
-    assert answer.headline(study(), lines, False, judged=judged)[0].startswith(start)
-    assert answer.verdict(study(), lines, judged).startswith("`wrong ≤ 0.001` is")
-    assert brief in answer.verdict(study(), lines, judged)
+    assert answer.headline(PointTable(study(), lines), False, judged=judged)[0].startswith(
+        start
+    )
+    assert answer.verdict(PointTable(study(), lines), judged).startswith("`wrong ≤ 0.001` is")
+    assert brief in answer.verdict(PointTable(study(), lines), judged)
 
 
 def test_without_ambiguity_the_answer_has_a_confidence() -> None:
     """1 - 0.05^(1 / 10,000) is 0.02995 %."""
-    texts = answer.headline(study(), [line(0, 500, 10_000)], True)
+    texts = answer.headline(PointTable(study(), [line(0, 500, 10_000)]), True)
     assert said(texts, "Is it ambiguous anywhere?") == (
         "Is it ambiguous anywhere? No. Ambiguous or misled: none in 10,000 (less than 0.03 % at 95 % confidence)."
     )
     assert pytest.approx(0.0002995, abs=1e-7) == 1 - 0.05 ** (1 / 10_000)
     assert [
         one
-        for one in answer.headline(study(), [line(0, 500, 10_000)], False)
+        for one in answer.headline(PointTable(study(), [line(0, 500, 10_000)]), False)
         if "ambiguous" in one
     ] == []
 
@@ -109,7 +111,9 @@ def test_ambiguity_is_located_and_the_rest_has_a_confidence() -> None:
     """Misled attitudes count as ambiguous ones that the tracker did not notice."""
     lines = [line(0, 500, 200, ambiguous=20, misled=10), line(1, 900, 400)]
     interval = metrics.proportion(30, 200)
-    text = said(answer.headline(study(), lines, True), "Is it ambiguous anywhere?")
+    text = said(
+        answer.headline(PointTable(study(), lines), True), "Is it ambiguous anywhere?"
+    )
     assert text == (
         "Is it ambiguous anywhere? Yes. Ambiguous or misled: at 1 of 2 points, most at leds = 500: 15 % of the"
         f" frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
@@ -121,7 +125,7 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
     """No attitude is ambiguous, but 4 of 200 are not solved at 500 LEDs."""
     lines = [line(0, 500, 200, refused=4), line(1, 900, 400)]
     interval = metrics.proportion(4, 200)
-    texts = answer.headline(study(), lines, True, "skysim study worst leds.yaml")
+    texts = answer.headline(PointTable(study(), lines), True, "skysim study worst leds.yaml")
     assert said(texts, "Is it ambiguous anywhere?").startswith(
         "Is it ambiguous anywhere? No."
     )
@@ -130,14 +134,16 @@ def test_refusals_are_named_where_they_are_most_frequent() -> None:
         f" the frames ({100 * interval.low:.3g} to {100 * interval.high:.3g} %); none in 400 (less than 0.75 % at 95 %"
         " confidence) at the other points. `skysim study worst leds.yaml --response refused` names the worst."
     )
-    solved = answer.headline(study(trial={"kind": "frames"}), [line(0, 500, 100)], True)
+    solved = answer.headline(
+        PointTable(study(trial={"kind": "frames"}), [line(0, 500, 100)]), True
+    )
     assert said(solved, "Is every frame solved?").startswith(
         "Is every frame solved? Yes. Refused"
     )
 
 
 def test_misidentification_and_roll_noise_are_distinguished() -> None:
-    texts = answer.headline(study(), [line(0, 500, 1000, roll_noise=50)], True)
+    texts = answer.headline(PointTable(study(), [line(0, 500, 1000, roll_noise=50)]), True)
     assert said(texts, "Misidentified").endswith(
         "none in 1,000 (less than 0.3 % at 95 % confidence)."
     )
@@ -150,7 +156,9 @@ def test_misidentification_and_roll_noise_are_distinguished() -> None:
 
 
 def test_the_bound_on_unseen_events_uses_the_point_with_fewest_trials() -> None:
-    texts = answer.headline(study(), [line(0, 500, 100), line(1, 900, 1000)], False)
+    texts = answer.headline(
+        PointTable(study(), [line(0, 500, 100), line(1, 900, 1000)]), False
+    )
     assert said(texts, "Misidentified").endswith(
         "none in 100 a point (less than 3 % at 95 % confidence)."
     )
@@ -162,7 +170,7 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
     other = line(1, 900, 200)
     for point, share in ((one, 25 / 18_000), (other, 0.0)):
         point.responses["mismatched"] = Summary(share, math.nan, math.nan, 18_000)
-    texts = answer.headline(study(), [one, other], True)
+    texts = answer.headline(PointTable(study(), [one, other]), True)
     assert (
         "There 25 of 18,000 matches are wrong; the attitude is unaffected: all errors are as claimed."
         in texts
@@ -173,7 +181,7 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
     one.responses["misled"] = metrics.proportion(10, 200)
     (text,) = [
         text
-        for text in answer.headline(study(), [one, other], True)
+        for text in answer.headline(PointTable(study(), [one, other]), True)
         if text.startswith("There 25")
     ]
     assert (
@@ -185,33 +193,40 @@ def test_wrong_matches_are_counted_and_their_effect_on_the_attitude() -> None:
 def test_a_tracker_without_matches_has_no_correctness_claim() -> None:
     unknown = line(0, 500, 100)
     unknown.responses["misidentified"] = metrics.NO_VALUE
-    assert said(answer.headline(study(), [unknown], False), "Misidentified").endswith(
-        "does not name its lights."
-    )
+    assert said(
+        answer.headline(PointTable(study(), [unknown]), False), "Misidentified"
+    ).endswith("does not name its lights.")
 
 
 def test_ranges_name_the_extreme_points_and_skip_points_of_few_values() -> None:
     lines = [line(0, 500, 200, identified=100), line(1, 900, 200, identified=200)]
     few = line(2, 200, 200, identified=3)
     few.responses["roll_arcsec_p95"] = Summary(1.0, math.nan, math.nan, 3, 56)
-    ranges = answer.ranges(study(), [*lines, few])
+    ranges = answer.ranges(PointTable(study(), [*lines, few]))
     assert ranges == [
         "identified: 0.015 (0.00511..0.0432) at leds = 200, to 1 (0.985..1) at leds = 900.",
         "roll_arcsec_p95: 100 (90..350) at leds = 500, to 200 (90..350) at leds = 900.",
     ]
-    assert answer.ranges(study(), [few])[1] == "roll_arcsec_p95: 1 (needs 56 more values)."
+    assert (
+        answer.ranges(PointTable(study(), [few]))[1]
+        == "roll_arcsec_p95: 1 (needs 56 more values)."
+    )
 
 
 def test_the_next_claim_says_how_many_trials_it_needs() -> None:
     """ln 0.05 / ln(1 - 0.001) is 2,994.2; what was seen at every point makes no claim."""
-    texts = answer.headline(study(), [line(0, 500, 1200), line(1, 900, 5000)], False)
+    texts = answer.headline(
+        PointTable(study(), [line(0, 500, 1200), line(1, 900, 5000)]), False
+    )
     assert said(texts, "None in") == (
         "None in 1,200 is less than 0.25 % at 95 % confidence; a claim of less than 0.1 % needs 2,995 in all at each"
         " point without any."
     )
     seen = line(0, 500, 1200, misidentified=1, misled=1, roll_noise=1, wrong=1, ambiguous=1)
     assert not [
-        one for one in answer.headline(study(), [seen], False) if one.startswith("None in")
+        one
+        for one in answer.headline(PointTable(study(), [seen]), False)
+        if one.startswith("None in")
     ]
 
 
@@ -259,12 +274,12 @@ def test_understated_errors_are_reported(
     lines = [line(n, leds, 500) for n, leds in enumerate((500, 900))]
     for one, values in zip(lines, nees, strict=True):
         one.responses["nees"] = Summary(*values, 1 if math.isnan(values[1]) else 500)
-    texts = answer.headline(study(), lines, False)
+    texts = answer.headline(PointTable(study(), lines), False)
     assert (
         said(texts, "Are the claimed errors true?")
         == f"Are the claimed errors true? {expected}"
     )
-    assert len(answer.ranges(study(responses=["nees"]), lines)) == 1
+    assert len(answer.ranges(PointTable(study(responses=["nees"]), lines))) == 1
 
 
 def verdicts(nees: NDArray[np.float64], survey_share: float = 0.0) -> list[str]:
@@ -277,9 +292,7 @@ def verdicts(nees: NDArray[np.float64], survey_share: float = 0.0) -> list[str]:
                 {"nees": values, "solved": np.ones(len(values))}
             )
             lines.append(PointRow(n, {"leds": n}, {"nees": nees_of}, len(values)))
-        texts += answer.claimed_errors(
-            lines, lambda line: f"leds = {line.levels['leds']}", survey_share
-        )
+        texts += answer.claimed_errors(PointTable(study(), lines), survey_share)
     return texts
 
 
@@ -335,15 +348,19 @@ def test_a_wrong_claim_is_noticed_with_the_stated_power(points: int) -> None:
 
 def test_before_the_first_trial_there_is_no_answer() -> None:
     empty = [PointRow(0, {"leds": 500}, {})]
-    assert answer.headline(study(), empty, True) == answer.ranges(study(), empty) == []
+    assert (
+        answer.headline(PointTable(study(), empty), True)
+        == answer.ranges(PointTable(study(), empty))
+        == []
+    )
 
 
 def test_a_point_whose_trials_all_failed_is_left_out() -> None:
     none = {name: Summary(math.nan, math.nan, math.nan, 0) for name in NEVER}
     failed = PointRow(1, {"leds": 900}, none, 20)
-    texts = answer.headline(study(), [line(0, 500, 100), failed], True)
-    assert texts == answer.headline(study(), [line(0, 500, 100)], True)
-    assert answer.headline(study(), [failed], True) == []
+    texts = answer.headline(PointTable(study(), [line(0, 500, 100), failed]), True)
+    assert texts == answer.headline(PointTable(study(), [line(0, 500, 100)]), True)
+    assert answer.headline(PointTable(study(), [failed]), True) == []
 
 
 # What the report begins with.
@@ -482,7 +499,7 @@ def test_the_location_of_an_extreme_has_its_unit() -> None:
         line(1, 500, 100, wrong=3)._replace(levels={"rate": 8}),
     ]
     assert "most at rate = 8 deg/s: 3 %" in said(
-        answer.headline(rates, lines, True), "Wrong attitudes"
+        answer.headline(PointTable(rates, lines), True), "Wrong attitudes"
     )
 
 
@@ -567,7 +584,7 @@ def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
     with store.open_store(tmp_path / "study.sqlite") as kept:
         command = study_report.commands(plan, kept, "again")
         found = study_report.analyze(plan, kept, command)
-        report = study_report.compose(plan.study, kept, found, command)
+        report = study_report.compose(kept, found, command)
     text = report.save(tmp_path / "r.html").read_text(encoding="utf-8")
     parts = (
         'class="verdict good"',
@@ -588,9 +605,11 @@ def test_a_report_begins_with_its_answer_and_one_figure(tmp_path: Path) -> None:
 def test_frames_without_an_attitude_have_no_wrong_one() -> None:
     """Forty of the hundred frames are refused: none of sixty is wrong."""
     lines = [line(0, 500, 50, refused=40), line(1, 900, 50)]
-    text = answer.verdict(study(), lines)
+    text = answer.verdict(PointTable(study(), lines))
     assert "No attitude is wrong (in 60 of 100 frames)." in text
-    assert "(in 100)" in answer.verdict(study(), [line(0, 500, 50), line(1, 900, 50)])
+    assert "(in 100)" in answer.verdict(
+        PointTable(study(), [line(0, 500, 50), line(1, 900, 50)])
+    )
 
 
 @pytest.mark.parametrize(("nees", "false"), [(12.0, True), (3.0, False)])
@@ -599,4 +618,4 @@ def test_the_last_line_says_that_claimed_errors_are_false(nees: float, false: bo
     known = {"nees": Summary(nees, 0.9 * nees, 1.1 * nees, 400)}
     lines = [one._replace(responses=one.responses | known) for one in lines]
     said_so = "Are the claimed errors true? No: too small by a factor of 2 (NEES 12"
-    assert (said_so in answer.verdict(study(), lines)) == false
+    assert (said_so in answer.verdict(PointTable(study(), lines))) == false

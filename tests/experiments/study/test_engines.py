@@ -351,7 +351,7 @@ def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
     engine = on_dask(cluster, 2)
     rows = engine.run(
         trials.TrialJob(plan_.spec),
-        runner.ChunkQueue(plan_.points, 150, np.arange(plan_.trials)),
+        runner.ChunkQueue(plan_, plan_.points, np.arange(plan_.trials)),
     )
     assert next(rows)[0].error is None
     assert {len(state) for state in engine.client.run(recipes).values()} == {1}

@@ -20,7 +20,7 @@ from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.plan import Map, Study
 from skysim.experiments.study.report import maps
-from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.table import PointRow, PointTable
 from skysim.results.metrics import Columns
 from skysim.scene.sections.motion import AttitudeConfig
 
@@ -148,7 +148,9 @@ def test_a_cell_of_too_few_values_is_hatched() -> None:
     assert sum(cell.values for cell in panel.cells) == solved.sum()
     assert sum(cell.shown for cell in panel.cells) < len(panel.cells) / 4
     figure = Map(kind="map", value="roll_arcsec_median")
-    text = maps.caption([panel], figure, study(), [PointRow(0, {"leds": 500}, {})])
+    text = maps.caption(
+        [panel], figure, PointTable(study(), [PointRow(0, {"leds": 500}, {})])
+    )
     assert f"n = {min(cell.values for cell in panel.cells)} to" in text
     assert "hatched: fewer than 5" in text
 
@@ -193,7 +195,9 @@ def of_points(*tables: Columns) -> Callable[[int], Columns]:
     return lambda point: tables[point]
 
 
-LINES = [PointRow(n, {"leds": leds}, {}) for n, leds in enumerate((500, 900))]
+LINES = PointTable(
+    study(), [PointRow(n, {"leds": leds}, {}) for n, leds in enumerate((500, 900))]
+)
 
 
 @pytest.mark.slow
@@ -201,7 +205,7 @@ def test_a_map_is_a_picture_with_a_panel_for_each_level() -> None:
     tables = columns(400), columns(400, wrong=np.ones(400))
     for by, labels, wrong in (("leds", ["500", "900"], [0.0, 1.0]), (None, [""], [0.0])):
         figure = Map(kind="map", value="wrong", by=by)
-        panels = maps.direction_maps(LINES, figure, study(), of_points(*tables))
+        panels = maps.direction_maps(LINES, figure, of_points(*tables))
         assert [panel.label for panel in panels] == labels
         assert [{cell.value for cell in panel.cells} for panel in panels] == [
             {one} for one in wrong
@@ -210,7 +214,7 @@ def test_a_map_is_a_picture_with_a_panel_for_each_level() -> None:
             np.frombuffer(maps.map_png(panels, figure), np.uint8), cv2.IMREAD_COLOR
         )
         assert picture.shape[1] > picture.shape[0] * len(labels) * 0.9
-    assert maps.caption(panels, figure, study(), LINES).startswith(
+    assert maps.caption(panels, figure, LINES).startswith(
         "wrong by direction, at leds = 500. Directions of"
     )
 
@@ -232,9 +236,9 @@ def test_the_color_scale_of_a_proportion_is_fixed() -> None:
 
 def test_a_map_without_trials_is_empty() -> None:
     figure = Map(kind="map", value="wrong")
-    panels = maps.direction_maps(LINES, figure, study(), lambda point: columns(0))
+    panels = maps.direction_maps(LINES, figure, lambda point: columns(0))
     assert panels[0].cells == []
-    assert maps.caption(panels, figure, study(), LINES).endswith("No trial of it is in yet.")
+    assert maps.caption(panels, figure, LINES).endswith("No trial of it is in yet.")
     assert maps.map_png(panels, figure).startswith(b"\x89PNG")
 
 
@@ -293,7 +297,7 @@ def test_a_cell_of_too_few_values_for_its_quantile_is_hatched() -> None:
     assert np.mean([cell.shown for cell in many.cells]) > 0.9
     assert all(cell.shown == (cell.values >= 20) for cell in many.cells)
     figure = Map(kind="map", value="roll_arcsec_p95")
-    assert "hatched: fewer than 20" in maps.caption([few], figure, study(), LINES)
+    assert "hatched: fewer than 20" in maps.caption([few], figure, LINES)
 
 
 # The worst.

@@ -26,7 +26,7 @@ from skysim.experiments.study.execution.setups import TrialSetup
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.report import maps
-from tests.helpers.study_stores import STRAYS, contents, done
+from tests.helpers.study_stores import STRAYS, contents, done, queue_of
 
 
 @pytest.fixture(scope="module")
@@ -383,7 +383,7 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
     points = [Point({"n": n}, {"trial.lights": n}) for n in range(first, first + count)]
     span = range(first * replicates, (first + count) * replicates)
     missing = sorted(data.draw(st.sets(st.sampled_from(span))))
-    todo = runner.ChunkQueue(points, replicates, np.array(missing, np.int64), first)
+    todo = queue_of(points, replicates, np.array(missing, np.int64), first)
     came = []
     size = 1
     while chunk := todo.next():
@@ -405,7 +405,7 @@ def test_chunks_hold_every_missing_trial_once_and_in_order(data: st.DataObject) 
 def test_under_a_budget_of_time_no_point_waits_for_another() -> None:
     """Four points of 300 trials of 10 ms, whenever it ends: counts differ by one, later by a fifth; all run at last."""
     points = [Point({"n": n}, {}) for n in range(4)]
-    todo = runner.ChunkQueue(points, 300, np.arange(1200), limited=True)
+    todo = queue_of(points, 300, np.arange(1200), budget="{time: 1 h}")
     ran = set[int]()
     while chunk := todo.next():
         for segment in chunk:
@@ -439,7 +439,7 @@ def test_a_study_with_a_budget_of_time_fills_its_points_together(
 def test_chunks_are_sized_by_time() -> None:
     """Trials of 10 ms: chunks double until they take CHUNK_S, and shrink as trials take longer."""
     point = [Point({}, {})]
-    todo = runner.ChunkQueue(point, 10_000, np.arange(10_000))
+    todo = queue_of(point, 10_000, np.arange(10_000))
     sizes = []
     for trial_s in [0.01] * 8 + [0.1] * 2:
         chunk = todo.next()
@@ -457,9 +457,7 @@ def test_the_rate_of_completed_chunks_is_bounded_for_many_workers(
     workers: int, rate_hz: float
 ) -> None:
     """Of trials of 10 ms: the chunks of a second, from their size."""
-    todo = runner.ChunkQueue(
-        [Point({}, {})], 100_000, np.arange(100_000), seconds=runner.chunk_seconds(workers)
-    )
+    todo = queue_of([Point({}, {})], 100_000, np.arange(100_000), workers=workers)
     size = 0
     for _ in range(14):
         size = sum(len(segment.replicates) for segment in todo.next())

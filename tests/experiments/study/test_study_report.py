@@ -26,7 +26,16 @@ from skysim.experiments.study.report import figures, layout, study_report
 from skysim.experiments.study.report.figures import color_scale
 from skysim.experiments.study.report.overview import Overview
 from skysim.experiments.study.report.study_report import POINTS, Analysis
-from skysim.experiments.study.table import Index, PointRow, cells, has_few_values, table
+from skysim.experiments.study.table import (
+    Index,
+    PointRow,
+    PointTable,
+    format_level,
+    format_response,
+    has_few_values,
+    table,
+    without_responses,
+)
 from skysim.results.metrics import Summary
 from skysim.results.plots import INK
 
@@ -93,9 +102,9 @@ def filled(
     return path
 
 
-def lines_of(path: Path, asked: Study) -> list[PointRow]:
+def lines_of(path: Path, asked: Study) -> PointTable:
     with store.open_store(path) as kept:
-        return table(kept, study_report.responses(asked))
+        return PointTable(asked, table(kept, study_report.responses(asked)))
 
 
 class Html(HTMLParser):
@@ -166,12 +175,12 @@ def written(path: Path, asked: Study, **more: Any) -> tuple[str, Html]:
     with store.open_store(path) as kept:
         scene = [("scene", "afit_simsat"), ("trials", "20 at each point; seed 11")]
         about = Overview(scene, [], False, (), {}, 0.0)
-        lines = table(kept, study_report.responses(asked))
+        lines = PointTable(asked, table(kept, study_report.responses(asked)))
         nothing: dict[str, Any] = dict.fromkeys(Analysis._fields[2:], ())
         nothing |= {"verdict": "", "result": None}
         found = Analysis(lines, about, **nothing | more)
         text = study_report.compose(
-            asked, kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND
+            kept, found, lambda verb: REPLAY if verb == "replay" else COMMAND
         ).html()
     return text, Html(text)
 
@@ -191,12 +200,20 @@ def test_every_number_of_the_report_is_the_store_s(tmp_path: Path) -> None:
     path = filled(tmp_path / "s.sqlite", asked, failed=3)
     _, html = written(path, asked)
     with store.open_store(path) as kept:
-        counts, heads, rows = kept.counts(), *cells(table(kept, asked.responses))
+        counts, lines = kept.counts(), table(kept, asked.responses)
     said = f"{counts['done']} of {9 * 20} trials, {counts['failed']} failed, {counts['wrong']} wrong attitudes"
     assert html.said["verdict bad"].startswith(said)
     assert (counts["failed"], counts["wrong"]) == (3, 0)
     assert dict(html.tables["Scene"])["code version"] == "cafe0123"
-    assert html.tables[POINTS] == [heads, *rows]
+    assert html.tables[POINTS][0] == ["point", "dome", "tilt", *asked.responses]
+    assert html.tables[POINTS][1:] == [
+        [
+            str(one.point),
+            *map(format_level, one.levels.values()),
+            *(format_response(one, name) for name in one.responses),
+        ]
+        for one in lines
+    ]
     assert html.tables["Runs"][1:] == [["pool", "2", "180", "4.0", "45"]]
     assert html.said["pre"] == "title: Which <dome>?"
     assert "Not finished" not in html.said["verdict bad"]
@@ -354,7 +371,7 @@ def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(
     lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
     curve = Curve(kind="curve", x="radius", y="identified", by="dome")
     for where, ring in (({}, 0), ({"ring": [0, 10]}, 1)):
-        shown = layout.series(lines, curve.model_copy(update={"where": where}), asked)
+        shown = layout.series(lines, curve.model_copy(update={"where": where}))
         assert [one.label for one in shown] == ["sphere", "flat", "cube"]
         for dome, one in enumerate(shown):
             # Points go with the last factor fastest; radii stand in the file as 48, 24, 96.
@@ -362,7 +379,7 @@ def test_a_curve_holds_the_other_factors_and_takes_its_values_from_the_trials(
             assert one.x.tolist() == [24, 48, 96]
             assert one.value == pytest.approx([1 - (n % 10) / 10 for n in numbers], abs=1e-12)
             assert np.all((one.low <= one.value + 1e-12) & (one.value <= one.high + 1e-12))
-    assert "at ring = 10, 20" in layout.caption(curve, asked, lines)
+    assert "at ring = 10, 20" in layout.caption(curve, lines)
 
 
 def test_figures_draw_the_arranged_data(tmp_path: Path) -> None:
@@ -372,7 +389,7 @@ def test_figures_draw_the_arranged_data(tmp_path: Path) -> None:
     lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
     fig = Canvas()
     curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
-    figures.draw_curve(fig, lines, curve, asked)
+    figures.draw_curve(fig, lines, curve)
     (axes,) = fig.axes
     drawn = [line for line in axes.lines if line.get_linestyle() == "-"]
     assert [line.get_xdata().tolist() for line in drawn] == [[0, 10, 20]]
@@ -396,7 +413,7 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_names_the_trials
     for log in (False, True):
         fig = Canvas()
         curve = Curve(kind="curve", x="tilt", y="roll_arcsec_p95", log=log)
-        figures.draw_curve(fig, lines, curve, study())
+        figures.draw_curve(fig, PointTable(study(), lines), curve)
         (axes,) = fig.axes
         low = axes.get_ylim()[0]
         ends = {
@@ -408,7 +425,7 @@ def test_a_point_without_an_interval_has_no_bar_and_the_caption_names_the_trials
         assert ends[0][0] == (low / 10 if log else 0)
         assert np.isnan(ends.get(10, [nan])).all()
         assert "none where a point needs up to 19 more trials" in layout.caption(
-            curve, study(), lines
+            curve, PointTable(study(), lines)
         )
 
 
@@ -424,7 +441,7 @@ def test_points_of_few_values_are_hollow_numbered_and_not_connected() -> None:
     ]
     curve = Curve(kind="curve", x="tilt", y="cross_arcsec_median")
     fig = Canvas()
-    figures.draw_curve(fig, lines, curve, study())
+    figures.draw_curve(fig, PointTable(study(), lines), curve)
     (axes,) = fig.axes
     joined = next(line for line in axes.lines if line.get_linestyle() == "-")
     assert joined.get_ydata() == pytest.approx([3, np.nan, 5], nan_ok=True)
@@ -438,10 +455,11 @@ def test_points_of_few_values_are_hollow_numbered_and_not_connected() -> None:
     ]
     assert [text.get_text() for text in axes.texts] == ["n=12"]
     assert "Hollow, without a line: few of the point's trials" in layout.caption(
-        curve, study(), lines
+        curve, PointTable(study(), lines)
     )
     heat = layout.grid(
-        lines, Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"), study()
+        PointTable(study(), lines),
+        Heat(kind="heat", x="tilt", y="tilt", value="cross_arcsec_median"),
     )
     assert [[bool(heat.few[n, n]), int(heat.values[n, n])] for n in range(3)] == [
         [False, 60],
@@ -476,7 +494,9 @@ def test_shares_are_drawn_from_zero_to_one() -> None:
     responses = {"identified": Summary(0.31, 0.3, 0.32, 99)}
     lines = [PointRow(n, {"tilt": tilt}, responses, 99) for n, tilt in enumerate((0, 10, 20))]
     fig = Canvas()
-    figures.draw_curve(fig, lines, Curve(kind="curve", x="tilt", y="identified"), study())
+    figures.draw_curve(
+        fig, PointTable(study(), lines), Curve(kind="curve", x="tilt", y="identified")
+    )
     assert fig.axes[0].get_ylim() == (-0.03, 1.03)
     heat = Heat(kind="heat", x="tilt", y="tilt", value="identified")
     scales = [color_scale(np.array(values), heat) for values in ([0.3, 0.31], [0.9, 1.0], [])]
@@ -500,12 +520,12 @@ def test_a_curve_of_nees_has_a_line_at_three() -> None:
     ]
     curve = Curve(kind="curve", x="tilt", y="nees")
     fig = Canvas()
-    figures.draw_curve(fig, lines, curve, study())
+    figures.draw_curve(fig, PointTable(study(), lines), curve)
     (axes,) = fig.axes
     assert [one.get_ydata() for one in axes.lines if one.get_linestyle() == ":"] == [[3, 3]]
     assert axes.get_ylim()[0] < 3
     assert "Dotted: 3, where the claimed errors are true." in layout.caption(
-        curve, study(), lines
+        curve, PointTable(study(), lines)
     )
     assert (
         layout.expected_value("nees_p95")
@@ -518,7 +538,7 @@ def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Pa
     asked = study(factors={"dome": DOME, "tilt": TILT})
     lines = lines_of(filled(tmp_path / "s.sqlite", asked, done=8 * 20), asked)
     heat = Heat(kind="heat", x="tilt", y="dome", value="cross_arcsec_median")
-    cell = layout.grid(lines, heat, asked)
+    cell = layout.grid(lines, heat)
     assert (cell.x.levels, cell.y.levels) == ([0, 10, 20], ["sphere", "flat", "cube"])
     # Tilts stand in the file as 20, 0, 10; the last point, cube at 10 degrees, is not done.
     assert cell.value == pytest.approx(
@@ -528,11 +548,8 @@ def test_a_heat_map_has_its_cells_in_order_and_nan_where_nothing_is(tmp_path: Pa
 
 def test_axes_know_numbers_quantities_names_and_lists() -> None:
     def axis(factor: dict[str, Any], levels: list[Any]) -> axes.Axis:
-        return axes.axis(
-            study(factors={"a": factor}),
-            [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)],
-            "a",
-        )
+        lines = [PointRow(n, {"a": one}, {}) for n, one in enumerate(levels)]
+        return PointTable(study(factors={"a": factor}), lines).axes["a"]
 
     quantity = axis(RADIUS, ["96 in", "24 in", "48 in"])
     assert quantity[:3] == ("a [in]", ["24 in", "48 in", "96 in"], True)
@@ -573,15 +590,13 @@ def test_equal_levels_in_different_units_are_one() -> None:
 
 def test_an_unknown_name_in_where_is_answered_with_the_known_ones() -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
-    lines = [PointRow(n, point.levels, {}) for n, point in enumerate(points(asked))]
+    lines = without_responses(asked, points(asked))
     for where, said in (
         ({"dome": "bowl"}, "unknown level 'bowl'; allowed: sphere, flat, cube"),
         ({"x": 1}, "allowed: dome, tilt"),
     ):
         with pytest.raises(InputError, match=said):
-            axes.shown_points(
-                lines, Curve(kind="curve", x="tilt", y="wrong", where=where), asked
-            )
+            lines.shown_in(Curve(kind="curve", x="tilt", y="wrong", where=where))
 
 
 def test_default_figures_follow_from_the_factors() -> None:
@@ -596,7 +611,7 @@ def test_default_figures_follow_from_the_factors() -> None:
         ]
         return [
             tuple(one.model_dump(exclude={"where", "log"}).values())
-            for one in layout.figures(asked, lines)
+            for one in layout.figures(PointTable(asked, lines))
         ]
 
     assert chosen() == [("curve", "tilt", "wrong", None)]
@@ -625,7 +640,9 @@ def test_drawn_factors_divide_points_into_equal_bands() -> None:
         PointRow(n, {"x": float(x), "b": float(b)}, {"nees_mean": Summary(float(b), 0, 1, 5)})
         for n, (x, b) in enumerate(rng.random((40, 2)))
     ]
-    shown = layout.series(lines, Curve(kind="curve", x="x", y="nees_mean", by="b"), asked)
+    shown = layout.series(
+        PointTable(asked, lines), Curve(kind="curve", x="x", y="nees_mean", by="b")
+    )
     assert [len(one.x) for one in shown] == [10] * 4
     assert all(
         before.value.max() < after.value.min() for before, after in itertools.pairwise(shown)
@@ -661,10 +678,10 @@ def test_each_figure_is_a_file_of_its_own(tmp_path: Path) -> None:
     asked = study(factors={"dome": DOME, "tilt": TILT})
     lines = lines_of(filled(tmp_path / "s.sqlite", asked), asked)
     curve = Curve(kind="curve", x="tilt", y="identified", by="dome")
-    shown = figures.figure_png(lines, curve, asked)
+    shown = figures.figure_png(lines, curve)
     picture = cv2.imdecode(np.frombuffer(shown, np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] == 888
     for ink in INK[:3]:  # every line's
         bgr = [int(ink[n : n + 2], 16) for n in (5, 3, 1)]
         assert (picture == bgr).all(axis=2).sum() > 50
-    assert shown == figures.figure_png(lines, curve, asked)
+    assert shown == figures.figure_png(lines, curve)

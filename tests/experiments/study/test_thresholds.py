@@ -15,7 +15,7 @@ from skysim.core.errors import InputError
 from skysim.experiments.datasheet import performance
 from skysim.experiments.study import study_file, thresholds
 from skysim.experiments.study.plan import Study, Threshold
-from skysim.experiments.study.table import PointRow
+from skysim.experiments.study.table import PointRow, PointTable
 from skysim.experiments.study.thresholds import Crossing, crossing
 from skysim.results import metrics
 
@@ -141,8 +141,8 @@ def test_the_isotonic_fit_pools_neighbors_that_violate_the_order() -> None:
 # In a study.
 
 
-def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[PointRow]:
-    return [
+def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> PointTable:
+    rows = [
         PointRow(
             n,
             {"rate": rate, "chain": chain},
@@ -151,17 +151,18 @@ def lines_of(study: Study, shares: dict[str, list[float]], trials: int) -> list[
         for chain, curve in shares.items()
         for n, (rate, p) in enumerate(zip(LEVELS.astype(int).tolist(), curve, strict=True))
     ]
+    return PointTable(study, rows)
 
 
 def test_a_study_states_the_rate_at_which_95_percent_are_identified() -> None:
     study = Study.model_validate(STUDY)
     curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
-    said = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 400))
+    said = thresholds.sentences(study.thresholds[0], lines_of(study, curves, 400))
     assert said == [
         "chain = slow: identified falls below 95 % at rate = 2.5 deg/s (each end at 95 %: 2 to 3).",
         "chain = fast: identified is at least 95 % at all levels of rate, 0 to 10 deg/s (95 %: above 10).",
     ]
-    few = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 50))
+    few = thresholds.sentences(study.thresholds[0], lines_of(study, curves, 50))
     assert few[0].endswith("(95 %: below 4; needs about 59 trials at rate = 0 deg/s).")
 
 
@@ -171,9 +172,7 @@ def test_a_level_of_the_sentence_has_its_unit() -> None:
     }
     study = Study.model_validate(STUDY | {"factors": factors})
     said = thresholds.sentences(
-        study.thresholds[0],
-        study,
-        lines_of(study, {"0.5 ms": [1.0] * 8, "5 ms": [1.0] * 8}, 60),
+        study.thresholds[0], lines_of(study, {"0.5 ms": [1.0] * 8, "5 ms": [1.0] * 8}, 60)
     )
     assert [one.partition(":")[0] for one in said] == ["chain = 0.5 ms", "chain = 5 ms"]
 
@@ -187,7 +186,7 @@ def test_a_threshold_needs_trials_at_two_levels() -> None:
     other = line._replace(
         levels={"rate": 1, "chain": "slow"}, responses={"identified": metrics.NO_VALUE}
     )
-    assert thresholds.sentences(study.thresholds[0], study, [line, other]) == [
+    assert thresholds.sentences(study.thresholds[0], PointTable(study, [line, other])) == [
         "chain = slow: identified has no trials at two levels of rate yet."
     ]
 
@@ -256,7 +255,7 @@ def test_two_trials_give_two_levels_and_no_number() -> None:
     """A step of one trial in two is no proportion near 95 %; 20 trials are the fewest that have one."""
     study = Study.model_validate(STUDY)
     curves = {"slow": [1, 1, 1, 0.5, 0.5, 0, 0, 0], "fast": [1.0] * 8}
-    (said, _) = thresholds.sentences(study.thresholds[0], study, lines_of(study, curves, 2))
+    (said, _) = thresholds.sentences(study.thresholds[0], lines_of(study, curves, 2))
     assert "identified falls below 95 % between rate = 2 and 3 deg/s (95 %: below 6" in said
     assert thresholds.too_few(np.array([19.0, 40]), 0.95)
     assert not thresholds.too_few(np.array([20.0, 40]), 0.95)
@@ -274,7 +273,7 @@ def test_only_a_proportion_has_a_threshold() -> None:
 def test_the_short_answer_has_the_interval_and_no_more_digits_than_it_knows() -> None:
     study = Study.model_validate(STUDY)
     curves = {"slow": [1, 1, 1, 0.9, 0.5, 0.1, 0, 0], "fast": [1.0] * 8}
-    said = thresholds.brief(study.thresholds[0], study, lines_of(study, curves, 400))
+    said = thresholds.brief(study.thresholds[0], lines_of(study, curves, 400))
     assert "at rate = 2.5 deg/s (slow) (2 to 3)" in said
-    few = thresholds.brief(study.thresholds[0], study, lines_of(study, curves, 50))
+    few = thresholds.brief(study.thresholds[0], lines_of(study, curves, 50))
     assert "(below 4)" in few

@@ -341,7 +341,7 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
     with place.open() as stored:
         command = study_report.commands(plan, stored, *place)
         found = study_report.analyze(plan, stored, command)
-        report = study_report.compose(plan.study, stored, found, command)
+        report = study_report.compose(stored, found, command)
         progress = study_status(plan, stored)
     report.save(path)
     if open_:

@@ -30,11 +30,11 @@ from skysim.experiments.study.execution.store import Store, to_sql
 from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import (
+    Budget,
     CentroidTrial,
     FlightTrial,
     FrameTrial,
     Plan,
-    TrialSpec,
     resolve_point,
 )
 from skysim.results import run_report, scoring, telemetry_report
@@ -42,7 +42,6 @@ from skysim.results.files import recording
 from skysim.results.run import Recorder
 from skysim.simulation.checks import check
 from skysim.simulation.lab import Lab
-from skysim.tracking import factory
 
 # Run time of a chunk: long relative to its overhead, short in case a worker dies.
 CHUNK_S = 0.25
@@ -63,6 +62,8 @@ class Progress:
         Numbers of trials in the store: all, failed ones, and those with a wrong attitude
     now
         Number of trials done by this run since `began`
+    uncounted
+        Number of failed trials that the budget does not count
     """
 
     trials: int
@@ -71,11 +72,23 @@ class Progress:
     wrong: int = 0
     now: int = 0
     began: float = field(default_factory=time.perf_counter)
+    uncounted: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Time since this run began."""
+        return time.perf_counter() - self.began
 
     @property
     def rate(self) -> float:
         """Trials per second of this run."""
-        return self.now / max(time.perf_counter() - self.began, 1e-9)
+        return self.now / max(self.seconds, 1e-9)
+
+    def exceeds(self, budget: Budget) -> bool:
+        """Whether the time or the failures of a budget are spent."""
+        return (budget.time_s is not None and self.seconds > budget.time_s) or (
+            budget.failures is not None and self.failed - self.uncounted >= budget.failures
+        )
 
     def add(self, rows: list[Row]) -> None:
         """Count finished rows."""
@@ -99,39 +112,35 @@ class ChunkQueue:
         (M,) trial numbers in the order in which they run
     ends
         Where in them segments end: trial numbers are not consecutive, the point or the hardware is another
-    spec
-        Specification of the trials, if their hardware is drawn
     """
 
     def __init__(
         self,
+        plan: Plan,
         points: Sequence[Point],
-        replicates: int,
         missing: Ints,
         first: int = 0,
-        spec: TrialSpec | None = None,
-        seconds: float = CHUNK_S,
-        limited: bool = False,
+        workers: int = 1,
     ) -> None:
-        """Order the trials by point, or if time is `limited` by replicate, so that no point stays empty.
+        """Order the trials by point, or if the study's time is limited by replicate, so that no point stays empty.
 
         Then all points run one replicate before the next one. Beyond the sixth, rounds are a fifth of the replicates
         before them, because trials of a point that run together are faster.
         """
         self.points = points
-        self.replicates = replicates
-        if limited:
+        self.replicates = replicates = plan.study.replicates
+        if plan.study.budget.time_s is not None:
             rounds = np.floor(4 * np.log2(1 + missing % replicates))
             missing = missing[np.lexsort((missing, rounds))]
         self.missing = missing
         self.first = first
-        self.spec = spec
-        self.seconds = seconds
+        self.spec = plan.spec
+        self.seconds = chunk_seconds(workers)
         self.position = 0
         self.size = 1
         apart = (np.diff(missing) != 1) | (missing[1:] % replicates == 0)
         self.ends = np.append(
-            np.flatnonzero(apart | bool(spec and spec.hardware)) + 1, len(missing)
+            np.flatnonzero(apart | bool(plan.spec.hardware)) + 1, len(missing)
         )
 
     def next(self) -> Chunk:
@@ -151,8 +160,7 @@ class ChunkQueue:
     def _segment(self, trials: Ints) -> Segment:
         point, replicate = divmod(int(trials[0]), self.replicates)
         settings = self.points[point - self.first].settings
-        if self.spec:
-            settings = self.spec.trial_settings(settings, replicate)
+        settings = self.spec.trial_settings(settings, replicate)
         return Segment(
             point, settings, int(trials[0]), range(replicate, replicate + len(trials))
         )
@@ -289,27 +297,26 @@ def run(
     watch: Watch | None = None,
     points: Sequence[Point] = (),
     first: int = 0,
+    total: Progress | None = None,
 ) -> Progress:
     """Run all missing trials of a plan, or of these `points` numbered from `first`, within its time and failures.
 
     Rows are stored before they are counted, so a killed run loses at most the chunks in flight.
+
+    Parameters
+    ----------
+    total
+        Progress of the search that these points are part of
     """
     points = points or plan.points
     replicates = plan.study.replicates
     numbers = np.arange(first * replicates, (first + len(points)) * replicates)
     missing = numbers[~store.done(int(numbers[-1]) + 1)[numbers]]
-    failed_before = store.counts()["failed"]
-    progress = Progress(len(numbers), len(numbers) - len(missing), failed_before)
-    budget = plan.study.budget
-    queue = ChunkQueue(
-        points,
-        replicates,
-        missing,
-        first,
-        plan.spec,
-        chunk_seconds(engine.workers),
-        budget.time_s is not None,
-    )
+    failed = store.counts()["failed"]
+    own = Progress(len(numbers), len(numbers) - len(missing), failed, uncounted=failed)
+    progress = total or own
+    before = progress.now
+    queue = ChunkQueue(plan, points, missing, first, engine.workers)
     rows = engine.run(TrialJob(plan.spec), queue) if len(missing) else iter(())
     try:
         for batch in rows:
@@ -317,25 +324,13 @@ def run(
             progress.add(batch)
             if watch:
                 watch(progress)
-            out_of_time = (
-                budget.time_s is not None
-                and time.perf_counter() - progress.began > budget.time_s
-            )
-            if out_of_time or (
-                budget.failures is not None
-                and progress.failed - failed_before >= budget.failures
-            ):
+            if progress.exceeds(plan.study.budget):
                 break
     finally:
         if hasattr(rows, "close"):
             rows.close()
-        if progress.now:
-            store.record_run(
-                engine.name,
-                engine.workers,
-                progress.now,
-                time.perf_counter() - progress.began,
-            )
+        if done := progress.now - before:
+            store.record_run(engine.name, engine.workers, done, own.seconds)
     return progress
 
 
@@ -386,9 +381,8 @@ def segment_of(plan: Plan, store: Store, trial: int) -> Segment:
         raise InputError(
             f"trial {trial}", "not in the study", f"0 to {len(points) * each - 1}"
         )
-    point, replicate = divmod(trial, each)
-    settings = plan.spec.trial_settings(points[point].settings, replicate)
-    return Segment(point, settings, trial, range(replicate, replicate + 1))
+    (segment,) = ChunkQueue(plan, points, np.array([trial])).next()
+    return segment
 
 
 def replay(
@@ -478,8 +472,7 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
             assert shot.report is not None
             return shot.frame, shot.truth, shot.report
     frame, truth, streak_px = trials.render_trial_frame(setup, seed)
-    rate = trials.gyro_rate(setup, truth)
-    solve = partial(factory.solve_frame, setup.estimator, frame, streak_px, rate)
+    solve = partial(trials.lost_in_space, setup, frame, truth, streak_px)
     return frame, truth, solve_or_failed(solve)
 
 

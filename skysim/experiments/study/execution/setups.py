@@ -45,22 +45,10 @@ class SetupCache(threading.local):
 CACHE = SetupCache()
 
 
-def setup_key(spec: TrialSpec, settings: Settings) -> str:
-    """Key of a design point's setup in the cache."""
+def prepared_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
+    """The setup of a design point, from the cache if it is there. Raises InputError."""
     programs = {**spec.programs, **spec.digests}
-    return digest([spec.scene, spec.folder, spec.base, spec.trial, programs, settings])
-
-
-def prepared_setup(spec: TrialSpec, settings: Settings, key: str = "") -> TrialSetup:
-    """The setup of a design point, from the cache if it is there. Raises InputError.
-
-    Parameters
-    ----------
-    key
-        `setup_key` of the point, if it is known. To compute it takes a fifteenth of a centroid
-        trial
-    """
-    key = key or setup_key(spec, settings)
+    key = digest([spec.scene, spec.folder, spec.base, spec.trial, programs, settings])
     cached = CACHE.setups
     if key not in cached:
         cached[key] = build_setup(spec, settings)

@@ -44,7 +44,6 @@ from skysim.experiments.study.execution.setups import (
     code_version,
     prepared_setup,
     seed_of,
-    setup_key,
 )
 from skysim.experiments.study.factors import Settings
 from skysim.experiments.study.plan import (
@@ -136,16 +135,15 @@ def run_segments(spec: TrialSpec, segments: tuple[Segment, ...]) -> list[Row]:
     """Run all trials of some segments in order, together in blocks if their kind allows."""
     rows = list[Row]()
     for segment in segments:
-        key = setup_key(spec, segment.settings)
-        for block in divided(segment, block_size(spec, segment, key)):
-            rows += run_block(spec, block, key)
+        for block in divided(segment, block_size(spec, segment)):
+            rows += run_block(spec, block)
     return rows
 
 
-def block_size(spec: TrialSpec, segment: Segment, key: str) -> int:
+def block_size(spec: TrialSpec, segment: Segment) -> int:
     """Number of trials of a segment that run together. Detections must reach an external tracker once, in order."""
     try:
-        setup = prepared_setup(spec, segment.settings, key)
+        setup = prepared_setup(spec, segment.settings)
     except Exception:  # the trials raise it again and store it in their rows
         return 1
     own = isinstance(setup.estimator, StarTracker | DomeTracker)
@@ -160,15 +158,10 @@ def divided(segment: Segment, size: int) -> Iterator[Segment]:
         )
 
 
-def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
+def run_block(spec: TrialSpec, segment: Segment) -> list[Row]:
     """Run the trials of a segment together.
 
     If one of them raises an exception, each is run alone, and the row of the faulty one stores the exception.
-
-    Parameters
-    ----------
-    key
-        `setup_key` of the segment, if it is known
     """
     numbers = list(enumerate(segment.replicates, segment.first))
     seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
@@ -177,14 +170,14 @@ def run_block(spec: TrialSpec, segment: Segment, key: str = "") -> list[Row]:
     error = None
     start_s = time.perf_counter()
     try:
-        setup = prepared_setup(spec, segment.settings, key)
+        setup = prepared_setup(spec, segment.settings)
         scene = setup.scene_hash
         start_s = time.perf_counter()
         outcomes = TRIALS[setup.trial.kind](setup, seeds)
     except Exception as raised:
         errors.raise_wrapped(raised)
         if len(seeds) > 1:
-            return [row for one in divided(segment, 1) for row in run_block(spec, one, key)]
+            return [row for one in divided(segment, 1) for row in run_block(spec, one)]
         if isinstance(raised, errors.InputError):
             scene = scene or REFUSED
             error = str(raised)
@@ -264,9 +257,7 @@ def run_frame_trial(setup: TrialSetup, seed: int) -> Outcome:
     if moving.tracked:
         report = tracked_report(setup, moving, frame)
     else:
-        report = factory.solve_frame(
-            setup.estimator, frame, moving.streak_px, gyro_rate(setup, truth)
-        )
+        report = lost_in_space(setup, frame, truth, moving.streak_px)
     return score(setup.lab, setup.estimator, report, true_lights(truth))
 
 
@@ -486,14 +477,14 @@ def rotation_between(moving: MovingCamera, then_s: float, now_s: float) -> Rotat
     return now * then.inv()
 
 
-def gyro_rate(setup: TrialSetup, truth: Truth) -> RateEstimate | None:
-    """The rate in camera axes that the trial's gyro measures, without an error; None without a gyro."""
-    assert isinstance(setup.trial, FrameTrial)
-    return (
-        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3))
-        if setup.trial.gyro
-        else None
+def lost_in_space(
+    setup: TrialSetup, frame: Frame, truth: Truth, streak_px: tuple[float, float] | None
+) -> Report:
+    """The report on a frame trial's frame alone. The trial's gyro measures the rate without an error."""
+    rate = (
+        RateEstimate(truth.rate_cam_rad_s, GYRO_RAD_S**2 * np.eye(3)) if streak_px else None
     )
+    return factory.solve_frame(setup.estimator, frame, streak_px, rate)
 
 
 def rate_axis(axis: str | AxisConfig, azimuth_rad: float, mount: Mount) -> Floats:

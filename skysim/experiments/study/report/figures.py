@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.types import Floats, Record
-from skysim.experiments.study.plan import Curve, Heat, Map, Study
+from skysim.experiments.study.plan import Curve, Heat, Map
 from skysim.experiments.study.report.layout import (
     MAX_POINTS_WITH_BARS,
     MAX_X_WITH_BARS,
@@ -24,11 +24,8 @@ from skysim.experiments.study.report.layout import (
 from skysim.experiments.study.table import (
     Axis,
     Index,
-    PointRows,
-    axis,
-    is_sampled,
+    PointTable,
     label,
-    shown_points,
 )
 from skysim.experiments.study.thresholds import crossings, thresholds_of
 from skysim.results.metrics import MORE_IS_BETTER, is_proportion, split_name
@@ -56,8 +53,11 @@ def add_color_bar(fig: Any, image: Any, figure: Heat | Map, **where: Any) -> Non
 
 
 def color_scale(values: Floats, figure: Heat | Map) -> Record:
-    """Color map and normalization of a response: every proportion has the same, from 0 to 1."""
-    from matplotlib.colors import Normalize
+    """Color map and normalization of a response: every proportion has the same, from 0 to 1.
+
+    Others extend over the finite values; a valid default range if all are equal or there are none.
+    """
+    from matplotlib.colors import LogNorm, Normalize
 
     share = is_proportion(figure.response)
     if share and not figure.log:
@@ -65,19 +65,13 @@ def color_scale(values: Floats, figure: Heat | Map) -> Record:
     colors = SHARE_COLORS if share else COLORS
     if split_name(figure.response)[0] in MORE_IS_BETTER:
         colors += "_r"
-    return {"cmap": colors, "norm": color_norm(values, figure.log)}
-
-
-def color_norm(values: Floats, log: bool) -> Any:
-    """Color normalization over the finite values; a valid default range if all are equal or there are none."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    finite = values[np.isfinite(values) & ((values > 0) | (not log))]
+    finite = values[np.isfinite(values) & ((values > 0) | (not figure.log))]
     low = float(finite.min()) if len(finite) else 0.5
     high = float(finite.max()) if len(finite) else 1.0
     if high <= low:
         high = low + (abs(low) or 1.0)
-    return LogNorm(low, high, clip=True) if log else Normalize(low, high)
+    norm = LogNorm(low, high, clip=True) if figure.log else Normalize(low, high)
+    return {"cmap": colors, "norm": norm}
 
 
 def ticks(low: float, high: float) -> tuple[Any, Any]:
@@ -127,13 +121,13 @@ GRAY = "#8fa1b3"
 ORANGE = "#d55e00"
 
 
-def figure_png(lines: PointRows, figure: Curve | Heat, study: Study) -> bytes:
+def figure_png(lines: PointTable, figure: Curve | Heat) -> bytes:
     """A curve or heat map as PNG. Raises InputError if its `where` names an unknown factor or level."""
     if isinstance(figure, Curve):
-        return png(lambda fig: draw_curve(fig, lines, figure, study), (7.4, 3.9))
-    if is_sampled(study):
-        return png(lambda fig: draw_scatter(fig, lines, figure, study), (7.0, 4.4))
-    cells = grid(lines, figure, study)
+        return png(lambda fig: draw_curve(fig, lines, figure), (7.4, 3.9))
+    if lines.study.is_sampled:
+        return png(lambda fig: draw_scatter(fig, lines, figure), (7.0, 4.4))
+    cells = grid(lines, figure)
     rows, columns = cells.value.shape
     width_in = min(max(2.6 + 0.6 * columns, 4.6), 9.6)
     height_in = min(max(1.2 + 0.42 * rows, 2.6), 7.0)
@@ -143,22 +137,22 @@ def figure_png(lines: PointRows, figure: Curve | Heat, study: Study) -> bytes:
 # Curves.
 
 
-def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
+def draw_curve(fig: Any, lines: PointTable, figure: Curve) -> None:
     """Draw series with their intervals; sampled points as markers, with a running median if they are many."""
     axes = fig.subplots()
-    x_axis = axis(study, lines, figure.x)
-    shown = series(lines, figure, study)
-    dots = draws_medians(study, x_axis, sum(len(one.x) for one in shown))
+    x_axis = lines.axes[figure.x]
+    shown = series(lines, figure)
+    dots = draws_medians(lines, x_axis, sum(len(one.x) for one in shown))
     set_up_y_axis(axes, figure.y, shown, figure.log, not dots)
     set_up_axis(axes, "x", x_axis)
     if (expected := expected_value(figure.y)) is not None:
         axes.axhline(expected, color="#777777", linestyle=":", linewidth=1.2)
-    group_axis = axis(study, lines, figure.by) if figure.by is not None else None
+    group_axis = lines.axes[figure.by] if figure.by is not None else None
     # Sampled points are not joined. Bars of several series with common levels are side by side.
     line = "-" if x_axis.numeric else ":"
     widest_pt, room_pt = (3.0, 20.0) if x_axis.numeric else (6.0, 60.0)
     step_pt = min(widest_pt, room_pt / max(len(shown), 1))
-    if is_sampled(study):
+    if lines.study.is_sampled:
         line = "none"
         step_pt = 0.0
     for n, (one, ink) in enumerate(zip(shown, colors(len(shown), group_axis), strict=True)):
@@ -168,7 +162,7 @@ def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
         else:
             shift_pt = (n - (len(shown) - 1) / 2) * step_pt
             draw_line(axes, one, ink, mark, line, shift_pt)
-    draw_thresholds(axes, figure, study, lines, group_axis)
+    draw_thresholds(axes, figure, lines, group_axis)
     if not any(np.isfinite(one.value).any() for one in shown):
         axes.text(
             0.5, 0.5, "nothing yet", transform=axes.transAxes, ha="center", color="#888888"
@@ -181,12 +175,12 @@ def draw_curve(fig: Any, lines: PointRows, figure: Curve, study: Study) -> None:
 
 
 def draw_thresholds(
-    axes: Any, figure: Curve, study: Study, lines: PointRows, group_axis: Axis | None
+    axes: Any, figure: Curve, lines: PointTable, group_axis: Axis | None
 ) -> None:
     """Draw the thresholds of this curve: the limit dashed, a tick at each crossing and a bar over its interval."""
-    for threshold in thresholds_of(figure, study, lines):
+    for threshold in thresholds_of(figure, lines):
         axes.axhline(threshold.limit, color="#777777", linestyle="--", linewidth=0.8)
-        found = crossings(threshold, study, lines)
+        found = crossings(threshold, lines)
         first, last = axes.get_xlim()
         for one, ink in zip(found.values(), colors(len(found), group_axis), strict=True):
             if one is None or not np.isfinite(one.value):
@@ -387,13 +381,13 @@ def write_values(axes: Any, cells: Grid, image: Any) -> None:
         axes.text(column, row, text, ha="center", va="center", color=ink, fontsize=8)
 
 
-def draw_scatter(fig: Any, lines: PointRows, figure: Heat, study: Study) -> None:
+def draw_scatter(fig: Any, lines: PointTable, figure: Heat) -> None:
     """Draw sampled points over two factors, colored by response."""
     axes = fig.subplots()
-    points = shown_points(lines, figure, study)
+    points = lines.shown_in(figure)
     places = []
     for which, name in (("x", figure.x), ("y", figure.y)):
-        one = axis(study, lines, name)
+        one = lines.axes[name]
         set_up_axis(axes, which, one)
         places.append(list(map(one.at, points)))
     values = np.array([line.responses[figure.value].value for line in points])

@@ -10,19 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core.types import Bools, Floats, Ints
-from skysim.experiments.study.plan import Curve, Figure, Heat, Search, Study
+from skysim.experiments.study.plan import Curve, Figure, Heat, Search
 from skysim.experiments.study.table import (
     Axis,
     PointRows,
-    axis,
-    fixed_levels,
+    PointTable,
     format_level,
-    group_points,
     has_few_values,
-    is_sampled,
     label,
-    shown_points,
-    varied_factors,
 )
 from skysim.experiments.study.thresholds import thresholds_of
 from skysim.results import metrics
@@ -87,32 +82,32 @@ class Panel(NamedTuple):
     bounds: list[float]
 
 
-def draws_medians(study: Study, x_axis: Axis, count: int) -> bool:
+def draws_medians(lines: PointTable, x_axis: Axis, count: int) -> bool:
     """Whether medians are drawn instead of intervals: sampled points that are many or share a non-numeric axis."""
-    return is_sampled(study) and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)
+    return lines.study.is_sampled and (count > MAX_POINTS_WITH_BARS or not x_axis.numeric)
 
 
 # Selection of figures and of their points.
 
 
-def figures(study: Study, lines: PointRows) -> list[Figure]:
+def figures(lines: PointTable) -> list[Figure]:
     """The figures of the study file; if it has none, automatic figures of the responses, about MOST_FIGURES at most.
 
     With sampled points and with one factor at a time, each response is drawn against each factor. Otherwise it is
     drawn against the first numeric factor, with a line for each level of a second factor, or as a heat map over both
     if there would be too many lines.
     """
+    study = lines.study
     if study.figures or not lines:
         return list(study.figures)
-    axes = {name: axis(study, lines, name) for name in study.factors}
-    varied = [name for name, one in axes.items() if len(one.levels) > 1]
+    varied = list(lines.varied)
     if not varied:
         return []
     pairs: list[tuple[str, str | None, str]]
-    if is_sampled(study) or study.design.kind == "one_at_a_time":
+    if study.is_sampled or study.design.kind == "one_at_a_time":
         pairs = [(one, None, y) for y in study.responses for one in varied]
     else:
-        x = next((name for name in varied if axes[name].numeric), varied[0])
+        x = next((name for name in varied if lines.axes[name].numeric), varied[0])
         by = next((name for name in varied if name != x), None)
         pairs = [(x, by, y) for y in study.responses]
     # If there are too many figures, show fewer responses, each with all of its figures.
@@ -120,30 +115,26 @@ def figures(study: Study, lines: PointRows) -> list[Figure]:
         MOST_FIGURES * len(study.responses) // len(pairs), 1
     )  # number of responses to show
     return [
-        automatic_figure(x, by, y, axes, lines)
-        for x, by, y in pairs
-        if y in study.responses[:most]
+        automatic_figure(x, by, y, lines) for x, by, y in pairs if y in study.responses[:most]
     ]
 
 
-def automatic_figure(
-    x: str, by: str | None, y: str, axes: Mapping[str, Axis], lines: PointRows
-) -> Figure:
+def automatic_figure(x: str, by: str | None, y: str, lines: PointTable) -> Figure:
     """An automatic figure: a curve, or a heat map if `by` has more than MOST_LINES levels."""
     values = np.array([line.responses[y].value for line in lines])
     values = values[np.isfinite(values)]
     least = values.min(initial=np.inf)
     log = bool(0 < least < values.max(initial=0.0) / LOG_RESPONSE_RATIO)
-    if by is not None and len(axes[by].levels) > MOST_LINES:
+    if by is not None and len(lines.axes[by].levels) > MOST_LINES:
         return Heat(kind="heat", x=x, y=by, value=y, log=log)
     return Curve(kind="curve", x=x, y=y, by=by, log=log)
 
 
-def series(lines: PointRows, figure: Curve, study: Study) -> list[Series]:
+def series(lines: PointTable, figure: Curve) -> list[Series]:
     """The series of a curve, one for each level of `by`; for a sampled `by`, one for each of GROUPS equal groups."""
-    x_axis = axis(study, lines, figure.x)
+    x_axis = lines.axes[figure.x]
     found = []
-    for name, group in group_points(lines, figure, study).items():
+    for name, group in lines.groups(figure).items():
         if not group:
             continue
         ordered = sorted(group, key=x_axis.at)
@@ -156,16 +147,16 @@ def series(lines: PointRows, figure: Curve, study: Study) -> list[Series]:
     return found
 
 
-def grid(lines: PointRows, figure: Heat, study: Study) -> Grid:
+def grid(lines: PointTable, figure: Heat) -> Grid:
     """The axes and cell values of a heat map."""
-    x = axis(study, lines, figure.x)
-    y = axis(study, lines, figure.y)
+    x = lines.axes[figure.x]
+    y = lines.axes[figure.y]
     columns, rows = ([one.coordinate(level) for level in one.levels] for one in (x, y))
     shape = len(rows), len(columns)
     value = np.full(shape, np.nan)
     count = np.zeros(shape, int)
     few = np.zeros(shape, bool)
-    for line in shown_points(lines, figure, study):
+    for line in lines.shown_in(figure):
         cell = rows.index(y.at(line)), columns.index(x.at(line))
         value[cell] = line.responses[figure.value].value
         count[cell] = line.responses[figure.value].trials
@@ -246,11 +237,11 @@ def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float
 # Captions.
 
 
-def caption(figure: Figure, study: Study, lines: PointRows) -> str:
+def caption(figure: Figure, lines: PointTable) -> str:
     """Caption of a figure: its axes, the fixed levels, the number of trials per point, and the markers used."""
     value = figure.response
-    shown = shown_points(lines, figure, study)
-    text = f"{caption_title(figure)}{fixed_text(figure, study, lines)}"
+    shown = lines.shown_in(figure)
+    text = f"{caption_title(figure)}{fixed_text(figure, lines)}"
     summaries = [line.responses[value] for line in shown]
     counts = [one.trials for one in summaries if one.trials]
     if not counts:
@@ -260,8 +251,8 @@ def caption(figure: Figure, study: Study, lines: PointRows) -> str:
     mark = "Dotted"
     if isinstance(figure, Curve):
         mark = "Hollow, without a line"
-        text += curve_note(figure, study, lines, summaries) + "."
-        if thresholds_of(figure, study, lines):
+        text += curve_note(figure, lines, summaries) + "."
+        if thresholds_of(figure, lines):
             text += " Dashed: a limit; ticks and bars: where it is crossed, each end at 95 %."
         if (expected := expected_value(value)) is not None:
             text += f" Dotted: {expected:g}, where the claimed errors are true."
@@ -283,20 +274,19 @@ def caption_title(figure: Figure) -> str:
     return f"{figure.value} by direction" + (f" and {figure.by}" if figure.by else "")
 
 
-def fixed_text(figure: Figure, study: Study, lines: PointRows) -> str:
+def fixed_text(figure: Figure, lines: PointTable) -> str:
     """The levels of varied factors that a figure keeps fixed, as ", at leds = 900"; empty if there are none."""
-    varied = varied_factors(study, lines)
-    fixed = fixed_levels(figure, study, lines).items()
-    at = ", ".join(f"{name} = {format_level(one)}" for name, one in fixed if name in varied)
+    fixed = lines.fixed_levels(figure).items()
+    at = ", ".join(
+        f"{name} = {format_level(one)}" for name, one in fixed if name in lines.varied
+    )
     return f", at {at}" if at else ""
 
 
-def curve_note(
-    figure: Curve, study: Study, lines: PointRows, summaries: Sequence[metrics.Summary]
-) -> str:
+def curve_note(figure: Curve, lines: PointTable, summaries: Sequence[metrics.Summary]) -> str:
     """The meaning of the lines and bars of a curve."""
-    x_axis = axis(study, lines, figure.x)
-    if draws_medians(study, x_axis, len(summaries)):
+    x_axis = lines.axes[figure.x]
+    if draws_medians(lines, x_axis, len(summaries)):
         return f"; lines: {'running medians' if x_axis.numeric else 'medians'} of the points"
     if np.isnan([one.low for one in summaries]).all():
         return ""

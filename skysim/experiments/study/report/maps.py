@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.experiments.study.plan import Map, Study
+from skysim.experiments.study.plan import Map
 from skysim.experiments.study.report.figures import (
     HATCHED,
     add_color_bar,
@@ -20,7 +20,7 @@ from skysim.experiments.study.report.figures import (
     is_light,
 )
 from skysim.experiments.study.report.layout import caption_title, fixed_text
-from skysim.experiments.study.table import PointRows, group_points
+from skysim.experiments.study.table import PointTable
 from skysim.experiments.study.worst import ColumnsOf, WorstTrial, worst_trials
 from skysim.results import metrics
 from skysim.results.files.row_parts import subset
@@ -76,12 +76,12 @@ class DirectionMap(NamedTuple):
 
 
 def direction_maps(
-    lines: PointRows, figure: Map, study: Study, columns_of: ColumnsOf
+    lines: PointTable, figure: Map, columns_of: ColumnsOf
 ) -> list[DirectionMap]:
     """The panels of a map, one for each level of `by`. Raises InputError for points of dome and of sky."""
     return [
         direction_map(label, columns_of(*(line.point for line in group)), figure.value)
-        for label, group in group_points(lines, figure, study).items()
+        for label, group in lines.groups(figure).items()
     ]
 
 
@@ -308,11 +308,9 @@ def mark_worst(axes: Any, panel: DirectionMap) -> None:
 # Caption.
 
 
-def caption(
-    panels: Sequence[DirectionMap], figure: Map, study: Study, lines: PointRows
-) -> str:
+def caption(panels: Sequence[DirectionMap], figure: Map, lines: PointTable) -> str:
     """Caption of a map: its response, the fixed levels, the meaning of directions, and the numbers in the cells."""
-    text = caption_title(figure) + fixed_text(figure, study, lines)
+    text = caption_title(figure) + fixed_text(figure, lines)
     cells = [cell for panel in panels for cell in panel.cells]
     if not cells:
         return f"{text}. No trial of it is in yet."

@@ -15,6 +15,7 @@ from skysim.experiments.study.table import level_columns, table, to_columns, wit
 from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
 
 Names = tuple[str, ...]
+META = ("title", "code", "study")  # what the files say of the study
 
 
 def to_csv(store: Store, responses: Names, path: Path) -> None:
@@ -72,7 +73,7 @@ def to_parquet(store: Store, responses: Names, path: Path) -> None:
     except ImportError:
         raise InputError(path, f"Parquet {EXTRA}") from None
     levels = level_columns(store)
-    meta = {key: store.meta(key) for key in ("title", "code", "study")}
+    meta = {key: store.meta(key) for key in META}
     tables = (
         to_arrow(with_levels(block, levels)).replace_schema_metadata(meta)
         for block in store.blocks()
@@ -109,7 +110,7 @@ def dataset(store: Store, responses: Names, path: Path) -> Any:
     full = (
         factors and int(np.prod(sizes)) == len(frame) and not frame.duplicated(factors).any()
     )
-    meta = {key: store.meta(key) for key in ("title", "code", "study")}
+    meta = {key: store.meta(key) for key in META}
     indexed = frame.set_index(factors if full else ["point"])
     return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
 

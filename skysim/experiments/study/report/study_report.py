@@ -17,20 +17,17 @@ from skysim.experiments.study.report import figures, layout, maps
 from skysim.experiments.study.report.overview import Overview, overview
 from skysim.experiments.study.table import (
     Index,
-    PointRows,
-    axis,
-    cells,
+    PointTable,
+    format_level,
     format_response,
     format_summary,
     indices,
-    is_sampled,
     pooled,
     pooled_row,
     quantities,
     rank_correlations,
     same,
     select_responses,
-    shown_points,
     switches_causes,
     table,
 )
@@ -101,7 +98,7 @@ class Analysis(NamedTuple):
         Judgments of each requirement at all points with an answer
     """
 
-    lines: PointRows
+    lines: PointTable
     about: Overview
     verdict: str
     headline: Sequence[str]
@@ -126,7 +123,7 @@ def study_report(plan: Plan, store: Store) -> Report:
         If `where` of a figure names an unknown factor or level.
     """
     command = commands(plan, store)
-    return compose(plan.study, store, analyze(plan, store, command), command)
+    return compose(store, analyze(plan, store, command), command)
 
 
 def commands(plan: Plan, store: Store, study: str = "", out: Path | None = None) -> Command:
@@ -161,21 +158,21 @@ def analyze(plan: Plan, store: Store, command: Command) -> Analysis:
     about = overview(plan)
     deciding = [one.response for one in starmap(requirement, about.require.items())]
     names = list(dict.fromkeys([*responses(study), *answer.RESPONSES, *deciding]))
-    lines = table(store, names)
+    lines = PointTable(study, table(store, names))
     columns = pooled(plan, store)
-    answered = [pooled_row(plan, columns, names)] if columns else lines
+    answered = lines.with_rows([pooled_row(plan, columns, names)]) if columns else lines
     judged = thresholds.judged(about.require, answer.answered(answered))
     headline = answer.headline(
-        study, answered, about.may_be_ambiguous, command("worst"), judged, about.survey_share
+        answered, about.may_be_ambiguous, command("worst"), judged, about.survey_share
     )
     headline += answer.one_unit(about.fixed) if headline else []
     sobol = study.design.kind == "saltelli" and not study.optimize
     return Analysis(
         lines,
         about,
-        answer.verdict(study, answered, judged, about.survey_share),
+        answer.verdict(answered, judged, about.survey_share),
         headline,
-        answer.ranges(study, answered),
+        answer.ranges(answered),
         indices(plan, store) if sobol or switches_causes(study) else [],
         search.collect_result(plan, store) if study.optimize else None,
         pooled_blocks(plan, columns, command("replay")) if columns else (),
@@ -190,30 +187,26 @@ def responses(study: Study) -> list[str]:
     return [name for name in dict.fromkeys(names) if name != "cost"]
 
 
-def compose(
-    study: Study,
-    store: Store,
-    found: Analysis,
-    command: Command,
-) -> Report:
+def compose(store: Store, found: Analysis, command: Command) -> Report:
     """The report of an analyzed study: its question, its answer, one figure, and then the details.
 
     `command` is the function of `commands`.
     """
+    study = found.lines.study
     lines = select_responses(found.lines, responses(study))
     result = found.result or search.SearchResult([], [], finished=False)
     front = [one.number for one in result.front]
     costs = {one.number: one.cost for one in result.candidates}
     title, shares = ERROR_CAUSES if switches_causes(study) else SOBOL
     drawn = [
-        *search_figures(lines, study, front, costs),
+        *search_figures(lines, front, costs),
         *(
             Figure(figures.indices_png(found.indices, one), shares.format(one), name=one)
             for one in dict.fromkeys(index.response for index in found.indices)
         ),
-        *study_figures(lines, study, store.point_columns, command("replay")),
+        *study_figures(lines, store.point_columns, command("replay")),
     ]
-    shown = {one.response for one in layout.figures(study, lines)}
+    shown = {one.response for one in layout.figures(lines)}
     left = ", ".join(name for name in study.responses if name not in shown)
     done = progress(study, store)
     unmet = any(one.answer == NOT_MET for row in found.judged for one in row)
@@ -230,17 +223,15 @@ def compose(
         *drawn[:1],
         folded("All answers", [Items(found.headline)], on_terminal=True),
         folded("Further figures", further),
-        folded(
-            "Ranges of the responses", [Table(RANGES, answer.range_rows(study, found.lines))]
-        )
+        folded("Ranges of the responses", [Table(RANGES, answer.range_rows(found.lines))])
         if not found.pooled
         else Text(""),
-        Section("Requirements", requirement_table(study, found)),
+        Section("Requirements", requirement_table(found)),
         Section(title, [index_table(found.indices)]),
         Section("Front", front_table(study, found.result)),
         Section(POOLED, found.pooled)
         if found.pooled
-        else points_section(lines, study, front, costs),
+        else points_section(lines, front, costs),
         *scene_sections(found.about, store.meta("code")),
         runs_section(store),
         folded(STUDY_FILE, [Code(store.meta("study"), "yaml")]),
@@ -307,29 +298,28 @@ def failures(store: Store, replay: str) -> Items:
 
 
 def points_section(
-    lines: PointRows,
-    study: Study,
-    front: Sequence[int],
-    costs: Mapping[int, float],
+    lines: PointTable, front: Sequence[int], costs: Mapping[int, float]
 ) -> Section:
     """The table of all points. Named levels sort in the order of the study file; points of a front are marked."""
-    heads, texts = cells(lines)
-    axes = {name: axis(study, lines, name) for name in (lines[0].levels if lines else ())}
-    named = [name for name, one in axes.items() if not one.numeric]
+    heads = ["point", *lines.axes, *(lines[0].responses if lines else ())]
+    named = [name for name, one in lines.axes.items() if not one.numeric]
     columns = [Column(head, kind="text" if head in named else "number") for head in heads]
     rows: list[list[Any]] = []
-    for line, row_texts in zip(lines[:ROWS], texts, strict=False):
-        keys = [line.point, *(one.at(line) for one in axes.values())]
-        keys += [one.value for one in line.responses.values()]
-        row: list[Any] = [
-            Cell(text, key=key) for text, key in zip(row_texts, keys, strict=True)
+    for line in lines[:ROWS]:
+        tone: Tone = "marked" if line.point in front else ""
+        row: list[Any] = [Cell(str(line.point), tone, line.point)]
+        row += [
+            Cell(format_level(line.levels[name]), key=one.at(line))
+            for name, one in lines.axes.items()
         ]
-        if line.point in front:
-            row[0] = row[0]._replace(tone="marked")
-        if study.optimize:
+        row += [
+            Cell(format_response(line, name), key=one.value)
+            for name, one in line.responses.items()
+        ]
+        if lines.study.optimize:
             row.append(costs.get(line.point))
         rows.append(row)
-    if study.optimize:
+    if lines.study.optimize:
         columns.append(Column("cost", format=".4g"))
     note = "In brackets intervals of 95 %."
     if front:
@@ -338,7 +328,7 @@ def points_section(
         note += (
             f" And {len(lines) - ROWS} points more: `skysim study export` writes them all."
         )
-    shown = Table(columns, rows, from_the_last(len(axes) + 1, len(columns)))
+    shown = Table(columns, rows, from_the_last(len(lines.axes) + 1, len(columns)))
     return Section(POINTS, [shown, Text(note)], folded=len(lines) > OPEN_ROWS)
 
 
@@ -373,12 +363,12 @@ def pooled_blocks(plan: Plan, columns: metrics.Columns, replay: str) -> list[Blo
     ]
 
 
-def requirement_table(study: Study, found: Analysis) -> list[Block]:
+def requirement_table(found: Analysis) -> list[Block]:
     """The judgment of each requirement at each point, and the share of its trials that miss it."""
     if not any(found.judged) or found.pooled:
         return []
     lines = answer.answered(found.lines)
-    places = map(answer.placer(study, lines), lines)
+    places = map(lines.place, lines)
     answers = [
         [f"{one.answer} ({percent(one.misses)} miss)" for one in row] for row in found.judged
     ]
@@ -446,9 +436,7 @@ def runs_section(store: Store) -> Section:
 # Figures.
 
 
-def study_figures(
-    lines: PointRows, study: Study, columns_of: ColumnsOf, replay: str
-) -> list[Block]:
+def study_figures(lines: PointTable, columns_of: ColumnsOf, replay: str) -> list[Block]:
     """The study's figures: maps with tables of their worst trials, other figures with tables of their numbers.
 
     Parameters
@@ -459,20 +447,16 @@ def study_figures(
         The command that repeats a trial
     """
     blocks: list[Block] = []
-    for one in layout.figures(study, lines):
+    for one in layout.figures(lines):
         if isinstance(one, Map):
-            panels = maps.direction_maps(lines, one, study, columns_of)
-            picture = Figure(
-                maps.map_png(panels, one), maps.caption(panels, one, study, lines)
-            )
+            panels = maps.direction_maps(lines, one, columns_of)
+            picture = Figure(maps.map_png(panels, one), maps.caption(panels, one, lines))
             blocks += [picture, worst_table(panels, replay)]
             continue
-        blocks.append(
-            Figure(figures.figure_png(lines, one, study), layout.caption(one, study, lines))
-        )
-        if not is_sampled(study):
+        blocks.append(Figure(figures.figure_png(lines, one), layout.caption(one, lines)))
+        if not lines.study.is_sampled:
             blocks.append(
-                Section("The figure's numbers", [pivot_table(one, lines, study)], folded=True)
+                Section("The figure's numbers", [pivot_table(one, lines)], folded=True)
             )
     return blocks
 
@@ -497,12 +481,12 @@ def worst_table(panels: Sequence[maps.DirectionMap], replay: str) -> Table:
     return Table([*columns, text_column("repeat it")], rows)
 
 
-def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
+def pivot_table(figure: Curve | Heat, lines: PointTable) -> Table:
     """A figure's numbers: a column per level of x, a row per level of the other factor."""
-    across = axis(study, lines, figure.x)
+    across = lines.axes[figure.x]
     other = figure.by if isinstance(figure, Curve) else figure.y
-    chosen = shown_points(lines, figure, study)
-    down = axis(study, lines, other) if other else None
+    chosen = lines.shown_in(figure)
+    down = lines.axes[other] if other else None
 
     def text(x: Any, level: Any) -> str:
         for line in chosen:
@@ -522,17 +506,15 @@ def pivot_table(figure: Curve | Heat, lines: PointRows, study: Study) -> Table:
 
 
 def search_figures(
-    lines: PointRows,
-    study: Study,
-    front: Sequence[int],
-    costs: Mapping[int, float],
+    lines: PointTable, front: Sequence[int], costs: Mapping[int, float]
 ) -> list[Figure]:
     """Plots of an optimization: every candidate and, with two objectives, the Pareto front."""
-    if study.optimize is None or not lines:
+    config = lines.study.optimize
+    if config is None or not lines:
         return []
-    panels = layout.panels(lines, study.optimize, costs)
+    panels = layout.panels(lines, config, costs)
     points = [line.point for line in lines]
-    named = [one.response for one in study.optimize.objectives]
+    named = [one.response for one in config.objectives]
     marked = ", ".join(map(str, front))
     best = f"none beats {marked} in all objectives" if front else "no candidate is marked yet"
     text = f"Every candidate; {best}. Dashed: bounds."
