@@ -210,10 +210,8 @@ class FlightComputer:
             self.loads = np.abs(control[self.actuator.motor]) / self.actuator.limit
             if isinstance(self.actuator, WheelActuator):
                 # The speed of a wheel counts if it is closer to its limit.
-                speeds = np.abs(inputs.speeds_rad_s[self.actuator.joints.dof])
-                self.loads = np.maximum(
-                    self.loads, speeds / self.actuator.model.speed_limit_rad_s
-                )
+                speeds = np.abs(inputs.speeds_rad_s[self.actuator.hinges.dof])
+                self.loads = np.maximum(self.loads, speeds / self.actuator.speed_limit_rad_s)
         # 4. Anti-windup.
         if has_law:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

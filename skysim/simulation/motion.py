@@ -382,7 +382,7 @@ class TelemetryRecorder:
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,
             joints=states[:, 1 : 1 + nq].copy(),
-            manipulability=cmgs.model.manipulability(gimbals, rotors)
+            manipulability=cmgs.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,
             lab_from_ref=reference.attitudes(t_s) if reference else None,

@@ -42,8 +42,7 @@ class ControlInput(NamedTuple):
 class Actuators:
     """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
 
-    It stores no momentum, its torque is proportional to its commands, and a command beyond the limit is clipped. Kinds
-    override what differs.
+    It stores no momentum, and its torque is proportional to its commands. Kinds override what differs.
 
     Attributes
     ----------
@@ -62,7 +61,14 @@ class Actuators:
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Write the commands into control; return the torque (3,) that they will give."""
-        return self.command(control, self.command_from_torque @ torque_nm, inputs)
+        return self.command(control, self.drive(torque_nm), inputs)
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        """The smallest commands (n,) that give the torque (3,), or the nearest to it in least squares.
+
+        One factor scales all commands to the limit, which keeps the direction of the torque.
+        """
+        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""

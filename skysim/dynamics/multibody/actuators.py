@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
     ActuatorKind,
@@ -34,6 +35,13 @@ TORQUES = ("torque_x", "torque_y", "torque_z")
 PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
 
 
+class IdealTorques(Actuators):
+    """Ideal torques about the body's axes, each of which is clipped by itself."""
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        return torque_nm
+
+
 def kinds_on(vehicle: VehicleConfig) -> list[tuple[ActuatorKind, Any]]:
     """The kinds that a scene switches on, each with its section."""
     kinds = [(kind, getattr(vehicle, kind.key)) for kind in KINDS]
@@ -43,7 +51,7 @@ def kinds_on(vehicle: VehicleConfig) -> list[tuple[ActuatorKind, Any]]:
 def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
     motors = np.array([model.actuator(name).id for name in TORQUES])
-    ideal = Actuators(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    ideal = IdealTorques(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
     return {"ideal": ideal} | {
         kind.key: kind.control(model, config) for kind, config in kinds_on(vehicle)
     }

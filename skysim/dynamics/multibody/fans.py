@@ -17,15 +17,12 @@ from skysim.dynamics.multibody.actuator_kind import (
     add_motor,
     all_names,
     inverse,
-    scale_to_limit,
     sites,
 )
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
 
 FAN = "fan_"
-
-NO_MOTORS = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,48 +63,20 @@ class Fans:
 
 
 class FanSet(Actuators):
-    """Actuators of the flight computer: n fans, commanded as if they had no lag.
+    """Actuators of the flight computer: n fans, commanded as if they had no lag. Each can blow either way.
 
-    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust.
-
-    Parameters
-    ----------
-    force_axes
-        (3, n) unit vectors along which a positive thrust pushes the body, in body axes
-    positions_m
-        (3, n) positions from the center of rotation, in body axes
-    thrust_limit_n
-        Greatest thrust of each fan
-    motor
-        Numbers of the motors; none without a model
+    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust. The bearing takes the net
+    force.
     """
 
-    def __init__(
-        self,
-        force_axes: Floats,
-        positions_m: Floats,
-        thrust_limit_n: float,
-        motor: Ints = NO_MOTORS,
-    ) -> None:
-        lever_m = np.cross(positions_m, force_axes, axis=0)
-        super().__init__(motor, lever_m, inverse(lever_m), thrust_limit_n)
-
-    def drive(self, torque_nm: Floats) -> Floats:
-        """The smallest thrusts (n,) that give the torque (3,), or the nearest to it in least squares.
-
-        One factor scales all thrusts to the limit, which keeps the direction of the torque. Each fan can blow either
-        way. The bearing takes the net force.
-        """
-        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, self.drive(torque_nm), inputs)
+    def __init__(self, fans: Fans, thrust_limit_n: float) -> None:
+        lever_m = np.cross(fans.positions_m, fans.axes, axis=0)
+        super().__init__(fans.motor, lever_m, inverse(lever_m), thrust_limit_n)
 
 
 def fan_actuators(model: Any, config: FansConfig) -> FanSet:
     """The fans of a compiled model."""
-    fans = Fans.from_model(model)
-    return FanSet(fans.axes, fans.positions_m, config.thrust_limit_n, fans.motor)
+    return FanSet(Fans.from_model(model), config.thrust_limit_n)
 
 
 @dataclass(slots=True)

@@ -52,9 +52,7 @@ class ThrusterActuator(FanSet):
 
     def __init__(self, model: Any, config: ThrustersConfig) -> None:
         thrusters = Fans.from_model(model, THRUSTER)
-        super().__init__(
-            thrusters.axes, thrusters.positions_m, config.thrust_n, thrusters.motor
-        )
+        super().__init__(thrusters, config.thrust_n)
         lever_m = self.torque_from_command
         self.weighted_m = np.vstack(
             (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(thrusters)))
