@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -190,8 +191,7 @@ class Hinges:
     @classmethod
     def from_model(cls, model: Any, prefix: str) -> Hinges:
         """All joints of a compiled model whose name begins with prefix."""
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
+        data = at_zero(model)
         # The diagonal of the joint-space inertia matrix is the inertia about each axis.
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
@@ -214,23 +214,22 @@ class Hinges:
         return len(self.names)
 
 
+def at_zero(model: Any) -> Any:
+    """Data of a compiled model with all joints at zero, where the axes of the body are those of the lab."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
 def all_names(element: Any, count: int, prefix: str = "") -> list[str]:
     """Names with a prefix of the elements of one kind of a compiled model; `element` returns one by its number."""
     return [name for k in range(count) if (name := element(k).name).startswith(prefix)]
 
 
-def joints(spec: Any, prefix: str) -> list[Any]:
-    """The joints of a spec whose name begins with prefix, in the order of their names."""
+def named(elements: Iterable[Any], prefix: str) -> list[Any]:
+    """The joints or sites of a spec whose name begins with prefix, in the order of their names."""
     return sorted(
-        (j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name
-    )
-
-
-def sites(spec: Any, prefix: str) -> list[Any]:
-    """The sites of a spec whose name begins with prefix, in the order of their names."""
-    return sorted(
-        (site for site in spec.sites if site.name.startswith(prefix)),
-        key=lambda site: site.name,
+        (one for one in elements if one.name.startswith(prefix)), key=attrgetter("name")
     )
 
 
@@ -260,7 +259,7 @@ def add_servos(spec: Any, model: Any, prefix: str, tau_s: float) -> None:
     The inertia of a slide is its mass, and its angle a position.
     """
     inertias = Hinges.from_model(model, prefix).inertia_kg_m2
-    for joint, inertia in zip(joints(spec, prefix), inertias, strict=True):
+    for joint, inertia in zip(named(spec.joints, prefix), inertias, strict=True):
         servo = spec.add_actuator(
             name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
         )

@@ -19,8 +19,7 @@ from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
     add_motor,
-    joints,
-    sites,
+    named,
 )
 from skysim.dynamics.multibody.cmgs import CMGS
 from skysim.dynamics.multibody.fans import FANS
@@ -90,7 +89,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {trim: (TRIM,)}
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
-            found = joints(spec, prefix)
+            found = named(spec.joints, prefix)
             if getattr(vehicle, key) is None:
                 locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
                 for joint in found:
@@ -101,7 +100,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     for kind, _ in kinds_on(vehicle):
         kind.check(spec, path)
         for prefix in kind.sites:
-            if not sites(spec, prefix):
+            if not named(spec.sites, prefix):
                 raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
     # 3. Names of the motors that `add_actuators` adds.
     for actuator in spec.actuators:

@@ -31,8 +31,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     add_motor,
     add_servos,
     inverse,
-    joints,
     member_values,
+    named,
     scale_to_limit,
 )
 from skysim.scene.sections.vehicle import CmgsConfig
@@ -286,7 +286,7 @@ def cmg_actuators(model: Any, config: CmgsConfig) -> CmgActuator:
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:
     """Raise InputError unless each rotor is on the gimbal with the same suffix."""
-    for gimbal in joints(spec, GIMBAL):
+    for gimbal in named(spec.joints, GIMBAL):
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
@@ -294,7 +294,7 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
                 path,
                 f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own",
             )
-    if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
+    if len(named(spec.joints, ROTOR)) != len(named(spec.joints, GIMBAL)):
         raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
 
@@ -305,7 +305,7 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     not hold it.
     """
     add_servos(spec, model, GIMBAL, cmgs.gimbal_time_constant_s)
-    for joint in joints(spec, ROTOR):
+    for joint in named(spec.joints, ROTOR):
         if cmgs.rotor_torque_limit_nm:
             add_motor(spec, joint.name, cmgs.rotor_torque_limit_nm)
 

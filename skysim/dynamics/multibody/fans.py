@@ -16,8 +16,9 @@ from skysim.dynamics.multibody.actuator_kind import (
     ControlInput,
     add_motor,
     all_names,
+    at_zero,
     inverse,
-    sites,
+    named,
 )
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
@@ -49,11 +50,10 @@ class Fans:
     @classmethod
     def from_model(cls, model: Any, prefix: str = FAN) -> Fans:
         """The sites whose name begins with prefix and that have an actuator."""
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
+        data = at_zero(model)
         names = sorted(all_names(model.actuator, model.nu, prefix))
         sites = [model.site(name).id for name in names]
-        # z axes of the sites; at zero joint angles lab and body axes coincide.
+        # z axes of the sites.
         axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
         motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
         return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
@@ -132,7 +132,7 @@ def add_force(spec: Any, site: str, limit_n: float) -> Any:
 
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
     """Add a force at each fan along z of its site, which follows the command with a first-order lag."""
-    for site in sites(spec, FAN):
+    for site in named(spec.sites, FAN):
         fan = add_force(spec, site.name, config.thrust_limit_n)
         # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER

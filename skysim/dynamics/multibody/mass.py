@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import joints
+from skysim.dynamics.multibody.actuator_kind import at_zero, named
 from skysim.dynamics.multibody.trims import TRIM
 from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
@@ -50,9 +50,7 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
 
     M = sum m,    center = sum m c / M,    J = sum R diag(I) R^T + m (c.c E - c c^T)    (Steiner)
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    # At zero joint angles the body frame is the lab frame, so lab positions and axes are those in body axes.
+    data = at_zero(model)
     bus = model.body("bus").id
     counted = model.body_rootid == bus
     counted[bus] &= not without_bus
@@ -262,10 +260,9 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     Their joints are removed unless motors move them in flight.
     """
     # 1. Axes and centers at position zero, from the compiled model.
-    slides = joints(spec, TRIM) if vehicle.trim or vehicle.trims else []
+    slides = named(spec.joints, TRIM) if vehicle.trim or vehicle.trims else []
     names = tuple(joint.name for joint in slides)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    data = at_zero(model)
     ids = [model.joint(name).id for name in names]
     bodies = model.jnt_bodyid[ids]
     axes = data.xaxis[ids].T.copy()

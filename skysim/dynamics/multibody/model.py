@@ -27,7 +27,7 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Ints, Mount
-from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, joints
+from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, at_zero, named
 from skysim.dynamics.multibody.actuators import (
     KINDS,
     PREFIXES,
@@ -192,7 +192,7 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     check_compiled(balanced, mass, path)
     # 7. Actuators.
     if vehicle.wheels:
-        unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
+        unbalance(balanced, named(spec.joints, WHEEL), vehicle.wheels, path)
     add_actuators(spec, balanced, vehicle)
     trims = hold_trims(spec, balanced, vehicle, path)
     return spec, trims.moved_mass(mass), trims
@@ -345,9 +345,7 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     mass = tree_mass(model)
     for prefix in (prefix for kind in KINDS for prefix in kind.sites):
         bodies = [
-            model.site(k).bodyid[0]
-            for k in range(model.nsite)
-            if model.site(k).name.startswith(prefix)
+            model.site(name).bodyid[0] for name in all_names(model.site, model.nsite, prefix)
         ]
         if any(model.body_rootid[body] != bus for body in bodies):
             raise InputError(path, f"sites {prefix}* must be on body bus or its children")
@@ -375,17 +373,13 @@ def camera_mount(vehicle: VehicleModel) -> Mount:
 
     Only this function converts MuJoCo's camera axes to skysim's.
     """
-    data = mujoco.MjData(vehicle.model)
-    mujoco.mj_forward(vehicle.model, data)  # at qpos0 the body frame is the lab frame
-    camera = data.camera(CAMERA)
+    camera = at_zero(vehicle.model).camera(CAMERA)
     body_from_mjcam = Rotation.from_matrix(camera.xmat.reshape(3, 3))
     return Mount(np.array(camera.xpos), CAM_FROM_MJCAM * body_from_mjcam.inv())
 
 
 def imu_position_m(vehicle: VehicleModel) -> Floats:
     """(3,) position of the accelerometers in body axes: site `imu`, or the bearing's center if there is none."""
-    if IMU not in [vehicle.model.site(k).name for k in range(vehicle.model.nsite)]:
+    if vehicle.spec.site(IMU) is None:
         return np.zeros(3)
-    data = mujoco.MjData(vehicle.model)
-    mujoco.mj_forward(vehicle.model, data)
-    return np.array(data.site(IMU).xpos)
+    return np.array(at_zero(vehicle.model).site(IMU).xpos)

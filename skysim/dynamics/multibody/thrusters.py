@@ -26,8 +26,8 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     ControlInput,
+    named,
     scale_to_limit,
-    sites,
 )
 from skysim.dynamics.multibody.fans import Fans, FanSet, add_force
 from skysim.scene.sections.vehicle import ThrustersConfig
@@ -183,7 +183,7 @@ class ValveDrive:
 
 def add_thrusters(spec: Any, _: Any, config: ThrustersConfig) -> None:
     """Add a one-sided force at each thruster along z of its site; `ValveDrive` has its lag."""
-    for site in sites(spec, THRUSTER):
+    for site in named(spec.sites, THRUSTER):
         add_force(spec, site.name, config.thrust_n).ctrlrange = [0.0, config.thrust_n]
 
 

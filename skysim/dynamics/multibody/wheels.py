@@ -25,8 +25,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     Hinges,
     add_motor,
     inverse,
-    joints,
     member_values,
+    named,
 )
 from skysim.scene.sections.vehicle import WheelsConfig
 
@@ -131,7 +131,7 @@ class Stiction:
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
     """Add a motor at each wheel, and the friction of its axle; MuJoCo's Coulomb friction also holds a wheel at rest."""
     # T = coulomb sign(speed) + viscous speed.
-    for joint in joints(spec, WHEEL):
+    for joint in named(spec.joints, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
         if wheels.stiction_nm:
