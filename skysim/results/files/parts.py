@@ -239,12 +239,23 @@ class PartsList(NamedTuple):
 
 
 class DomeDesign(NamedTuple):
-    """A dome as designed; boards may stand out beyond the cap of the layout."""
+    """A dome as designed, by the name of its scene; boards may stand out beyond the cap of the layout."""
 
+    name: str
     light: DomeConfig
     surface: Surface
     leds: Sources
     cap_deg: float
+
+    @property
+    def led_m(self) -> Floats:
+        """(N, 3) places of the LEDs."""
+        return self.leds.place[:, :3]
+
+    @property
+    def led_radius_m(self) -> float:
+        """Radius of an LED's disk."""
+        return self.light.led.disk_diameter_m / 2
 
     def to_rim_m(self, place_m: Floats) -> Floats:
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
@@ -303,20 +314,20 @@ def build_design(scene: Scene, what: str = "parts") -> DomeDesign:
     leds = design_leds(light, surface, Band.from_camera(scene.camera))
     # Boards stand out.
     cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
-    return DomeDesign(light, surface, leds, cap_deg)
+    return DomeDesign(scene.name, light, surface, leds, cap_deg)
 
 
 def single_leds(design: DomeDesign) -> Quantities:
     """LEDs one by one, each in its hole, or at the rim with a fiber to its hole."""
     count = len(design.leds)
     line = "fiber" if design.light.layout.kind == "fibers" else "wire"
-    length_m = float(design.to_rim_m(design.leds.place[:, :3]).sum())
+    length_m = float(design.to_rim_m(design.led_m).sum())
     return {"led": count, "mounting_led": count, line: length_m}
 
 
 def boards(design: DomeDesign) -> Quantities:
     """Patch boards; a board's wire goes to its LED next to the rim."""
-    length_m = nearest_m(design.to_rim_m(design.leds.place[:, :3]), design.leds.id // HOLES)
+    length_m = nearest_m(design.to_rim_m(design.led_m), design.leds.id // HOLES)
     count = len(length_m)
     return {
         "board": count,
