@@ -103,7 +103,7 @@ class FlightComputer:
     ) -> None:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
-        self.actuator_sets = build_actuators(scene.vehicle, vehicle.model)
+        self.actuator_sets = build_actuators(scene.vehicle, vehicle)
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
         self.achieved_nm = np.zeros(3)

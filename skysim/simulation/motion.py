@@ -66,7 +66,7 @@ def check_reference(
     check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    actuators = build_actuators(scene.vehicle, model.model)
+    actuators = build_actuators(scene.vehicle, model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -489,7 +489,7 @@ class Motion:
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
         self.period_steps = round(self.flight_computer.period_s / self.simulation.step_s)
-        self.drives = build_drives(scene.vehicle, vehicle.model)
+        self.drives = build_drives(scene.vehicle, vehicle)
         self.navigation = None
         if scene.vehicle.imu is not None:
             self.navigation = Navigation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,7 +56,8 @@ def cmg_set(
     config = CmgsConfig.model_validate({"steering": steering})
     config = config.model_copy(update={"rotor_torque_limit_nm": rotor_torque_limit_nm})
     rotors = hinges(spin_axes, inertia, len(inertia))
-    set_ = CmgActuator(hinges(gimbal_axes, inertia), rotors, config)
+    gimbals = hinges(gimbal_axes, inertia)
+    set_ = CmgActuator(SimpleNamespace(gimbals=gimbals, rotors=rotors), config)
     set_.limit = rate_limit_rad_s
     return set_
 
@@ -63,7 +65,7 @@ def cmg_set(
 def wheel_set(axes: np.ndarray, inertia: np.ndarray, torque_limit_nm: float) -> WheelActuator:
     """Wheels without a model, up to 300 rad/s."""
     config = WheelsConfig().model_copy(update={"torque_limit_nm": torque_limit_nm})
-    set_ = WheelActuator(hinges(axes, inertia), config)
+    set_ = WheelActuator(SimpleNamespace(wheels=hinges(axes, inertia)), config)
     set_.speed_limit_rad_s = 300.0
     return set_
 

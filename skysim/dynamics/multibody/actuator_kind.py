@@ -84,10 +84,6 @@ class Actuators:
         """(3,) stored angular momentum, in body axes."""
         return np.zeros(3)
 
-    def command_map(self) -> tuple[Floats, float]:
-        """The map from torques to commands, and the limit of a command."""
-        return self.command_from_torque, self.limit
-
 
 class ActuatorDrive(Protocol):
     """Hardware between the commands of a set and MuJoCo's motors, such as valves. Stateful: one object per motion.
@@ -126,13 +122,13 @@ class ActuatorKind:
     add
         (spec, compiled spec, config): adds its motors to the spec
     control
-        (compiled model, config): returns the set that the flight computer commands
+        (`VehicleModel`, config): returns the set that the flight computer commands
     start
         (model, data, config): sets the initial angles and speeds of its joints in the data
     check
         (spec, path of the file): raises InputError for joints that do not fit together
     drive
-        (compiled model, config): returns the hardware between commands and motors; None without any
+        (`VehicleModel`, config): returns the hardware between commands and motors; None without any
     """
 
     key: str

@@ -47,18 +47,17 @@ def kinds_on(vehicle: VehicleConfig) -> list[tuple[ActuatorKind, Any]]:
     return [(kind, config) for kind, config in kinds if config is not None]
 
 
-def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
+def build_actuators(config: VehicleConfig, vehicle: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
-    motors = np.array([model.actuator(name).id for name in TORQUES])
-    ideal = IdealTorques(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    ideal = IdealTorques(vehicle.torques, np.eye(3), np.eye(3), config.torque_limit_nm)
     return {"ideal": ideal} | {
-        kind.key: kind.control(model, config) for kind, config in kinds_on(vehicle)
+        kind.key: kind.control(vehicle, own) for kind, own in kinds_on(config)
     }
 
 
-def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
+def build_drives(config: VehicleConfig, vehicle: Any) -> list[ActuatorDrive]:
     """The hardware between commands and motors of all actuators that are switched on."""
-    return [kind.drive(model, config) for kind, config in kinds_on(vehicle) if kind.drive]
+    return [kind.drive(vehicle, own) for kind, own in kinds_on(config) if kind.drive]
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:

@@ -169,17 +169,12 @@ class CmgActuator(Actuators):
     g is the gimbal axis and h the rotor's momentum along its axle. The torque that accelerates a gimbal about its
     own axis is left out. Variable-speed CMGs have no steering law.
 
-    Parameters
+    Attributes
     ----------
     gimbals
         Gimbals, whose axes are g
     rotors
         Rotors, whose axes s are those of the axles at gimbal angle zero, at right angles to g
-    config
-        The scene's `vehicle.cmgs`
-
-    Attributes
-    ----------
     cross_axes
         (3, n) g x s
 
@@ -189,13 +184,13 @@ class CmgActuator(Actuators):
         If axes are not at right angles.
     """
 
-    def __init__(self, gimbals: Hinges, rotors: Hinges, config: CmgsConfig) -> None:
+    def __init__(self, vehicle: Any, config: CmgsConfig) -> None:
+        self.gimbals = gimbals = vehicle.gimbals
+        self.rotors = rotors = vehicle.rotors
         if np.abs((gimbals.axes * rotors.axes).sum(axis=0)).max() > 1e-6:
             raise InputError(
                 "rotor axes", "", "one for each gimbal, at right angles to its axis"
             )
-        self.gimbals = gimbals
-        self.rotors = rotors
         self.config = config
         # One memory layout, since numba compiles for each.
         self.cross_axes = np.ascontiguousarray(np.cross(gimbals.axes, rotors.axes, axis=0))
@@ -278,12 +273,6 @@ class CmgActuator(Actuators):
         return self.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
 
 
-def cmg_actuators(model: Any, config: CmgsConfig) -> CmgActuator:
-    """The CMGs of a compiled model."""
-    gimbals, rotors = (Hinges.from_model(model, prefix) for prefix in (GIMBAL, ROTOR))
-    return CmgActuator(gimbals, rotors, config)
-
-
 def check_rotor_pairs(spec: Any, path: Path) -> None:
     """Raise InputError unless each rotor is on the gimbal with the same suffix."""
     for gimbal in named(spec.joints, GIMBAL):
@@ -326,7 +315,7 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
 CMGS = ActuatorKind(
     "cmgs",
     add_cmgs,
-    cmg_actuators,
+    CmgActuator,
     joints=(GIMBAL, ROTOR),
     start=start_cmgs,
     check=check_rotor_pairs,

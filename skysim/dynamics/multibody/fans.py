@@ -48,7 +48,7 @@ class Fans:
     motor: Ints
 
     @classmethod
-    def from_model(cls, model: Any, prefix: str = FAN) -> Fans:
+    def from_model(cls, model: Any, prefix: str) -> Fans:
         """The sites whose name begins with prefix and that have an actuator."""
         data = at_zero(model)
         names = sorted(all_names(model.actuator, model.nu, prefix))
@@ -74,9 +74,9 @@ class FanSet(Actuators):
         super().__init__(fans.motor, lever_m, inverse(lever_m), thrust_limit_n)
 
 
-def fan_actuators(model: Any, config: FansConfig) -> FanSet:
-    """The fans of a compiled model."""
-    return FanSet(Fans.from_model(model), config.thrust_limit_n)
+def fan_actuators(vehicle: Any, config: FansConfig) -> FanSet:
+    """The fans of a vehicle."""
+    return FanSet(vehicle.fans, config.thrust_limit_n)
 
 
 @dataclass(slots=True)

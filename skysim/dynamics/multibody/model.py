@@ -37,7 +37,7 @@ from skysim.dynamics.multibody.actuators import (
     locked_joint_hint,
 )
 from skysim.dynamics.multibody.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.fans import Fans
+from skysim.dynamics.multibody.fans import FAN, Fans
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,
@@ -144,7 +144,7 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
         Hinges.from_model(model, WHEEL),
         Hinges.from_model(model, GIMBAL),
         Hinges.from_model(model, ROTOR),
-        Fans.from_model(model),
+        Fans.from_model(model, FAN),
         trims,
         Fans.from_model(model, THRUSTER),
     )

@@ -43,21 +43,19 @@ class WheelActuator(Actuators):
     A motor torque u on a wheel acts oppositely on the body, T = -sum axis u. `drive` scales the torques to their limit,
     which keeps the direction of T; the speed limit may change it.
 
-    Parameters
+    Attributes
     ----------
     hinges
         Axles of the wheels; a positive speed is right-handed about them
-    config
-        The scene's `vehicle.wheels`
     """
 
-    def __init__(self, hinges: Hinges, config: WheelsConfig) -> None:
+    def __init__(self, vehicle: Any, config: WheelsConfig) -> None:
+        self.hinges = hinges = vehicle.wheels
         # T = -axes u, solved for u.
         motor_from_torque = -inverse(hinges.axes)
         super().__init__(
             hinges.motor, -hinges.axes, motor_from_torque, config.torque_limit_nm
         )
-        self.hinges = hinges
         self.speed_limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
@@ -74,11 +72,6 @@ class WheelActuator(Actuators):
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of the wheels relative to the body: h = sum axis inertia speed."""
         return self.hinges.axes @ (self.hinges.inertia_kg_m2 * speeds_rad_s[self.hinges.dof])
-
-
-def wheel_actuators(model: Any, config: WheelsConfig) -> WheelActuator:
-    """The wheels of a compiled model."""
-    return WheelActuator(Hinges.from_model(model, WHEEL), config)
 
 
 class Stiction:
@@ -148,5 +141,5 @@ def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
 
 
 WHEELS = ActuatorKind(
-    "wheels", add_wheels, wheel_actuators, joints=(WHEEL,), start=start_wheels
+    "wheels", add_wheels, WheelActuator, joints=(WHEEL,), start=start_wheels
 )
