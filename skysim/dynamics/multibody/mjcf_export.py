@@ -271,7 +271,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
        lower than about a third of the surface's height are ignored.
     3. The rings are at equal steps between the first and the last ray in each direction that meets the surface.
     """
-    azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+    azimuth = np.linspace(0, 2 * np.pi, SECTORS, endpoint=False)
     # 1. Panel: circles about its center, clipped to its edges.
     if isinstance(inside, Plane):
         outer_m = inside.height_m * np.tan(min(cap_rad + 0.1, 1.3))
