@@ -92,35 +92,38 @@ class Recording:
         path = self.folder / f"{name}.ecsv"
         return read_table(path) if path.is_file() else None
 
-    def _require(self, name: str, table: Any, columns: Sequence[str]) -> None:
-        """Raise InputError for a table of the run that lacks a column."""
-        for column in columns:
+    def _attitudes(
+        self, name: str, key: str, angles: Sequence[str], is_celestial: bool
+    ) -> tuple[NDArray[Any], Rotation] | None:
+        """(K,) values of a column of a table, and the attitudes of these rows; None without any.
+
+        Raises InputError if a column is missing.
+        """
+        table = self.table(name)
+        if table is None:
+            return None
+        for column in (key, *angles):
             if column not in table.colnames:
                 path = self.folder / f"{name}.ecsv"
                 raise InputError(path, f"missing column {column}", "a table of a run")
+        angles_deg = np.column_stack(
+            [np.ma.filled(table[column].astype(float), np.nan) for column in angles]
+        )
+        valid = np.isfinite(angles_deg).all(axis=1)
+        if not valid.any():
+            return None
+        return np.asarray(table[key])[valid], attitudes(angles_deg[valid], is_celestial)
 
-    def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
+    def solved(self) -> tuple[NDArray[Any], Rotation] | None:
         """(K,) indices of the solved frames and their attitudes.
 
         Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
         table of solutions or no frame was solved. Raises InputError if a column is missing.
         """
-        solutions = self.table("solutions")
-        if solutions is None:
-            return None
         names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
-        self._require("solutions", solutions, ("frame", *names))
-        angles = np.column_stack(
-            [np.ma.filled(solutions[name].astype(float), np.nan) for name in names]
-        )
-        valid = np.isfinite(angles).all(axis=1)
-        if not valid.any():
-            return None
-        return np.asarray(solutions["frame"], np.int64)[valid], attitudes(
-            angles[valid], self.is_celestial
-        )
+        return self._attitudes("solutions", "frame", names, self.is_celestial)
 
-    def motion(self) -> tuple[Floats, Rotation] | None:
+    def motion(self) -> tuple[NDArray[Any], Rotation] | None:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
 
         Raises
@@ -128,17 +131,8 @@ class Recording:
         InputError
             If a column is missing.
         """
-        telemetry = self.table("telemetry")
-        if telemetry is None:
-            return None
-        columns = [f"true_{name}" for name in LAB_ANGLES]
-        self._require("telemetry", telemetry, ("t_s", *columns))
-        angles = np.column_stack(
-            [np.asarray(telemetry[name], dtype=float) for name in columns]
-        )
-        return np.asarray(telemetry["t_s"], dtype=float), attitudes(
-            angles, is_celestial=False
-        )
+        names = [f"true_{name}" for name in LAB_ANGLES]
+        return self._attitudes("telemetry", "t_s", names, is_celestial=False)
 
 
 def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
