@@ -14,7 +14,7 @@ import numpy as np
 from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.profile_samples import Samples
+from skysim.dynamics.profile_samples import Samples, continuous
 
 Derivatives = tuple[float, float, float]  # a value and its first two derivatives by time
 AngleProfile = Callable[[float], Derivatives]
@@ -242,11 +242,8 @@ def fit_spline(samples: Samples) -> AttitudeSpline:
     """The spline through checked samples of lab_from_body."""
     from scipy.interpolate import CubicSpline
 
-    # q and -q are the same attitude: choose the signs so that no component jumps.
-    wxyz = samples.a_from_b.as_quat(scalar_first=True)
-    dot = np.sum(wxyz[1:] * wxyz[:-1], axis=1)
-    sign = np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
-    cubic = CubicSpline(samples.t_s, wxyz * sign[:, None])
+    wxyz = continuous(samples.a_from_b.as_quat(scalar_first=True))
+    cubic = CubicSpline(samples.t_s, wxyz)
     return AttitudeSpline(
         str(samples.source),
         samples.t_s,

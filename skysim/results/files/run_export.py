@@ -17,7 +17,7 @@ from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
 from skysim.core.types import ATTITUDES, Floats, Record
-from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
+from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
 from skysim.results.files.row_parts import EXTRA
@@ -103,13 +103,10 @@ def message(
 def continuous_quaternions(xyzw: Floats) -> Floats:
     """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
 
-    q and -q are the same attitude. Each quaternion takes the sign that makes its dot product with the previous one
-    positive, so that other tools can interpolate between them.
+    Other tools can interpolate between them.
     """
-    dot = np.sum(xyzw[1:] * xyzw[:-1], axis=1)
     first = -1.0 if xyzw[0, 3] < 0 else 1.0
-    sign = first * np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
-    return xyzw * sign[:, None] + 0.0  # + 0.0 turns -0.0 into 0.0
+    return first * continuous(xyzw) + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 def epoch(utc: datetime.datetime) -> str:
