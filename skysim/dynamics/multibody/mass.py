@@ -260,7 +260,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     Their joints are removed unless motors move them in flight.
     """
     # 1. Axes and centers at position zero, from the compiled model.
-    slides = named(spec.joints, TRIM) if vehicle.trim or vehicle.trims else []
+    slides = named(spec.joints, TRIM)
     names = tuple(joint.name for joint in slides)
     data = at_zero(model)
     ids = [model.joint(name).id for name in names]
