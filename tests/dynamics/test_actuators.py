@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput, Hinges
 from skysim.dynamics.multibody.cmgs import STEERING, CmgActuator
-from skysim.dynamics.multibody.fans import Desaturator, Fans, FanSet
+from skysim.dynamics.multibody.fans import Fans, FanSet, MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import CmgsConfig, WheelsConfig
@@ -628,7 +628,7 @@ PART = DesaturationConfig.model_validate(
 
 
 def test_desaturation_starts_and_stops_at_different_thresholds():
-    fan = Desaturator(PART)
+    fan = MomentumDump(fans(), 1.0, PART)
     size = [0.5, 0.99, 1.01, 0.8, 0.21, 0.19, 0.5, 0.99, 1.5]
     running = [bool(fan.torque(np.array([0, -h, 0])).any()) for h in size]
     assert running == [False, False, True, True, True, False, False, False, True]
@@ -636,7 +636,10 @@ def test_desaturation_starts_and_stops_at_different_thresholds():
 
 def test_the_desaturation_torque_opposes_the_momentum_over_its_time():
     np.testing.assert_allclose(
-        Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
+        MomentumDump(fans(), 1.0, PART).torque(np.array([4.0, -8.0, 0])),
+        [-0.5, 1, 0],
+        rtol=1e-15,
+        atol=0,
     )
 
 
@@ -644,7 +647,7 @@ def test_the_desaturation_torque_opposes_the_momentum_over_its_time():
 def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     """h falls as exp(-t / 8 s), from 1.5 to 0.2 N m s in 8 ln 7.5 = 16.1 s, and the body comes to rest where it was."""
     set_ = wheels(3)
-    fan = Desaturator(PART)
+    fan = MomentumDump(fans(), 1.0, PART)
     blow = fans(limit_n=1.0)
     body = Body.start(
         np.eye(3), np.eye(3), set_.hinges.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL

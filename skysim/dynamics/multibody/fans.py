@@ -79,16 +79,19 @@ def fan_actuators(vehicle: Any, config: FansConfig) -> FanSet:
     return FanSet(vehicle.fans, config.thrust_limit_n)
 
 
-@dataclass(slots=True)
-class Desaturator:
-    """Law of momentum dumping: torque -h / time on the body, once the stored momentum h exceeds a threshold.
+class MomentumDump:
+    """Momentum dumping by fans, with a model of their lag: torque -h / time once the stored momentum h is too large.
 
     The controller holds the body still against this torque. The wheels or CMGs absorb it, and h decays as
     exp(-t / time). Stateful: one object per motion.
     """
 
-    config: DesaturationConfig
-    running: bool = False
+    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
+        self.fans = fans
+        self.lag_s = lag_s
+        self.config = config
+        self.running = False
+        self.fan_torque_nm = np.zeros(3)
 
     def torque(self, momentum_nms: Floats) -> Floats:
         """Torque (3,) that the fans should give: zero until |h| > start, then -h / time until |h| < stop."""
@@ -101,22 +104,10 @@ class Desaturator:
         )
         return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
 
-
-class MomentumDump:
-    """Momentum dumping by fans, with a model of their lag."""
-
-    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
-        self.fans = fans
-        self.lag_s = lag_s
-        self.desaturator = Desaturator(config)
-        self.fan_torque_nm = np.zeros(3)
-
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
         """Command the fans; return the torque (3,) that they give now according to the lag model."""
         present_nm = self.fan_torque_nm
-        commanded_nm = self.fans.allocate(
-            control, self.desaturator.torque(momentum_nms), inputs
-        )
+        commanded_nm = self.fans.allocate(control, self.torque(momentum_nms), inputs)
         # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
         # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
