@@ -263,15 +263,18 @@ def fits_image(frame: Frame, scene: Scene, wcs_cards: Any, comment: str) -> Any:
     """A FITS image: uint16 (float64 for a noise-free frame) with exposure, time, scene and seed in the header."""
     from astropy.io import fits
 
-    header = fits.Header()
-    header["EXPTIME"] = (frame.exposure_s, "exposure [s]")
-    header["DATE-OBS"] = (utc_text(scene, frame.t_mid_s), "mid-exposure [UTC]")
-    header["TMID"] = (frame.t_mid_s, "mid-exposure since the scene's start [s]")
-    header["SCENE"] = (scene.name, "scene")
-    header["SEED"] = (scene.seed, "seed of every random stream")
-    header["FRAME"] = (frame.index, "index of the frame")
-    header.append(TOP_DOWN_CARD)
-    header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
+    header = fits.Header(
+        [
+            ("EXPTIME", frame.exposure_s, "exposure [s]"),
+            ("DATE-OBS", utc_text(scene, frame.t_mid_s), "mid-exposure [UTC]"),
+            ("TMID", frame.t_mid_s, "mid-exposure since the scene's start [s]"),
+            ("SCENE", scene.name, "scene"),
+            ("SEED", scene.seed, "seed of every random stream"),
+            ("FRAME", frame.index, "index of the frame"),
+            TOP_DOWN_CARD,
+            ("SATURATE", frame.saturation_dn, "saturation [DN]"),
+        ]
+    )
     header.update(wcs_cards)
     header["COMMENT"] = comment
     return fits.PrimaryHDU(frame.image_dn, header)
