@@ -19,7 +19,7 @@ import numpy as np
 
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Floats
-from skysim.dynamics.attitude_control import Pid, build_controller
+from skysim.dynamics.attitude_control import Pid
 from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_law
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
@@ -136,9 +136,7 @@ class FlightComputer:
         torque_nm = authority_nm(self.actuator)
         rate_limit_rad_s = return_rate_limit_rad_s(scene)
         if config.law in BUILT_IN_LAWS and config.law not in programs:
-            return build_controller(
-                reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s
-            )
+            return Pid(reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s)
         # An external controller gets the same numbers that place the poles of the built-in one.
         setup = ControllerSetup(
             self.period_s,

@@ -602,7 +602,7 @@ def build_disturbances(
 ) -> DisturbanceModel:
     """The scene's disturbances, with these knocks."""
     scene = lab.scene
-    return DisturbanceModel.from_config(
+    return DisturbanceModel(
         scene.vehicle.disturbances,
         imu.earth_rate_lab_rad_s(scene.site),
         impulses,
