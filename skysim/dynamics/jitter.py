@@ -1,6 +1,6 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
-1. `Vibration.draw` draws each vibration as a sum of sines of the rotation vector in body axes: single frequencies
+1. `Vibration` draws each vibration as a sum of sines of the rotation vector in body axes: single frequencies
    (`line`) or a random spectrum (`band`).
 2. `Vibration.subdivisions` finds how finely the trajectory must be sampled.
 3. `Vibration.add_to` adds the rotation and its rate to the samples.
@@ -166,30 +166,24 @@ class VibrationComponent:
         return gain * phi, gain * rate + slope * phi
 
 
-@dataclass(frozen=True, slots=True)
 class Vibration:
-    """All vibration of one run. Its phases are drawn once, so evaluation piece by piece equals one evaluation."""
+    """All vibration of one run: `motion.jitter`, which is always on, and each jitter maneuver in its interval.
 
-    components: tuple[VibrationComponent, ...]
+    Its phases are drawn once, so evaluation piece by piece equals one evaluation.
 
-    @classmethod
-    def draw(
-        cls,
-        motion: MotionConfig,
-        rng: Generator,
-        reference: Reference | None = None,
-    ) -> "Vibration":
-        """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
+    Parameters
+    ----------
+    motion
+        The scene's section `motion`
+    rng
+        Generator of the frequencies and phases
+    reference
+        Reference of the maneuvers; by default it is planned here, which is not possible with a profile
+    """
 
-        Parameters
-        ----------
-        motion
-            The scene's section `motion`
-        rng
-            Generator of the frequencies and phases
-        reference
-            Reference of the maneuvers; by default it is planned here, which is not possible with a profile
-        """
+    def __init__(
+        self, motion: MotionConfig, rng: Generator, reference: Reference | None = None
+    ) -> None:
         components = [draw_component(motion.jitter, rng, "motion.jitter")]
         starts_s = (reference or plan(motion)).start_s
         for begin_s, element in zip(starts_s, motion.maneuver, strict=False):
@@ -199,7 +193,7 @@ class Vibration:
                 components.append(
                     draw_component(element.components, rng, name, begin_s, end_s)
                 )
-        return cls(tuple(component for component in components if component))
+        self.components = tuple(component for component in components if component)
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) rotation vector phi and (N, 3) its derivative (rad/s), body axes, at (N,) ascending times."""

@@ -479,7 +479,7 @@ class Motion:
             self.simulation = multibody.Simulation(
                 vehicle, lab.start, rate, duration_s, kept_s
             )
-        self.vibration = Vibration.draw(
+        self.vibration = Vibration(
             scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
         )
         if kept_s is None:

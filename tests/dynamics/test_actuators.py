@@ -13,9 +13,9 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput, Hinges
+from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
 from skysim.dynamics.multibody.cmgs import STEERING, CmgActuator
-from skysim.dynamics.multibody.fans import Fans, FanSet, MomentumDump
+from skysim.dynamics.multibody.fans import FanSet, MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import CmgsConfig, WheelsConfig
@@ -37,11 +37,17 @@ def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return gimbal.T.copy(), around.apply([0.0, 1.0, 0.0]).T.copy()
 
 
-def hinges(axes: np.ndarray, inertia: np.ndarray, first: int = 0) -> Hinges:
+class Joints(SimpleNamespace):
     """Joints whose angles, speeds and motors have the numbers from `first` on."""
-    number = first + np.arange(len(inertia))
-    names = tuple(map(str, number))
-    return Hinges(names, axes, inertia, number, number, number)
+
+    def __init__(self, axes: np.ndarray, inertia: np.ndarray, first: int = 0) -> None:
+        number = first + np.arange(len(inertia))
+        super().__init__(
+            axes=axes, inertia_kg_m2=inertia, qpos=number, dof=number, motor=number
+        )
+
+    def __len__(self) -> int:
+        return len(self.motor)
 
 
 def cmg_set(
@@ -55,8 +61,8 @@ def cmg_set(
     """CMGs without a model: their gimbals come before their rotors."""
     config = CmgsConfig.model_validate({"steering": steering})
     config = config.model_copy(update={"rotor_torque_limit_nm": rotor_torque_limit_nm})
-    rotors = hinges(spin_axes, inertia, len(inertia))
-    gimbals = hinges(gimbal_axes, inertia)
+    rotors = Joints(spin_axes, inertia, len(inertia))
+    gimbals = Joints(gimbal_axes, inertia)
     set_ = CmgActuator(SimpleNamespace(gimbals=gimbals, rotors=rotors), config)
     set_.limit = rate_limit_rad_s
     return set_
@@ -65,7 +71,7 @@ def cmg_set(
 def wheel_set(axes: np.ndarray, inertia: np.ndarray, torque_limit_nm: float) -> WheelActuator:
     """Wheels without a model, up to 300 rad/s."""
     config = WheelsConfig().model_copy(update={"torque_limit_nm": torque_limit_nm})
-    set_ = WheelActuator(SimpleNamespace(wheels=hinges(axes, inertia)), config)
+    set_ = WheelActuator(SimpleNamespace(wheels=Joints(axes, inertia)), config)
     set_.speed_limit_rad_s = 300.0
     return set_
 
@@ -300,7 +306,8 @@ def fans(limit_n: float = 0.5) -> FanSet:
     pushes = np.array(
         [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
     ).T
-    return FanSet(Fans((), pushes, places, np.zeros(0, int)), limit_n)
+    found: Any = SimpleNamespace(axes=pushes, positions_m=places, motor=np.zeros(0, int))
+    return FanSet(found, limit_n)
 
 
 def test_a_fan_pair_is_a_couple():

@@ -159,9 +159,8 @@ def inverse(torque_from_command: Floats) -> Floats:
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)
 
 
-@dataclass(frozen=True, slots=True)
 class Hinges:
-    """Hinge joints of one kind, in the order of their names.
+    """All joints of a compiled model whose name begins with a prefix, in the order of their names.
 
     Attributes
     ----------
@@ -177,34 +176,21 @@ class Hinges:
         (n,) numbers of the actuators; -1 for a joint without one
     """
 
-    names: tuple[str, ...]
-    axes: Floats
-    inertia_kg_m2: Floats
-    qpos: Ints
-    dof: Ints
-    motor: Ints
-
-    @classmethod
-    def from_model(cls, model: Any, prefix: str) -> Hinges:
-        """All joints of a compiled model whose name begins with prefix."""
+    def __init__(self, model: Any, prefix: str) -> None:
         data = at_zero(model)
         # The diagonal of the joint-space inertia matrix is the inertia about each axis.
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        names = sorted(all_names(model.joint, model.njnt, prefix))
-        ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
-        dof = model.jnt_dofadr[ids].astype(np.int64)
+        self.names = tuple(sorted(all_names(model.joint, model.njnt, prefix)))
+        ids = np.array([model.joint(name).id for name in self.names], dtype=np.int64)
+        self.axes = data.xaxis[ids].T.copy()
+        self.qpos = model.jnt_qposadr[ids].astype(np.int64)
+        self.dof = model.jnt_dofadr[ids].astype(np.int64)
+        self.inertia_kg_m2 = full[self.dof, self.dof]
         # A motor has the name of its joint; MuJoCo gives -1 for a name that does not exist.
         kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-        motor = [mujoco.mj_name2id(model, kind, name) for name in names]
-        return cls(
-            tuple(names),
-            data.xaxis[ids].T.copy(),
-            full[dof, dof],
-            model.jnt_qposadr[ids].astype(np.int64),
-            dof,
-            np.array(motor, dtype=np.int64),
-        )
+        motor = [mujoco.mj_name2id(model, kind, name) for name in self.names]
+        self.motor = np.array(motor, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -254,7 +240,7 @@ def add_servos(spec: Any, model: Any, prefix: str, tau_s: float) -> None:
 
     The inertia of a slide is its mass, and its angle a position.
     """
-    inertias = Hinges.from_model(model, prefix).inertia_kg_m2
+    inertias = Hinges(model, prefix).inertia_kg_m2
     for joint, inertia in zip(named(spec.joints, prefix), inertias, strict=True):
         servo = spec.add_actuator(
             name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name

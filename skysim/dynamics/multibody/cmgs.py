@@ -301,7 +301,7 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     """Set the gimbal angles and rotor speeds at the start."""
-    gimbals = Hinges.from_model(model, GIMBAL)
+    gimbals = Hinges(model, GIMBAL)
     angles = np.radians(
         member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg")
     )
@@ -309,7 +309,7 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     driven = gimbals.motor >= 0
     # A servo whose set-point differs from the angle would jerk the gimbal.
     data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]
-    data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
+    data.qvel[Hinges(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
 
 
 CMGS = ActuatorKind(

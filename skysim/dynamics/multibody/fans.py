@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
@@ -26,9 +25,8 @@ from skysim.scene.sections.vehicle import FansConfig
 FAN = "fan_"
 
 
-@dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans, or thrusters, of a compiled model, in the order of their names.
+    """Fans, or thrusters, of a compiled model: sites with an actuator whose name begins with a prefix, in their order.
 
     Attributes
     ----------
@@ -42,21 +40,15 @@ class Fans:
         (n,) numbers of the actuators
     """
 
-    names: tuple[str, ...]
-    axes: Floats
-    positions_m: Floats
-    motor: Ints
-
-    @classmethod
-    def from_model(cls, model: Any, prefix: str) -> Fans:
-        """The sites whose name begins with prefix and that have an actuator."""
+    def __init__(self, model: Any, prefix: str) -> None:
         data = at_zero(model)
-        names = sorted(all_names(model.actuator, model.nu, prefix))
-        sites = [model.site(name).id for name in names]
+        self.names = tuple(sorted(all_names(model.actuator, model.nu, prefix)))
+        sites = [model.site(name).id for name in self.names]
         # z axes of the sites.
-        axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
-        motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
-        return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
+        self.axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2].T.copy()
+        self.positions_m = data.site_xpos[sites].T.copy()
+        motor = [model.actuator(name).id for name in self.names]
+        self.motor = np.array(motor, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.names)

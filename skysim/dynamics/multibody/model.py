@@ -141,12 +141,12 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
         vehicle,
         mass,
         np.array([model.actuator(name).id for name in TORQUES]),
-        Hinges.from_model(model, WHEEL),
-        Hinges.from_model(model, GIMBAL),
-        Hinges.from_model(model, ROTOR),
-        Fans.from_model(model, FAN),
+        Hinges(model, WHEEL),
+        Hinges(model, GIMBAL),
+        Hinges(model, ROTOR),
+        Fans(model, FAN),
         trims,
-        Fans.from_model(model, THRUSTER),
+        Fans(model, THRUSTER),
     )
 
 

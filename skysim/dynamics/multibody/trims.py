@@ -54,7 +54,7 @@ class TrimMotors:
     def __init__(self, vehicle: Any, config: TrimsConfig) -> None:
         self.model = vehicle.model
         self.config = config
-        self.slides = Hinges.from_model(self.model, TRIM)
+        self.slides = Hinges(self.model, TRIM)
         self.motor = self.slides.motor
         self.start_m = self.model.qpos0[self.slides.qpos]
         self.position_m = self.start_m
@@ -137,7 +137,7 @@ def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
 
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:
     """Set the set-points of the servos to the positions at the start, less what gravity makes them yield."""
-    slides = Hinges.from_model(model, TRIM)
+    slides = Hinges(model, TRIM)
     if (slides.motor < 0).any():
         return  # a model without motors, of the shapes alone
     sag_m = SERVO_S**2 * (gravity_body_m_s2(model, data.qpos) @ slides.axes)

@@ -98,7 +98,7 @@ class Stiction:
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.model = model
         self.config = config
-        self.joints = Hinges.from_model(model, WHEEL)
+        self.joints = Hinges(model, WHEEL)
         self.sticks = np.zeros(len(self.joints), dtype=bool)
         self.before_rad_s = np.zeros(len(self.joints))
 
@@ -134,7 +134,7 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
 
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
     """Set the wheel speeds at the start."""
-    hinges = Hinges.from_model(model, WHEEL)
+    hinges = Hinges(model, WHEEL)
     data.qvel[hinges.dof] = (
         member_values(config.start_rpm, len(hinges), "vehicle.wheels.start_rpm") * RPM_RAD_S
     )
