@@ -5,7 +5,6 @@ import datetime
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,12 +48,29 @@ class FrameTruth(NamedTuple):
     sources: Any
 
 
-@dataclass(frozen=True)
 class Recording:
-    """A finished run: its folder, and the frames' file paths without suffix, in frame order."""
+    """A finished run: its folder, and the frames' file paths without suffix, in frame order.
 
-    folder: Path
-    stems: list[Path] = field(repr=False)
+    Raises
+    ------
+    InputError
+        If the folder holds no frame with its truth.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        stems = {}
+        for path in folder.glob("frame_*.fits"):
+            number = re.fullmatch(r"frame_(\d{4,})", path.stem)
+            if number and path.with_suffix(".ecsv").is_file():
+                stems[int(number[1])] = path.with_suffix("")
+        if not stems:
+            raise InputError(
+                folder,
+                "no frames with truth files",
+                "a folder of a run, or of rendered frames",
+            )
+        self.folder = folder
+        self.stems = [stems[index] for index in sorted(stems)]
 
     @cached_property
     def meta(self) -> Record:
@@ -144,20 +160,6 @@ def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
     if is_celestial:
         return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
     return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
-
-
-def open_recording(folder: Path) -> Recording:
-    """The run in a folder. Raises InputError if the folder holds no frame with its truth."""
-    stems = {}
-    for path in folder.glob("frame_*.fits"):
-        number = re.fullmatch(r"frame_(\d{4,})", path.stem)
-        if number and path.with_suffix(".ecsv").is_file():
-            stems[int(number[1])] = path.with_suffix("")
-    if not stems:
-        raise InputError(
-            folder, "no frames with truth files", "a folder of a run, or of rendered frames"
-        )
-    return Recording(folder, [stems[index] for index in sorted(stems)])
 
 
 def read_truth(path: Path) -> FrameTruth:

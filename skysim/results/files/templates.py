@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats, normalized
-from skysim.results.files.parts import DomeDesign, build_design
+from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
 from skysim.sources.dome.layouts.string import directions
@@ -153,7 +153,7 @@ MARK_M = 4e-3  # size of an LED's mark on the mesh
 
 def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
-    return TEMPLATES[ending](build_design(lab.scene, "templates"))
+    return TEMPLATES[ending](DomeDesign(lab.scene, "templates"))
 
 
 def at(surface: Surface, rays: Floats) -> Floats:
