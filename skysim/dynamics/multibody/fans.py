@@ -66,11 +66,6 @@ class FanSet(Actuators):
         super().__init__(fans.motor, lever_m, inverse(lever_m), thrust_limit_n)
 
 
-def fan_actuators(vehicle: Any, config: FansConfig) -> FanSet:
-    """The fans of a vehicle."""
-    return FanSet(vehicle.fans, config.thrust_limit_n)
-
-
 class MomentumDump:
     """Momentum dumping by fans, with a model of their lag: torque -h / time once the stored momentum h is too large.
 
@@ -122,4 +117,9 @@ def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
         fan.dynprm[0] = config.time_constant_s
 
 
-FANS = ActuatorKind("fans", add_fans, fan_actuators, sites=(FAN,))
+FANS = ActuatorKind(
+    "fans",
+    add_fans,
+    lambda vehicle, config: FanSet(vehicle.fans, config.thrust_limit_n),
+    sites=(FAN,),
+)

@@ -47,7 +47,7 @@ from skysim.dynamics.multibody.mass import (
     tree_mass,
     unbalance,
 )
-from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_errors, mujoco_warnings
 from skysim.dynamics.multibody.thrusters import THRUSTER
 from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -181,12 +181,8 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
         )
     # 5. Bearing.
     check_options(spec, vehicle, path)
-    try:
+    with mujoco_errors(path, "a name is reserved for skysim's bearing"):
         add_bearing(spec, bus, vehicle)
-    except ValueError as error:  # a name is taken
-        raise InputError(
-            path, f"a name is reserved for skysim's bearing: {one_line(error)}"
-        ) from error
     # 6. Check while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     balanced = compile_spec(spec, path)
     check_compiled(balanced, mass, path)
