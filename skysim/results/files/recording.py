@@ -24,13 +24,12 @@ from skysim.core.files import (
 )
 from skysim.core.images import TOP_DOWN_CARD, read_image
 from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
+from skysim.dynamics.profile_table import BODY_ANGLES, CAMERA_ANGLES
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
-SKY_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
-LAB_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
 class FrameTruth(NamedTuple):
@@ -136,7 +135,7 @@ class Recording:
         Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
         table of solutions or no frame was solved. Raises InputError if a column is missing.
         """
-        names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
+        names = CAMERA_ANGLES if self.is_celestial else BODY_ANGLES
         return self._attitudes("solutions", "frame", names, self.is_celestial)
 
     def motion(self) -> tuple[NDArray[Any], Rotation] | None:
@@ -147,7 +146,7 @@ class Recording:
         InputError
             If a column is missing.
         """
-        names = [f"true_{name}" for name in LAB_ANGLES]
+        names = [f"true_{name}" for name in BODY_ANGLES]
         return self._attitudes("telemetry", "t_s", names, is_celestial=False)
 
 
@@ -158,7 +157,7 @@ def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
     sequence.
     """
     if is_celestial:
-        return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
+        return stars.cam_from_icrs(*angles_deg.T).inv()
     return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
 
 
