@@ -118,7 +118,7 @@ def check_tilt(
         )
 
 
-def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]:
+def demands(leg: guidance.AnyLeg, period_s: float) -> tuple[Floats, Floats, Floats]:
     """(K,) times since the leg's start, (K, 3) rates and (K, 3) accelerations in body axes.
 
     They are those at the samples of a profile, else at every control period. Between two samples the acceleration of
