@@ -226,9 +226,9 @@ class ExternalLaw:
         inputs = ControllerInput(
             self.tick,
             t_s,
-            scalar_last(lab_from_body_wxyz),
+            np.roll(lab_from_body_wxyz, -1),
             rate_body_rad_s.copy(),
-            scalar_last(lab_from_ref_wxyz),
+            np.roll(lab_from_ref_wxyz, -1),
             np.array(rate_ref),
             np.array(acceleration_ref),
             momentum_nms.copy(),
@@ -299,8 +299,3 @@ def external_law(
         )
 
     return ExternalLaw(reference, name, answer, program)
-
-
-def scalar_last(a_from_b_wxyz: Floats) -> Floats:
-    """(4,) xyzw of a quaternion wxyz."""
-    return a_from_b_wxyz[[1, 2, 3, 0]]

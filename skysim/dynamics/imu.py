@@ -301,9 +301,10 @@ class Triad:
             self.white = config.vrw_ug_sqrt_hz * ug
             self.limit = config.limit_g * STANDARD_GRAVITY_M_S2
             self.quantum = 1e-6 * config.quantum_um_s
-        self.matrix = response_matrix(
-            config.scale_ppm, config.misalignment_arcsec, hardware[1:]
-        )
+        # 1 + scale error on the diagonal, the sensors' misalignments off it.
+        scale = PPM * scaled_errors(config.scale_ppm, hardware[1:])
+        tilt_rad = ARCSEC_RAD * scaled_errors(config.misalignment_arcsec, hardware[1:])
+        self.matrix = np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
         self.turn_on_bias = turn_on
         self.markov_bias = self.markov_sd * start
         self.markov_time_s = config.bias_time_s
@@ -395,19 +396,6 @@ def corrupt(
                 remainder[i] -= x
             counted[n, i] = x
     return counted, limited
-
-
-def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
-    """(3, 3) response: 1 + scale error on the diagonal, the sensors' misalignments off it
-
-    Parameters
-    ----------
-    normal
-        (3, 3) draws.
-    """
-    scale = PPM * scaled_errors(scale_ppm, normal)
-    tilt_rad = ARCSEC_RAD * scaled_errors(misalignment_arcsec, normal)
-    return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
 
 
 class Imu:

@@ -22,9 +22,9 @@ from skysim.dynamics.imu import (
     Imu,
     Increments,
     Navigator,
+    Triad,
     earth_rate_lab_rad_s,
     ideal_increments,
-    response_matrix,
     tilt_rad,
 )
 from skysim.scene.sections.vehicle import ImuConfig, SiteConfig
@@ -515,7 +515,9 @@ def test_turn_on_errors_of_units_scatter_as_declared() -> None:
 
 def test_scale_errors_are_on_the_diagonal_and_misalignments_off_it() -> None:
     normal = np.random.default_rng(4).normal(size=(3, 3))
-    errors = response_matrix(500.0, 30.0, normal) - np.eye(3)
+    config = part({"scale_ppm": 500, "misalignment_arcsec": 30}).gyro
+    draws = np.vstack([np.zeros(3), normal])
+    errors = Triad(config, draws, np.zeros(3)).matrix - np.eye(3)
     np.testing.assert_allclose(np.diag(errors), 500e-6 * np.diag(normal), rtol=1e-9)
     off = ~np.eye(3, dtype=bool)
     np.testing.assert_allclose(errors[off], 30 * ARCSEC * normal[off], rtol=1e-12)
