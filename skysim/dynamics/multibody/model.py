@@ -369,7 +369,8 @@ def camera_mount(vehicle: VehicleModel) -> Mount:
 
     Only this function converts MuJoCo's camera axes to skysim's.
     """
-    camera = at_zero(vehicle.model).camera(CAMERA)
+    data = at_zero(vehicle.model)
+    camera = data.camera(CAMERA)
     body_from_mjcam = Rotation.from_matrix(camera.xmat.reshape(3, 3))
     return Mount(np.array(camera.xpos), CAM_FROM_MJCAM * body_from_mjcam.inv())
 
@@ -378,4 +379,5 @@ def imu_position_m(vehicle: VehicleModel) -> Floats:
     """(3,) position of the accelerometers in body axes: site `imu`, or the bearing's center if there is none."""
     if vehicle.spec.site(IMU) is None:
         return np.zeros(3)
-    return np.array(at_zero(vehicle.model).site(IMU).xpos)
+    data = at_zero(vehicle.model)
+    return np.array(data.site(IMU).xpos)
