@@ -83,8 +83,9 @@ class ControllerSetup:
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
         """The inverse of `as_tree`."""
-        values = {name: value for name, value in tree.items() if name != "skysim_controller"}
-        return cls(**values | {"inertia_kg_m2": np.array(values["inertia_kg_m2"])})
+        values = {**tree, "inertia_kg_m2": np.array(tree["inertia_kg_m2"])}
+        values.pop("skysim_controller", None)
+        return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import at_zero, named
+from skysim.dynamics.multibody.actuator_kind import Hinges, at_zero, named
 from skysim.dynamics.multibody.trims import TRIM
 from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
@@ -261,11 +261,10 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     """
     # 1. Axes and centers at position zero, from the compiled model.
     slides = named(spec.joints, TRIM)
-    names = tuple(joint.name for joint in slides)
+    hinges = Hinges(model, TRIM)
+    names = hinges.names
+    bodies = [model.joint(name).bodyid[0] for name in names]
     data = at_zero(model)
-    ids = [model.joint(name).id for name in names]
-    bodies = model.jnt_bodyid[ids]
-    axes = data.xaxis[ids].T.copy()
     centers_m = data.subtree_com[bodies].T.copy()
     # 2. Move the bodies.
     position_m = np.zeros(len(names))
@@ -284,7 +283,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
             "vehicle.trim.position",
             f"beyond vehicle.trims.travel {vehicle.trims.travel_m:g} m",
         )
-    for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
+    for joint, axis, at_m in zip(slides, hinges.axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:
             raise InputError(
@@ -296,4 +295,5 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
         joint.ref = at_m
         if vehicle.trims is None:
             spec.delete(joint)
-    return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)
+    mass_kg = model.body_subtreemass[bodies].copy()
+    return Trims(names, hinges.axes, centers_m, mass_kg, position_m)

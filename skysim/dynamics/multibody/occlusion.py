@@ -135,20 +135,18 @@ def free_distance_m(obstacles: Obstacles, from_m: Floats, rays: Floats) -> Float
     count = len(rays)
     geom = np.empty(count, np.int32)
     distance_m = np.empty(count)
-    if count:
-        directions = np.ascontiguousarray(rays).ravel()
-        mujoco.mj_multiRay(
-            obstacles.model,
-            obstacles.data,
-            from_m,
-            directions,
-            GROUPS,
-            True,
-            -1,
-            geom,
-            distance_m,
-            None,
-            count,
-            mujoco.mjMAXVAL,
-        )
+    mujoco.mj_multiRay(
+        obstacles.model,
+        obstacles.data,
+        from_m,
+        np.ascontiguousarray(rays).ravel(),
+        GROUPS,
+        True,
+        -1,
+        geom,
+        distance_m,
+        None,
+        count,
+        mujoco.mjMAXVAL,
+    )
     return np.where(distance_m >= 0, distance_m, np.inf)

@@ -365,7 +365,6 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
 def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str, str]]:
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
-    yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
     yield (
         "mid_utc",
         np.array(utc, dtype="datetime64[us]").astype(np.int64),
@@ -373,6 +372,7 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
         "microseconds since 1970-01-01",
     )
     for name, axis in (
+        ("frame", ""),
         ("t_mid_s", ""),
         ("exposure_s", ""),
         ("rate_cam_rad_s", "xyz"),
