@@ -52,7 +52,7 @@ def sky_flight(folder: Path) -> Flight:
     rows = []
     for shot in flight.shots():
         recording.write_frame(folder, shot.frame, shot.truth, scene)
-        rows.append(scoring.score(shot).row)
+        rows.append(scoring.Score(shot).row)
     files.write_table(
         folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene))
     )
