@@ -86,7 +86,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> recording.Recording:
     scene = loader.load("shefex2", {"exposure.frames": "3", "light.limit_mag": "5"})
     for shot in open_flight(scene).shots(solves=False):
         recording.write_frame(folder, shot.frame, shot.truth, scene)
-    return recording.open_recording(folder)
+    return recording.Recording(folder)
 
 
 @contextlib.contextmanager

@@ -1,10 +1,8 @@
 """The attitude control law (PID with feed-forward). Independent of the simulator and the actuators."""
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from skysim.core.jit import jit
 from skysim.core.quaternion import apply, cross, inverse, matrix_vector, multiply, to_rotvec
@@ -16,7 +14,6 @@ from skysim.scene.sections.motion import ControlConfig
 TORQUE_DEFICIT = 0.01
 
 
-@dataclass(slots=True)
 class Pid:
     """PID control on the rotation vector of the attitude error, with feed-forward. Stateful: one object per motion.
 
@@ -35,20 +32,33 @@ class Pid:
        so the feedback only has to reject disturbances. h is the momentum stored in wheels or CMGs.
     4. After the actuators have answered, the error is integrated, except on saturated axes (`integrate`).
 
-    Rates and torques are in body axes. ki = 0 is a PD controller.
+    Rates and torques are in body axes. The gains place the poles: the error obeys
+    (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
 
-    Attributes
+        kp = b^2 + 2 z b p,    ki = b^2 p,    kd = 2 z b + p
+
+    b and z are the bandwidth and damping of the attitude loop. p = integral_rad_s is the pole that removes the
+    steady error of a constant torque, such as that of an unbalanced bearing. Law pd has p = 0, which leaves the
+    error torque / (J b^2). The defaults settle in about 5 s, slow enough for a control period of 10 ms
+    (b x period = 0.03).
+
+    Parameters
     ----------
     reference
         Commanded attitude, rate and acceleration over time
     inertia_kg_m2
         (3, 3) inertia J about the bearing, in body axes
-    kp, ki, kd
-        Gains in 1/s2, 1/s3 and 1/s, the same on each axis
+    config
+        The scene's `motion.control`; None for its defaults
     authority_nm
         Torque that the actuators can give in every direction
     rate_limit_rad_s
         Greatest return rate
+
+    Attributes
+    ----------
+    kp, ki, kd
+        Gains in 1/s2, 1/s3 and 1/s, the same on each axis
     limited
         Whether step 2 limited the last command
     error_rad
@@ -57,16 +67,29 @@ class Pid:
         (3,) integral of the error
     """
 
-    reference: Reference
-    inertia_kg_m2: Floats
-    kp: float
-    ki: float
-    kd: float
-    authority_nm: float = math.inf
-    rate_limit_rad_s: float = math.inf
-    limited: bool = False
-    error_rad: Floats = field(default_factory=lambda: np.zeros(3))
-    error_sum_rad_s: Floats = field(default_factory=lambda: np.zeros(3))
+    def __init__(
+        self,
+        reference: Reference,
+        inertia_kg_m2: Floats,
+        config: ControlConfig | None = None,
+        authority_nm: float = math.inf,
+        rate_limit_rad_s: float = math.inf,
+    ) -> None:
+        config = config or ControlConfig()
+        self.reference = reference
+        self.inertia_kg_m2 = inertia_kg_m2
+        self.authority_nm = authority_nm
+        self.rate_limit_rad_s = rate_limit_rad_s
+        # The gains are the coefficients of the expanded polynomial.
+        b = config.bandwidth_rad_s
+        z = config.damping
+        p = config.integral_rad_s if config.law == "pid" else 0.0
+        self.kp = b**2 + 2 * z * b * p
+        self.ki = b**2 * p
+        self.kd = 2 * z * b + p
+        self.limited = False
+        self.error_rad = np.zeros(3)
+        self.error_sum_rad_s = np.zeros(3)
 
     def torque_nm(
         self,
@@ -162,49 +185,3 @@ def integrate_error(
         saturated = abs(achieved[i]) < abs(commanded[i]) * (1 - TORQUE_DEFICIT)
         if not saturated or error[i] * commanded[i] > 0:
             error_sum[i] += error[i] * period_s
-
-
-def build_controller(
-    reference: Reference,
-    inertia_kg_m2: ArrayLike,
-    config: ControlConfig | None = None,
-    authority_nm: float = math.inf,
-    rate_limit_rad_s: float = math.inf,
-) -> Pid:
-    """The controller whose gains place the poles: the error obeys (s^2 + 2 z b s + b^2)(s + p) = 0 on each axis.
-
-        kp = b^2 + 2 z b p,    ki = b^2 p,    kd = 2 z b + p
-
-    b and z are the bandwidth and damping of the attitude loop. p = integral_rad_s is the pole that removes the
-    steady error of a constant torque, such as that of an unbalanced bearing. Law pd has p = 0, which leaves the
-    error torque / (J b^2). The defaults settle in about 5 s, slow enough for a control period of 10 ms
-    (b x period = 0.03).
-
-    Parameters
-    ----------
-    reference
-        Commanded attitude over time
-    inertia_kg_m2
-        (3,) principal moments or (3, 3) tensor about the bearing, in body axes
-    config
-        The scene's `motion.control`; None for its defaults
-    authority_nm
-        Torque that the actuators can give in every direction
-    rate_limit_rad_s
-        Greatest return rate
-    """
-    config = config or ControlConfig()
-    inertia = np.asarray(inertia_kg_m2, dtype=float)
-    b = config.bandwidth_rad_s
-    z = config.damping
-    p = config.integral_rad_s if config.law == "pid" else 0.0
-    # The gains are the coefficients of the expanded polynomial.
-    return Pid(
-        reference,
-        inertia if inertia.ndim == 2 else np.diag(inertia).copy(),
-        kp=b**2 + 2 * z * b * p,
-        ki=b**2 * p,
-        kd=2 * z * b + p,
-        authority_nm=authority_nm,
-        rate_limit_rad_s=rate_limit_rad_s,
-    )

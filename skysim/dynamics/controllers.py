@@ -83,8 +83,9 @@ class ControllerSetup:
     @classmethod
     def of_tree(cls, tree: Mapping[str, Any]) -> Self:
         """The inverse of `as_tree`."""
-        values = {name: value for name, value in tree.items() if name != "skysim_controller"}
-        return cls(**values | {"inertia_kg_m2": np.array(values["inertia_kg_m2"])})
+        values = {**tree, "inertia_kg_m2": np.array(tree["inertia_kg_m2"])}
+        values.pop("skysim_controller", None)
+        return cls(**values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,9 +227,9 @@ class ExternalLaw:
         inputs = ControllerInput(
             self.tick,
             t_s,
-            scalar_last(lab_from_body_wxyz),
+            np.roll(lab_from_body_wxyz, -1),
             rate_body_rad_s.copy(),
-            scalar_last(lab_from_ref_wxyz),
+            np.roll(lab_from_ref_wxyz, -1),
             np.array(rate_ref),
             np.array(acceleration_ref),
             momentum_nms.copy(),
@@ -299,8 +300,3 @@ def external_law(
         )
 
     return ExternalLaw(reference, name, answer, program)
-
-
-def scalar_last(a_from_b_wxyz: Floats) -> Floats:
-    """(4,) xyzw of a quaternion wxyz."""
-    return a_from_b_wxyz[[1, 2, 3, 0]]

@@ -11,7 +11,6 @@ The cable's spring and the air drag depend on the state within a step. MuJoCo co
 
 import itertools
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -108,7 +107,6 @@ class AirCurrent:
         return current
 
 
-@dataclass(slots=True)
 class DisturbanceModel:
     """The disturbances of a vehicle, period by period. Stateful: one object per motion.
 
@@ -126,30 +124,21 @@ class DisturbanceModel:
         (3, 3) inertia about the bearing, in body axes
     """
 
-    turbine_lab_nm: Floats
-    earth_lab_rad_s: Floats
-    air_current: AirCurrent | None
-    impulses: tuple[Impulse, ...]
-    inertia_kg_m2: Floats
-
-    @classmethod
-    def from_config(
-        cls,
+    def __init__(
+        self,
         config: DisturbancesConfig,
         earth_lab_rad_s: Floats,
         impulses: tuple[Impulse, ...],
         inertia_kg_m2: Floats,
         period_s: float,
         rng: Generator,
-    ) -> "DisturbanceModel":
-        """The disturbances that the scene switches on; period_s is the control period."""
-        return cls(
-            np.array(config.turbine_nm),
-            earth_lab_rad_s if config.earth_rotation else np.zeros(3),
-            AirCurrent(config.air_current, period_s, rng) if config.air_current else None,
-            impulses,
-            inertia_kg_m2,
-        )
+    ) -> None:
+        self.turbine_lab_nm = np.array(config.turbine_nm)
+        self.earth_lab_rad_s = earth_lab_rad_s if config.earth_rotation else np.zeros(3)
+        air = config.air_current
+        self.air_current = AirCurrent(air, period_s, rng) if air else None
+        self.impulses = impulses
+        self.inertia_kg_m2 = inertia_kg_m2
 
     @property
     def inactive(self) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.types import Floats
-from skysim.dynamics.attitude_control import Pid, build_controller
+from skysim.dynamics.attitude_control import Pid
 from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_law
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
@@ -103,7 +103,7 @@ class FlightComputer:
     ) -> None:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
-        self.actuator_sets = build_actuators(scene.vehicle, vehicle.model)
+        self.actuator_sets = build_actuators(scene.vehicle, vehicle)
         self.nu = vehicle.model.nu
         self.control_torque_nm = np.zeros(3)
         self.achieved_nm = np.zeros(3)
@@ -136,9 +136,7 @@ class FlightComputer:
         torque_nm = authority_nm(self.actuator)
         rate_limit_rad_s = return_rate_limit_rad_s(scene)
         if config.law in BUILT_IN_LAWS and config.law not in programs:
-            return build_controller(
-                reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s
-            )
+            return Pid(reference, vehicle.inertia_kg_m2, config, torque_nm, rate_limit_rad_s)
         # An external controller gets the same numbers that place the poles of the built-in one.
         setup = ControllerSetup(
             self.period_s,
@@ -210,10 +208,8 @@ class FlightComputer:
             self.loads = np.abs(control[self.actuator.motor]) / self.actuator.limit
             if isinstance(self.actuator, WheelActuator):
                 # The speed of a wheel counts if it is closer to its limit.
-                speeds = np.abs(inputs.speeds_rad_s[self.actuator.joints.dof])
-                self.loads = np.maximum(
-                    self.loads, speeds / self.actuator.model.speed_limit_rad_s
-                )
+                speeds = np.abs(inputs.speeds_rad_s[self.actuator.hinges.dof])
+                self.loads = np.maximum(self.loads, speeds / self.actuator.speed_limit_rad_s)
         # 4. Anti-windup.
         if has_law:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)

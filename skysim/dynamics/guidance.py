@@ -56,7 +56,7 @@ from skysim.sources.ephemeris import earth_rate_rad_s
 State = tuple[Floats, Floats, Floats]  # lab_from_ref_wxyz, rate_rad_s, acceleration_rad_s2
 
 # A change of rate is integrated in steps of at most KNOT_RAD, and in at least MIN_KNOTS steps: error 2e-10 rad, see
-# `RateChangeLeg`.
+# `spin_up`.
 KNOT_RAD = 0.01
 MIN_KNOTS = 128
 MAX_KNOTS = 5_000_000
@@ -127,48 +127,14 @@ def rotated_state(
     return lab_from_ref_wxyz, rate_rad_s * axis, acceleration_rad_s2 * axis
 
 
-# Kinds of legs. Each has a duration and the state at 0 <= t_s <= duration_s after its start.
+# Kinds of legs.
 
 
-@dataclass(frozen=True, slots=True)
-class FixedAxisLeg:
-    """A rotation about one fixed axis (3,) in body axes with a profile of its angle; zeros for no rotation."""
+class Leg(NamedTuple):
+    """A leg: its duration, and the function of its state at 0 <= t_s <= duration_s after its start."""
 
-    lab_from_start_wxyz: Floats
-    axis: Floats
     duration_s: float
-    profile: AngleProfile
-
-    def state_at(self, t_s: float) -> State:
-        return rotated_state(self.lab_from_start_wxyz, self.axis, *self.profile(t_s))
-
-
-@dataclass(frozen=True, slots=True)
-class RateChangeLeg:
-    """A smooth change of the rate: rate_rad_s + change_rad_s (3x^2 - 2x^3), x = t / duration.
-
-    The attitude is integrated from knots by Magnus' expansion. For a change that rotates by an angle a in n steps
-    its error is proportional to a^3 / n^4: below 2e-10 rad for the knots that `spin_up` takes.
-
-    Attributes
-    ----------
-    lab_from_knot_wxyz
-        (K, 4) attitudes at the beginnings of K equal steps
-    rate_rad_s
-        (3,) rate at the start, in body axes
-    change_rad_s
-        (3,) change of the rate over the leg
-    """
-
-    lab_from_knot_wxyz: Floats
-    duration_s: float
-    rate_rad_s: Floats
-    change_rad_s: Floats
-
-    def state_at(self, t_s: float) -> State:
-        return rate_change_state(
-            self.lab_from_knot_wxyz, self.duration_s, self.rate_rad_s, self.change_rad_s, t_s
-        )
+    state_at: Callable[[float], State]
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +149,16 @@ class ProfileLeg:
         return self.spline.state_at(self.begin_s + t_s)
 
 
-Leg = FixedAxisLeg | RateChangeLeg | ProfileLeg
+AnyLeg = Leg | ProfileLeg
+
+
+def fixed_axis(
+    lab_from_start_wxyz: Floats, axis: Floats, duration_s: float, profile: AngleProfile
+) -> Leg:
+    """A rotation about one fixed axis (3,) in body axes with a profile of its angle; zeros for no rotation."""
+    return Leg(
+        duration_s, lambda t_s: rotated_state(lab_from_start_wxyz, axis, *profile(t_s))
+    )
 
 
 class LegStart(NamedTuple):
@@ -220,7 +195,7 @@ def hold(element: Any, start: LegStart) -> Leg:
     """Rest at the present attitude; a preceding rate drops to zero at once."""
     # A bump rests as well, until the end of its second impulse.
     caught_s = element.caught_after_s if isinstance(element, BumpConfig) else None
-    return FixedAxisLeg(
+    return fixed_axis(
         start.lab_from_ref_wxyz, np.zeros(3), element.duration_s + (caught_s or 0.0), still
     )
 
@@ -228,7 +203,7 @@ def hold(element: Any, start: LegStart) -> Leg:
 def step(element: StepConfig, start: LegStart) -> Leg:
     """Jump to another attitude and rest there."""
     lab_from_there = quaternion.from_rotation(start.lab_from_home * attitude(element))
-    return FixedAxisLeg(lab_from_there, np.zeros(3), element.duration_s, still)
+    return fixed_axis(lab_from_there, np.zeros(3), element.duration_s, still)
 
 
 def slew(element: SlewConfig, start: LegStart) -> Leg:
@@ -251,7 +226,7 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
     )
     # The vehicle is there already.
     if angle < 1e-12:
-        return FixedAxisLeg(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
+        return fixed_axis(start.lab_from_ref_wxyz, np.zeros(3), 0.0, still)
     # 2. Peak rate, duration of a ramp, and duration of the whole: two ramps, and a cruise over the rest of the angle.
     accel = math.radians(element.acceleration_deg_s2)
     if element.duration_s is None:
@@ -262,7 +237,7 @@ def slew(element: SlewConfig, start: LegStart) -> Leg:
         rate = slew_rate(angle, accel, element.duration_s)
     ramp = 1.5 * rate / accel
     duration_s = ramp + angle / rate
-    return FixedAxisLeg(
+    return fixed_axis(
         start.lab_from_ref_wxyz,
         axis,
         duration_s,
@@ -286,13 +261,17 @@ def slew_rate(angle_rad: float, acceleration_rad_s2: float, duration_s: float) -
 def rate(element: RateConfig, start: LegStart) -> Leg:
     """A constant rate w from the start of the leg, where the rate jumps: attitude start exp(w t)."""
     size, axis = length_and_direction(np.radians(element.rate_deg_s))
-    return FixedAxisLeg(
+    return fixed_axis(
         start.lab_from_ref_wxyz, axis, element.duration_s, partial(steady, size)
     )
 
 
 def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
     """Change the present rate to another one, each component along a smoothstep; the axis may move.
+
+    The rate is rate + change (3x^2 - 2x^3), x = t / duration. The attitude is integrated from knots at the beginnings
+    of equal steps by Magnus' expansion. For a change that rotates by an angle a in n steps its error is proportional
+    to a^3 / n^4: below 2e-10 rad for these knots.
 
     Raises
     ------
@@ -316,12 +295,11 @@ def spin_up(element: SpinUpConfig, start: LegStart) -> Leg:
             f" rotates by {math.degrees(fastest * duration_s):.3g} deg",
             f"{math.degrees(MAX_KNOTS * KNOT_RAD):.3g} deg",
         )
-    return RateChangeLeg(
-        integrate_knots(start.lab_from_ref_wxyz, count, duration_s, start_rate, change),
-        duration_s,
-        start_rate,
-        change,
+    knots_wxyz = integrate_knots(
+        start.lab_from_ref_wxyz, count, duration_s, start_rate, change
     )
+    state_at = partial(rate_change_state, knots_wxyz, duration_s, start_rate, change)
+    return Leg(duration_s, state_at)
 
 
 def sine(element: SineConfig, start: LegStart) -> Leg:
@@ -336,7 +314,7 @@ def sine(element: SineConfig, start: LegStart) -> Leg:
     growth_s = min(1 / element.frequency_hz, duration_s / 2)
     size, axis = length_and_direction(np.radians(element.amplitude_deg))
     profile = partial(linear_sweep, size, omega, 0.0, duration_s, growth_s, growth_s)
-    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, profile)
+    return fixed_axis(start.lab_from_ref_wxyz, axis, duration_s, profile)
 
 
 def chirp(element: ChirpConfig, start: LegStart) -> Leg:
@@ -360,10 +338,10 @@ def chirp(element: ChirpConfig, start: LegStart) -> Leg:
     profile = partial(
         sweep, size, omega, change, duration_s, 1 / element.from_hz, 1 / element.to_hz
     )
-    return FixedAxisLeg(start.lab_from_ref_wxyz, axis, duration_s, profile)
+    return fixed_axis(start.lab_from_ref_wxyz, axis, duration_s, profile)
 
 
-def profile(element: ProfileConfig, start: LegStart) -> Leg:
+def profile(element: ProfileConfig, start: LegStart) -> ProfileLeg:
     """Follow the attitudes of a file or table.
 
     If the maneuver begins before the first sample, the first cubic is continued backwards by one step at most.
@@ -402,7 +380,7 @@ def profile(element: ProfileConfig, start: LegStart) -> Leg:
 
 
 # The leg of each kind of maneuver. To add a kind, add a class to scene/sections/motion.py and a function here.
-LEGS: dict[str, Callable[[Any, LegStart], Leg]] = {
+LEGS: dict[str, Callable[[Any, LegStart], AnyLeg]] = {
     "hold": hold,
     "step": step,
     "slew": slew,
@@ -428,7 +406,7 @@ class Reference:
         Start time of each leg, ascending from 0
     """
 
-    legs: tuple[Leg, ...]
+    legs: tuple[AnyLeg, ...]
     start_s: tuple[float, ...]
 
     @property
@@ -499,9 +477,7 @@ def plan(
         )
     # 3. The last leg; an empty list rests.
     size, axis = length_and_direction(leg_start.rate_rad_s if legs else np.zeros(3))
-    final_leg = FixedAxisLeg(
-        leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size)
-    )
+    final_leg = fixed_axis(leg_start.lab_from_ref_wxyz, axis, math.inf, partial(steady, size))
     start_times_s = itertools.accumulate((leg.duration_s for leg in legs), initial=0.0)
     return Reference((*legs, final_leg), tuple(start_times_s))
 

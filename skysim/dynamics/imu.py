@@ -11,7 +11,7 @@ unit. They contain all motion between two samples; only its order within the int
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -247,11 +247,20 @@ def add_cubic(
             out[c] += weight * knots[i, c]
 
 
-@dataclass(slots=True)
 class Triad:
-    """Three orthogonal sensors of one kind and their errors, in SI units.
+    """Three orthogonal sensors of one kind and their errors, in SI units, from standard normal draws.
 
-    The unit x of an increment is rad for gyros and m/s for accelerometers.
+    The unit x of an increment is rad for gyros and m/s for accelerometers. The square of an accelerometer's noise
+    density in ug/sqrt(Hz) is the variance of a mean over 1 s.
+
+    Parameters
+    ----------
+    config
+        The gyros or the accelerometers of the scene's IMU
+    hardware
+        (4, 3) draws of the fixed errors: bias, then the rows of the response matrix
+    start
+        (3,) draws of the initial Gauss-Markov bias
 
     Attributes
     ----------
@@ -276,15 +285,30 @@ class Triad:
         (3,) input not yet counted, x; a state
     """
 
-    matrix: Floats
-    turn_on_bias: Floats
-    markov_bias: Floats
-    markov_sd: float
-    markov_time_s: float
-    white: float
-    limit: float
-    quantum: float
-    remainder: Floats = field(default_factory=lambda: np.zeros(3))
+    def __init__(
+        self, config: GyroConfig | AccelerometerConfig, hardware: Floats, start: Floats
+    ) -> None:
+        if isinstance(config, GyroConfig):
+            turn_on = DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0])
+            self.markov_sd = config.bias_deg_h * DEG_H_RAD_S
+            self.white = math.radians(config.arw_deg_sqrt_h) / 60
+            self.limit = math.radians(config.rate_limit_deg_s)
+            self.quantum = math.radians(config.quantum_arcsec / 3600)
+        else:
+            ug = PPM * STANDARD_GRAVITY_M_S2  # a micro-g in m/s2
+            turn_on = ug * scaled_errors(config.turn_on_bias_ug, hardware[0])
+            self.markov_sd = config.bias_ug * ug
+            self.white = config.vrw_ug_sqrt_hz * ug
+            self.limit = config.limit_g * STANDARD_GRAVITY_M_S2
+            self.quantum = 1e-6 * config.quantum_um_s
+        # 1 + scale error on the diagonal, the sensors' misalignments off it.
+        scale = PPM * scaled_errors(config.scale_ppm, hardware[1:])
+        tilt_rad = ARCSEC_RAD * scaled_errors(config.misalignment_arcsec, hardware[1:])
+        self.matrix = np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
+        self.turn_on_bias = turn_on
+        self.markov_bias = self.markov_sd * start
+        self.markov_time_s = config.bias_time_s
+        self.remainder = np.zeros(3)
 
     def measure(self, ideal: Floats, step_s: float, normal: Floats) -> tuple[Floats, Bools]:
         """(N, 3) measured increments, and (N,) whether one was limited; see `corrupt`.
@@ -374,76 +398,23 @@ def corrupt(
     return counted, limited
 
 
-def build_triad(
-    config: GyroConfig | AccelerometerConfig, hardware: Floats, start: Floats
-) -> Triad:
-    """The gyros or the accelerometers from standard normal draws.
-
-    The square of an accelerometer's noise density in ug/sqrt(Hz) is the variance of a mean over 1 s.
-
-    Parameters
-    ----------
-    hardware
-        (4, 3) draws of the fixed errors: bias, then the rows of the response matrix
-    start
-        (3,) draws of the initial Gauss-Markov bias
-    """
-    if isinstance(config, GyroConfig):
-        turn_on = DEG_H_RAD_S * scaled_errors(config.turn_on_bias_deg_h, hardware[0])
-        bias = config.bias_deg_h * DEG_H_RAD_S
-        white = math.radians(config.arw_deg_sqrt_h) / 60
-        limit = math.radians(config.rate_limit_deg_s)
-        quantum = math.radians(config.quantum_arcsec / 3600)
-    else:
-        ug = PPM * STANDARD_GRAVITY_M_S2  # a micro-g in m/s2
-        turn_on = ug * scaled_errors(config.turn_on_bias_ug, hardware[0])
-        bias = config.bias_ug * ug
-        white = config.vrw_ug_sqrt_hz * ug
-        limit = config.limit_g * STANDARD_GRAVITY_M_S2
-        quantum = 1e-6 * config.quantum_um_s
-    matrix = response_matrix(config.scale_ppm, config.misalignment_arcsec, hardware[1:])
-    time_s = config.bias_time_s
-    return Triad(matrix, turn_on, bias * start, bias, time_s, white, limit, quantum)
-
-
-def response_matrix(scale_ppm: float, misalignment_arcsec: float, normal: Floats) -> Floats:
-    """(3, 3) response: 1 + scale error on the diagonal, the sensors' misalignments off it
-
-    Parameters
-    ----------
-    normal
-        (3, 3) draws.
-    """
-    scale = PPM * scaled_errors(scale_ppm, normal)
-    tilt_rad = ARCSEC_RAD * scaled_errors(misalignment_arcsec, normal)
-    return np.eye(3) + np.where(np.eye(3) > 0, scale, tilt_rad)
-
-
-@dataclass(slots=True)
 class Imu:
     """An inertial measurement unit with its fixed errors and its states (biases, remainders).
+
+    At first it is the unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
+    distribution.
 
     Twelve numbers are drawn per sample, whichever errors are on. A run split into pieces therefore equals one run bit
     for bit, and switching one error does not change the others.
     """
 
-    gyro: Triad
-    accelerometer: Triad
-    rng: Generator
-
-    @classmethod
-    def from_config(cls, config: ImuConfig, rng: Generator) -> "Imu":
-        """The unit of the scene's hardware_seed at turn-on; its Gauss-Markov biases start in their stationary
-        distribution.
-        """
+    def __init__(self, config: ImuConfig, rng: Generator) -> None:
         # Fixed errors have the seed of the unit, states that of the run: gyros first, then accelerometers.
         hardware = random_stream(config.hardware_seed).standard_normal((2, 4, 3))
         start = rng.standard_normal((2, 3))
-        return cls(
-            build_triad(config.gyro, hardware[0], start[0]),
-            build_triad(config.accelerometer, hardware[1], start[1]),
-            rng,
-        )
+        self.gyro = Triad(config.gyro, hardware[0], start[0])
+        self.accelerometer = Triad(config.accelerometer, hardware[1], start[1])
+        self.rng = rng
 
     def measure(self, ideal: Increments) -> Increments:
         """The unit's output for the next samples of `ideal_increments`."""
@@ -460,7 +431,6 @@ class Imu:
         return self.gyro.turn_on_bias + self.gyro.markov_bias
 
 
-@dataclass(slots=True)
 class Navigator:
     """Inertial navigator: integrates the gyro increments from the attitude at which the vehicle was zeroed.
 
@@ -472,12 +442,12 @@ class Navigator:
         (3,) Earth rate to compensate; with zeros the Earth's rotation appears as one of the vehicle
     """
 
-    lab_from_body_wxyz: Floats
-    earth_rate_lab_rad_s: Floats = field(default_factory=lambda: np.zeros(3))
-
-    def __post_init__(self) -> None:
-        start = np.asarray(self.lab_from_body_wxyz, dtype=float)
+    def __init__(
+        self, lab_from_body_wxyz: Floats, earth_rate_lab_rad_s: Floats = NO_RATE
+    ) -> None:
+        start = np.asarray(lab_from_body_wxyz, dtype=float)
         self.lab_from_body_wxyz = start / np.linalg.norm(start)
+        self.earth_rate_lab_rad_s = earth_rate_lab_rad_s
 
     def add(self, increments: Increments) -> None:
         """Integrate the next samples, in order; see `integrate_attitude`."""

@@ -1,6 +1,6 @@
 """Vibration: small rotations about the body axes added to the simulated attitude, always or for an interval.
 
-1. `Vibration.draw` draws each vibration as a sum of sines of the rotation vector in body axes: single frequencies
+1. `Vibration` draws each vibration as a sum of sines of the rotation vector in body axes: single frequencies
    (`line`) or a random spectrum (`band`).
 2. `Vibration.subdivisions` finds how finely the trajectory must be sampled.
 3. `Vibration.add_to` adds the rotation and its rate to the samples.
@@ -27,7 +27,6 @@ from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
     JitterBandConfig,
     JitterLineConfig,
-    JitterPart,
     MotionConfig,
 )
 
@@ -132,8 +131,8 @@ class VibrationComponent:
 
     sines: Sines
     name: str
-    begin_s: float = -math.inf
-    end_s: float = math.inf
+    begin_s: float
+    end_s: float
 
     @property
     def rise_s(self) -> float:
@@ -166,40 +165,39 @@ class VibrationComponent:
         return gain * phi, gain * rate + slope * phi
 
 
-@dataclass(frozen=True, slots=True)
 class Vibration:
-    """All vibration of one run. Its phases are drawn once, so evaluation piece by piece equals one evaluation."""
+    """All vibration of one run: `motion.jitter`, which is always on, and each jitter maneuver in its interval.
 
-    components: tuple[VibrationComponent, ...]
+    Its phases are drawn once, so evaluation piece by piece equals one evaluation.
 
-    @classmethod
-    def draw(
-        cls,
-        motion: MotionConfig,
-        rng: Generator,
-        reference: Reference | None = None,
-    ) -> "Vibration":
-        """The vibration of `motion.jitter`, which is always on, and of each jitter maneuver during its interval.
+    Parameters
+    ----------
+    motion
+        The scene's section `motion`
+    rng
+        Generator of the frequencies and phases
+    reference
+        Reference of the maneuvers; by default it is planned here, which is not possible with a profile
+    """
 
-        Parameters
-        ----------
-        motion
-            The scene's section `motion`
-        rng
-            Generator of the frequencies and phases
-        reference
-            Reference of the maneuvers; by default it is planned here, which is not possible with a profile
-        """
-        components = [draw_component(motion.jitter, rng, "motion.jitter")]
+    def __init__(
+        self, motion: MotionConfig, rng: Generator, reference: Reference | None = None
+    ) -> None:
+        spans = [("motion.jitter", motion.jitter, -math.inf, math.inf)]
         starts_s = (reference or plan(motion)).start_s
         for begin_s, element in zip(starts_s, motion.maneuver, strict=False):
             if element.kind == "jitter":
                 name = f"motion.maneuver jitter at {begin_s:g} s"
                 end_s = begin_s + element.duration_s
-                components.append(
-                    draw_component(element.components, rng, name, begin_s, end_s)
-                )
-        return cls(tuple(component for component in components if component))
+                spans.append((name, element.components, begin_s, end_s))
+        # Parts without power are left out.
+        self.components = tuple(
+            VibrationComponent(
+                joined([SPECTRA[part.kind](part, rng) for part in active]), name, *span_s
+            )
+            for name, parts, *span_s in spans
+            if (active := [part for part in parts if any(part.rms_arcsec)])
+        )
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) rotation vector phi and (N, 3) its derivative (rad/s), body axes, at (N,) ascending times."""
@@ -278,25 +276,6 @@ class Vibration:
                 f"{MAX_SAMPLES:,}, {SAMPLES_PER_PERIOD} a period",
             )
         return count.astype(np.int64)
-
-
-def draw_component(
-    configs: Sequence[JitterPart],
-    rng: Generator,
-    name: str,
-    begin_s: float = -math.inf,
-    end_s: float = math.inf,
-) -> VibrationComponent | None:
-    """One vibration with the parts of its spectrum drawn; None if all have zero rms."""
-    active = [config for config in configs if any(config.rms_arcsec)]
-    if not active:
-        return None
-    return VibrationComponent(
-        joined([SPECTRA[config.kind](config, rng) for config in active]),
-        name,
-        begin_s,
-        end_s,
-    )
 
 
 def subdivide(t_s: Floats, counts: Ints) -> Floats:

@@ -20,6 +20,7 @@ recommends.
 
 import datetime
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError, XMLPullParser
@@ -96,10 +97,7 @@ def read_aem(path: Path, lines: list[Line], start: datetime.datetime) -> Samples
             path, "no segment", "META_START ... META_STOP, DATA_START ... DATA_STOP"
         )
     parts = [segment_samples(path, version, segment, start) for segment in segments]
-    joined = parts[0]
-    for part in parts[1:]:
-        joined = join(joined, part)
-    return joined
+    return reduce(join, parts)
 
 
 def from_xml(path: Path, lines: list[Line]) -> list[Line]:

@@ -67,6 +67,16 @@ class Samples:
         return replace(self, a=self.b, b=self.a, a_from_b=self.a_from_b.inv())
 
 
+def continuous(quaternions: Floats) -> Floats:
+    """(K, 4) the same attitudes without jumps of a component: q and -q are the same attitude.
+
+    Each quaternion takes the sign that makes its dot product with the previous one positive.
+    """
+    dot = np.sum(quaternions[1:] * quaternions[:-1], axis=1)
+    sign = np.cumprod(np.where(dot < 0, -1.0, 1.0))
+    return quaternions * np.append(1.0, sign)[:, None]
+
+
 def from_quaternions(
     source: str | Path,
     unit: str,

@@ -4,7 +4,7 @@
 2. `to_body` converts them to lab_from_body.
 3. `profile_samples.check_samples` checks their number, times and steps.
 4. `two_axis.on_gimbals` turns them to those that a two-axis mount takes.
-5. `reference_curves.fit_spline` interpolates them.
+5. `reference_curves.AttitudeSpline` interpolates them.
 """
 
 import datetime
@@ -19,7 +19,7 @@ from skysim.core.time import in_utc
 from skysim.core.types import Mount
 from skysim.dynamics import profile_aem, profile_stk, profile_table
 from skysim.dynamics.profile_samples import Samples, check_samples
-from skysim.dynamics.reference_curves import AttitudeSpline, fit_spline
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.dynamics.two_axis import on_gimbals
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import ProfileConfig
@@ -56,7 +56,7 @@ def load_profiles(
                 samples = check_samples(to_body(samples, scene, mount))
                 if scene.vehicle.gimbals:
                     samples = on_gimbals(samples, scene.vehicle.gimbals)
-                profiles.append(fit_spline(samples))
+                profiles.append(AttitudeSpline(samples))
             except InputError as error:
                 raise error.within(f"motion.maneuver.{n}") from None
     return tuple(profiles)

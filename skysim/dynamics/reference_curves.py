@@ -7,14 +7,13 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.types import Floats
-from skysim.dynamics.profile_samples import Samples
+from skysim.dynamics.profile_samples import Samples, continuous
 
 Derivatives = tuple[float, float, float]  # a value and its first two derivatives by time
 AngleProfile = Callable[[float], Derivatives]
@@ -199,9 +198,8 @@ def rate_change_state(
 # 3. Attitude samples interpolated by a C2 spline: attitude, rate and acceleration are continuous.
 
 
-@dataclass(frozen=True, slots=True)
 class AttitudeSpline:
-    """Attitude samples interpolated by a C2 spline.
+    """Checked samples of lab_from_body interpolated by a C2 spline.
 
     The spline is SciPy's `CubicSpline` (not-a-knot) of the four components of the quaternion with continuous sign.
     It is normalized where it is evaluated. Its error is of fourth order in the step up to both ends.
@@ -221,10 +219,15 @@ class AttitudeSpline:
         Whether the samples have epochs
     """
 
-    source: str
-    t_s: Floats
-    coefficients: Floats
-    absolute: bool
+    def __init__(self, samples: Samples) -> None:
+        from scipy.interpolate import CubicSpline
+
+        wxyz = continuous(samples.a_from_b.as_quat(scalar_first=True))
+        cubic = CubicSpline(samples.t_s, wxyz)
+        self.source = str(samples.source)
+        self.t_s = samples.t_s
+        self.coefficients = np.ascontiguousarray(cubic.c.transpose(1, 0, 2))
+        self.absolute = samples.absolute
 
     def state_at(self, t_s: float) -> tuple[Floats, Floats, Floats]:
         """lab_from_body_wxyz (4,), rate (rad/s) and acceleration (rad/s2) (3,) in body axes.
@@ -236,23 +239,6 @@ class AttitudeSpline:
     def states_at(self, t_s: Floats) -> tuple[Floats, Floats, Floats]:
         """`state_at` at (K,) times: (K, 4), (K, 3), (K, 3)."""
         return spline_states(self.t_s, self.coefficients, t_s)
-
-
-def fit_spline(samples: Samples) -> AttitudeSpline:
-    """The spline through checked samples of lab_from_body."""
-    from scipy.interpolate import CubicSpline
-
-    # q and -q are the same attitude: choose the signs so that no component jumps.
-    wxyz = samples.a_from_b.as_quat(scalar_first=True)
-    dot = np.sum(wxyz[1:] * wxyz[:-1], axis=1)
-    sign = np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
-    cubic = CubicSpline(samples.t_s, wxyz * sign[:, None])
-    return AttitudeSpline(
-        str(samples.source),
-        samples.t_s,
-        np.ascontiguousarray(cubic.c.transpose(1, 0, 2)),
-        samples.absolute,
-    )
 
 
 @jit

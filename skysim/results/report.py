@@ -162,7 +162,7 @@ def print_blocks(blocks: Sequence[Block]) -> None:
                 print_table(block)
             case Code(text=text):
                 print(text)
-            case Text(text=text) | Verdict(text=text):
+            case Text(text=text):
                 print_wrapped(text)
 
 

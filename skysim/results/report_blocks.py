@@ -92,11 +92,8 @@ class Text(Block):
 
 
 @dataclass(frozen=True)
-class Verdict(Block):
+class Verdict(Text):
     """A sentence that answers what the report is about."""
-
-    text: str
-    tone: Tone = ""
 
 
 @dataclass(frozen=True)

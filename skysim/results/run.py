@@ -262,7 +262,7 @@ class FlightRecorder:
     def record(self, shots: Iterable[Shot]) -> list[FrameRow]:
         """Solved shots, written as they come and not kept. Returns the rows of the main camera."""
         for shot in shots:
-            self.of(shot.camera).add(scoring.score(shot))
+            self.of(shot.camera).add(scoring.Score(shot))
         return self.of(self.flight.lab.camera).rows
 
     def finish(

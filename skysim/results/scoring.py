@@ -3,7 +3,6 @@
 import html
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -196,9 +195,8 @@ def annotated(frame: Frame, truth: Truth, report: Report | None) -> Picture:
     )
 
 
-@dataclass(frozen=True, slots=True, repr=False)
 class Score:
-    """A shot with the error of its solution.
+    """A solved shot with the error of its solution.
 
     Attributes
     ----------
@@ -207,8 +205,10 @@ class Score:
         arcseconds
     """
 
-    shot: Shot
-    row: FrameRow
+    def __init__(self, shot: Shot) -> None:
+        assert shot.report is not None
+        self.shot = shot
+        self.row = row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status)
 
     @property
     def image(self) -> NDArray[Any]:
@@ -241,14 +241,6 @@ class Score:
 
     def _repr_html_(self) -> str:
         return f"{image_tag(self.annotated())}<p>{html.escape(repr(self)[1:-1])}</p>"
-
-
-def score(shot: Shot) -> Score:
-    """A solved shot with the error of its solution."""
-    assert shot.report is not None
-    return Score(
-        shot, row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status)
-    )
 
 
 def image_tag(image: Picture) -> str:

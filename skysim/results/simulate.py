@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Trajectory, Truth
 from skysim.results.run import Run, run_of
-from skysim.results.scoring import Score, score
+from skysim.results.scoring import Score
 from skysim.scene.scene import Scene, check_scene
 from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
@@ -58,7 +58,7 @@ def simulate(
     ) as flight:
         scores: dict[str, list[Score]] = {camera.name: [] for camera in flight.lab.cameras}
         for shot in flight.shots(progress=progress):
-            scores[shot.camera.name].append(score(shot))
+            scores[shot.camera.name].append(Score(shot))
         return run_of(flight, list(scores.values()))
 
 

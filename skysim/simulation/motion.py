@@ -66,7 +66,7 @@ def check_reference(
     check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    actuators = build_actuators(scene.vehicle, model.model)
+    actuators = build_actuators(scene.vehicle, model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -118,7 +118,7 @@ def check_tilt(
         )
 
 
-def demands(leg: guidance.Leg, period_s: float) -> tuple[Floats, Floats, Floats]:
+def demands(leg: guidance.AnyLeg, period_s: float) -> tuple[Floats, Floats, Floats]:
     """(K,) times since the leg's start, (K, 3) rates and (K, 3) accelerations in body axes.
 
     They are those at the samples of a profile, else at every control period. Between two samples the acceleration of
@@ -382,7 +382,7 @@ class TelemetryRecorder:
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,
             joints=states[:, 1 : 1 + nq].copy(),
-            manipulability=cmgs.model.manipulability(gimbals, rotors)
+            manipulability=cmgs.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,
             lab_from_ref=reference.attitudes(t_s) if reference else None,
@@ -479,7 +479,7 @@ class Motion:
             self.simulation = multibody.Simulation(
                 vehicle, lab.start, rate, duration_s, kept_s
             )
-        self.vibration = Vibration.draw(
+        self.vibration = Vibration(
             scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
         )
         if kept_s is None:
@@ -489,7 +489,7 @@ class Motion:
             )
         self.flight_computer = FlightComputer(scene, vehicle, self.reference, programs)
         self.period_steps = round(self.flight_computer.period_s / self.simulation.step_s)
-        self.drives = build_drives(scene.vehicle, vehicle.model)
+        self.drives = build_drives(scene.vehicle, vehicle)
         self.navigation = None
         if scene.vehicle.imu is not None:
             self.navigation = Navigation(
@@ -602,7 +602,7 @@ def build_disturbances(
 ) -> DisturbanceModel:
     """The scene's disturbances, with these knocks."""
     scene = lab.scene
-    return DisturbanceModel.from_config(
+    return DisturbanceModel(
         scene.vehicle.disturbances,
         imu.earth_rate_lab_rad_s(scene.site),
         impulses,

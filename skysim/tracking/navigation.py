@@ -119,7 +119,7 @@ class Navigation:
     ) -> None:
         config = scene.vehicle.imu
         assert config is not None
-        self.imu = imu.Imu.from_config(config, rng)
+        self.imu = imu.Imu(config, rng)
         self.position_body_m = position_body_m
         self.gravity_m_s2 = gravity_m_s2
         self.body_from_cam = [mount.cam_from_body.inv() for mount in mounts]

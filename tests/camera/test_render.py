@@ -611,9 +611,7 @@ def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
 @pytest.mark.compiles
 def test_jitter_widens_a_star_by_its_own_variance() -> None:
     line = JitterLineConfig(kind="line", frequency_hz=40.0, rms_arcsec=(60.0, 120.0, 0.0))
-    shaken = Vibration.draw(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(
-        STILL
-    )
+    shaken = Vibration(MotionConfig(jitter=(line,)), np.random.default_rng(4)).add_to(STILL)
     image, seen = shot(star_at(31.5, 23.5), shaken)  # forty whole periods
     wide = (np.radians([120 / 3600, 60 / 3600]) * 2500) ** 2  # about y it swings along x
     np.testing.assert_allclose(moments(image)[1], 0.7**2 + 1 / 12 + wide, rtol=2e-3, atol=0)

@@ -236,9 +236,7 @@ def test_gyros_of_a_data_sheet_are_within_their_tolerance() -> None:
         }
     )
     units = [
-        imu.Imu.from_config(
-            config.model_copy(update={"hardware_seed": seed}), np.random.default_rng(0)
-        )
+        imu.Imu(config.model_copy(update={"hardware_seed": seed}), np.random.default_rng(0))
         for seed in range(1000)
     ]
     scale_ppm = np.array([np.diag(unit.gyro.matrix) - 1 for unit in units]) * 1e6

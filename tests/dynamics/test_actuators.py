@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +13,12 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.dynamics.multibody.cmgs import STEERING, CmgSet
-from skysim.dynamics.multibody.fans import Desaturator, FanSet
-from skysim.dynamics.multibody.wheels import WheelSet
+from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
+from skysim.dynamics.multibody.cmgs import STEERING, CmgActuator
+from skysim.dynamics.multibody.fans import FanSet, MomentumDump
+from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.sections.motion import DesaturationConfig
+from skysim.scene.sections.vehicle import CmgsConfig, WheelsConfig
 from tests.helpers.interpreted import interpreted
 
 # Kg m2, less the rotors about their axles.
@@ -33,11 +37,82 @@ def pyramid(skew_rad: float, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return gimbal.T.copy(), around.apply([0.0, 1.0, 0.0]).T.copy()
 
 
+class Joints(SimpleNamespace):
+    """Joints whose angles, speeds and motors have the numbers from `first` on."""
+
+    def __init__(self, axes: np.ndarray, inertia: np.ndarray, first: int = 0) -> None:
+        number = first + np.arange(len(inertia))
+        super().__init__(
+            axes=axes, inertia_kg_m2=inertia, qpos=number, dof=number, motor=number
+        )
+
+    def __len__(self) -> int:
+        return len(self.motor)
+
+
+def cmg_set(
+    gimbal_axes: np.ndarray,
+    spin_axes: np.ndarray,
+    inertia: np.ndarray,
+    rate_limit_rad_s: float,
+    rotor_torque_limit_nm: float | None = None,
+    steering: str = "singularity_robust",
+) -> CmgActuator:
+    """CMGs without a model: their gimbals come before their rotors."""
+    config = CmgsConfig.model_validate({"steering": steering})
+    config = config.model_copy(update={"rotor_torque_limit_nm": rotor_torque_limit_nm})
+    rotors = Joints(spin_axes, inertia, len(inertia))
+    gimbals = Joints(gimbal_axes, inertia)
+    set_ = CmgActuator(SimpleNamespace(gimbals=gimbals, rotors=rotors), config)
+    set_.limit = rate_limit_rad_s
+    return set_
+
+
+def wheel_set(axes: np.ndarray, inertia: np.ndarray, torque_limit_nm: float) -> WheelActuator:
+    """Wheels without a model, up to 300 rad/s."""
+    config = WheelsConfig().model_copy(update={"torque_limit_nm": torque_limit_nm})
+    set_ = WheelActuator(SimpleNamespace(wheels=Joints(axes, inertia)), config)
+    set_.speed_limit_rad_s = 300.0
+    return set_
+
+
+def allocated(set_: Actuators, torque: np.ndarray, *state: Any) -> np.ndarray:
+    """The controls for a torque, from the fields of `ControlInput`."""
+    control = np.zeros(16)
+    set_.allocate(control, torque, ControlInput(*state))
+    return control
+
+
+def driven_wheels(
+    set_: WheelActuator, torque: np.ndarray, speed: np.ndarray, period_s: float
+) -> np.ndarray:
+    """The wheels' motor torques."""
+    return allocated(set_, torque, 0.0, period_s, STILL, STILL, speed)[set_.motor]
+
+
+def steered(
+    set_: CmgActuator,
+    torque: np.ndarray,
+    rate: np.ndarray,
+    angle: np.ndarray,
+    spin: np.ndarray,
+    t_s: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gimbal rates and the rotors' motor torques."""
+    speeds = np.concatenate([np.zeros_like(spin), spin])
+    control = allocated(set_, torque, t_s, 0.01, rate, angle, speeds)
+    return control[set_.motor], control[set_.rotors.motor]
+
+
+def wheel_momentum(set_: WheelActuator, speed: np.ndarray) -> np.ndarray:
+    return set_.momentum_nms(STILL, speed)
+
+
 def pyramid_set(
     steering: str = "singularity_robust", rate_limit_rad_s: float = 1.0
-) -> CmgSet:
+) -> CmgActuator:
     """Four CMGs of one N m s each at 100 rad/s."""
-    return CmgSet(*pyramid(SKEW), np.full(4, 0.01), rate_limit_rad_s, None, steering)
+    return cmg_set(*pyramid(SKEW), np.full(4, 0.01), rate_limit_rad_s, None, steering)
 
 
 SPEED = np.full(4, 100.0)  # rad/s
@@ -116,9 +191,9 @@ def torque_felt(body: Body, gimbal_rate=0.0, motor=0.0, dt: float = 1e-4) -> np.
     return BUS @ (later.rate - earlier.rate) / (2 * dt)
 
 
-def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelSet:
+def wheels(n: int, torque_limit_nm: float = 0.5) -> WheelActuator:
     axes = np.eye(3) if n == 3 else pyramid(SKEW)[0]
-    return WheelSet(axes, np.full(n, 0.02), torque_limit_nm, 300.0)
+    return wheel_set(axes, np.full(n, 0.02), torque_limit_nm)
 
 
 # ---- wheels ----------------------------------------------------------------------------------------------------
@@ -131,16 +206,21 @@ def test_wheels_turn_the_body_and_take_its_momentum(n):
     set_ = wheels(n)
     torque = np.array([0.05, -0.08, 0.03])
     body = Body.start(
-        set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(n), np.zeros(n), STILL
+        set_.hinges.axes,
+        set_.hinges.axes,
+        set_.hinges.inertia_kg_m2,
+        np.zeros(n),
+        np.zeros(n),
+        STILL,
     )
     for _ in range(100):
-        body = body.move(0.01, motor=set_.drive(torque, body.speed, 0.01))
+        body = body.move(0.01, motor=driven_wheels(set_, torque, body.speed, 0.01))
     np.testing.assert_allclose(
         body.rate, np.linalg.solve(BUS, torque * 1.0), rtol=1e-9, atol=0
     )
-    everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
+    everything = BUS + set_.hinges.axes * set_.hinges.inertia_kg_m2 @ set_.hinges.axes.T
     np.testing.assert_allclose(
-        set_.momentum(body.speed), -everything @ body.rate, rtol=1e-9, atol=0
+        wheel_momentum(set_, body.speed), -everything @ body.rate, rtol=1e-9, atol=0
     )
 
 
@@ -150,11 +230,18 @@ def test_with_gyroscopic_feed_forward_spinning_wheels_give_the_commanded_torque(
     speed = np.array([200.0, -50, 120, 10])
     rate = np.array([0.3, -0.2, 0.4])
     torque = np.array([0.1, 0.2, -0.3])
-    body = Body.start(set_.axes, set_.axes, set_.inertia_kg_m2, np.zeros(4), speed, rate)
-    everything = BUS + set_.axes * set_.inertia_kg_m2 @ set_.axes.T
-    gyroscopic = np.cross(rate, everything @ rate + set_.momentum(speed))
-    with_it = torque_felt(body, motor=set_.drive(torque + gyroscopic, speed, 0.01))
-    without = torque_felt(body, motor=set_.drive(torque, speed, 0.01))
+    body = Body.start(
+        set_.hinges.axes,
+        set_.hinges.axes,
+        set_.hinges.inertia_kg_m2,
+        np.zeros(4),
+        speed,
+        rate,
+    )
+    everything = BUS + set_.hinges.axes * set_.hinges.inertia_kg_m2 @ set_.hinges.axes.T
+    gyroscopic = np.cross(rate, everything @ rate + wheel_momentum(set_, speed))
+    with_it = torque_felt(body, motor=driven_wheels(set_, torque + gyroscopic, speed, 0.01))
+    without = torque_felt(body, motor=driven_wheels(set_, torque, speed, 0.01))
     np.testing.assert_allclose(with_it, torque, rtol=1e-6, atol=0)
     np.testing.assert_allclose(without, torque - gyroscopic, rtol=1e-6, atol=0)
     assert np.linalg.norm(gyroscopic) > 0.5
@@ -163,14 +250,16 @@ def test_with_gyroscopic_feed_forward_spinning_wheels_give_the_commanded_torque(
 def test_four_wheels_share_a_torque_with_the_least_norm():
     """Of all motor torques that do it, the pseudo-inverse's are the smallest: none of the null vector in them."""
     set_ = wheels(4)
-    motor = set_.drive(np.array([0.1, -0.05, 0.2]), np.zeros(4), 0.01)
+    motor = driven_wheels(set_, np.array([0.1, -0.05, 0.2]), np.zeros(4), 0.01)
     assert abs(motor @ [1, -1, 1, -1]) < 1e-15  # the pyramid's null vector
-    np.testing.assert_allclose(set_.axes @ motor, [-0.1, 0.05, -0.2], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        set_.hinges.axes @ motor, [-0.1, 0.05, -0.2], rtol=0, atol=1e-15
+    )
 
 
 def test_beyond_the_torque_limit_the_direction_is_kept():
     torque = np.array([3.0, -1.0, 0.5])
-    motor = wheels(3).drive(torque, np.zeros(3), 0.01)
+    motor = driven_wheels(wheels(3), torque, np.zeros(3), 0.01)
     np.testing.assert_allclose(motor, -torque / 6, rtol=1e-15, atol=0)
 
 
@@ -186,7 +275,9 @@ def test_beyond_the_torque_limit_the_direction_is_kept():
     ],
 )
 def test_a_wheel_is_not_driven_beyond_its_speed(speed, wanted, motor):
-    driven = wheels(3).drive(np.array([wanted, 0.1, 0]), np.array([speed, 0, 0]), 0.01)
+    driven = driven_wheels(
+        wheels(3), np.array([wanted, 0.1, 0]), np.array([speed, 0, 0]), 0.01
+    )
     np.testing.assert_allclose(driven, [motor, -0.1, 0], rtol=1e-9, atol=1e-15)
 
 
@@ -196,8 +287,8 @@ def test_a_torque_outside_the_plane_of_level_wheels_is_dropped(angles_deg):
     a = np.radians(angles_deg)
     tilted = Rotation.from_rotvec([0.3, -0.2, 0.9])  # so that rounding has its say
     axes = tilted.apply(np.array([np.cos(a), np.sin(a), 0 * a]).T).T
-    set_ = WheelSet(axes, np.full(len(a), 0.01), 1.0, 300.0)
-    motor = set_.drive(tilted.apply([0.1, 0.2, 0.3]), np.zeros(len(a)), 0.01)
+    set_ = wheel_set(axes, np.full(len(a), 0.01), 1.0)
+    motor = driven_wheels(set_, tilted.apply([0.1, 0.2, 0.3]), np.zeros(len(a)), 0.01)
     np.testing.assert_allclose(
         tilted.inv().apply(-axes @ motor), [0.1, 0.2, 0], rtol=0, atol=1e-14
     )
@@ -215,7 +306,8 @@ def fans(limit_n: float = 0.5) -> FanSet:
     pushes = np.array(
         [[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], float
     ).T
-    return FanSet(pushes, places, limit_n)
+    found: Any = SimpleNamespace(axes=pushes, positions_m=places, motor=np.zeros(0, int))
+    return FanSet(found, limit_n)
 
 
 def test_a_fan_pair_is_a_couple():
@@ -249,7 +341,7 @@ SPEEDS = np.array([100.0, 80, -120, 95])
 
 def test_the_momentum_is_that_of_the_gimballed_rotors():
     set_ = pyramid_set()
-    axles = Rotation.from_rotvec((set_.gimbal_axes * ANGLES).T).apply(set_.spin_axes.T)
+    axles = Rotation.from_rotvec((set_.gimbals.axes * ANGLES).T).apply(set_.rotors.axes.T)
     np.testing.assert_allclose(
         set_.momentum(ANGLES, SPEEDS), 0.01 * SPEEDS @ axles, rtol=0, atol=1e-14
     )
@@ -268,7 +360,7 @@ def test_the_jacobian_is_the_momentums_derivative():
 
 
 def test_manipulability_is_one_at_best_and_nothing_at_a_singularity():
-    square = CmgSet(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0)
+    square = cmg_set(np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0)
     assert square.manipulability(np.zeros(3), np.full(3, 100.0)) == pytest.approx(
         1, rel=1e-12
     )
@@ -294,15 +386,15 @@ def test_a_cmg_s_torque_is_gimbal_rate_times_momentum(rate):
     rate = np.array(rate)
     torque = np.array([0.1, 0.2, -0.3])
     body = Body.start(
-        set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, ANGLES, SPEEDS, rate
+        set_.gimbals.axes, set_.rotors.axes, set_.rotors.inertia_kg_m2, ANGLES, SPEEDS, rate
     )
     asked = torque + np.cross(rate, body.whole)
-    gimbal_rate, motor = set_.drive(asked, rate, ANGLES, SPEEDS, 0.0)
+    gimbal_rate, motor = steered(set_, asked, rate, ANGLES, SPEEDS, 0.0)
     assert np.abs(gimbal_rate).max() < 1
     np.testing.assert_array_equal(motor, np.zeros(4))
     np.testing.assert_allclose(torque_felt(body, gimbal_rate), torque, rtol=1e-6, atol=0)
     momenta = body.axles(ANGLES) * body.spin
-    crossed = -np.cross(set_.gimbal_axes * gimbal_rate, momenta, axis=0).sum(axis=1)
+    crossed = -np.cross(set_.gimbals.axes * gimbal_rate, momenta, axis=0).sum(axis=1)
     np.testing.assert_allclose(crossed, asked, rtol=1e-12, atol=0)
 
 
@@ -310,7 +402,7 @@ def test_away_from_singularities_both_steering_laws_agree():
     """lambda is 0.01 exp(-10 det A A^T), 5e-8 at rest with det = 32/27: the rates differ by no more."""
     torque = np.array([0.1, -0.05, 0.2])
     plain, robust = (
-        pyramid_set(name).drive(torque, STILL, np.zeros(4), SPEED, 3.0)[0]
+        steered(pyramid_set(name), torque, STILL, np.zeros(4), SPEED, 3.0)[0]
         for name in STEERING
     )
     lambda_ = 0.01 * math.exp(-10 * 32 / 27)
@@ -342,7 +434,7 @@ def test_the_robust_inverse_matches_wie_s_formula_at_any_time():
 def test_gimbals_at_their_limit_keep_the_direction(steering):
     torque = np.array([1.0, -0.5, 2.0])
     set_ = pyramid_set(steering, rate_limit_rad_s=0.1)
-    rate, _ = set_.drive(torque, STILL, np.zeros(4), SPEED, 0.0)
+    rate, _ = steered(set_, torque, STILL, np.zeros(4), SPEED, 0.0)
     assert np.abs(rate).max() == pytest.approx(0.1, rel=1e-12)
     given = -set_.jacobian(np.zeros(4), SPEED) @ rate
     # The robust inverse is off by lambda, 5e-8 there, over the smallest eigenvalue 2/3.
@@ -354,7 +446,7 @@ def test_gimbals_at_their_limit_keep_the_direction(steering):
 
 def test_a_cmg_may_have_any_skew_angle():
     """Gimbal and rotor at 45 deg between x and y: at right angles, though no product of their components is zero."""
-    one = CmgSet(
+    one = cmg_set(
         np.sqrt([[0.5], [0.5], [0.0]]),
         np.sqrt([[0.5], [0.5], [0.0]]) * [[1], [-1], [1]],
         np.array([0.01]),
@@ -369,7 +461,7 @@ def test_a_cmg_may_have_any_skew_angle():
 
 @pytest.mark.parametrize("steering", STEERING)
 def test_resting_rotors_are_not_gimballed(steering):
-    rate, motor = pyramid_set(steering).drive(np.ones(3), STILL, ANGLES, np.zeros(4), 0.0)
+    rate, motor = steered(pyramid_set(steering), np.ones(3), STILL, ANGLES, np.zeros(4), 0.0)
     np.testing.assert_array_equal([rate, motor], np.zeros((2, 4)))
 
 
@@ -379,7 +471,7 @@ def test_resting_rotors_are_not_gimballed(steering):
 def test_the_pyramid_saturates_with_every_rotor_at_its_largest_projection():
     """A rotor's axle reaches within g's plane: at most sqrt(1 - g_x^2) along x. c, 1, c, 1: 2 + 2 c = 3.155."""
     set_ = pyramid_set()
-    best = np.sqrt(1 - set_.gimbal_axes[0] ** 2).sum()
+    best = np.sqrt(1 - set_.gimbals.axes[0] ** 2).sum()
     assert best == pytest.approx(2 + 2 * SLANT, rel=1e-12)
     angles = np.radians([-90, 180, 90, 0])
     np.testing.assert_allclose(set_.momentum(angles, SPEED), [best, 0, 0], rtol=0, atol=1e-14)
@@ -389,18 +481,20 @@ def test_the_pyramid_saturates_with_every_rotor_at_its_largest_projection():
 def test_in_a_singularity_the_pseudo_inverse_gives_the_other_components():
     set_ = pyramid_set("pseudo_inverse")
     angles = np.radians([-90, 0, 90, 0])
-    rate, _ = set_.drive(np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
+    rate, _ = steered(set_, np.array([0.3, 0.1, -0.2]), STILL, angles, SPEED, 0.0)
     np.testing.assert_allclose(
         -set_.jacobian(angles, SPEED) @ rate, [0, 0.1, -0.2], rtol=0, atol=1e-14
     )
 
 
-def pushed_along_x(set_: CmgSet, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pushed_along_x(
+    set_: CmgActuator, seconds: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Momentum (N, 3), gimbal rates and angles (N, 4) from rest, momentum wanted to grow by 0.1 N m along +x."""
     angle = np.zeros(4)
     story = []
     for k in range(round(seconds / 0.01)):
-        rate, _ = set_.drive(np.array([-0.1, 0, 0]), STILL, angle, SPEED, 0.01 * k)
+        rate, _ = steered(set_, np.array([-0.1, 0, 0]), STILL, angle, SPEED, 0.01 * k)
         angle = angle + 0.01 * rate
         story.append((set_.momentum(angle, SPEED), rate, angle))
     momentum, rates, angles = zip(*story, strict=True)
@@ -442,9 +536,9 @@ def test_the_robust_inverse_passes_the_internal_singularity_and_reaches_saturati
 # ---- variable-speed gyros --------------------------------------------------------------------------------------
 
 
-def variable(rotor_torque_limit_nm: float = 0.5) -> CmgSet:
+def variable(rotor_torque_limit_nm: float = 0.5) -> CmgActuator:
     """Three variable-speed CMGs about the body axes, 1 N m s each at 100 rad/s; d(h)/d(angle) is diagonal at zero."""
-    return CmgSet(
+    return cmg_set(
         np.eye(3), np.roll(np.eye(3), 1, axis=0), np.full(3, 0.01), 1.0, rotor_torque_limit_nm
     )
 
@@ -452,10 +546,10 @@ def variable(rotor_torque_limit_nm: float = 0.5) -> CmgSet:
 THREE = np.full(3, 100.0)
 
 
-def singular_angles(set_: CmgSet, along: np.ndarray) -> np.ndarray:
+def singular_angles(set_: CmgActuator, along: np.ndarray) -> np.ndarray:
     """Gimbal angles with every rotor at its largest component along a direction: a singularity."""
-    across = np.cross(set_.gimbal_axes, set_.spin_axes, axis=0)
-    return np.arctan2(along @ across, along @ set_.spin_axes)
+    across = np.cross(set_.gimbals.axes, set_.rotors.axes, axis=0)
+    return np.arctan2(along @ across, along @ set_.rotors.axes)
 
 
 @pytest.mark.compiles
@@ -467,16 +561,16 @@ def test_rotors_deliver_what_singular_gimbals_cannot():
         along @ set_.jacobian(angles, THREE), np.zeros(3), rtol=0, atol=1e-15
     )
     torque = 0.3 * along + 0.2 * np.array([1.0, 0, 1.0])
-    rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
+    rate, motor = steered(set_, torque, STILL, angles, THREE, 0.0)
     assert np.abs(motor).max() < 0.5
     body = Body.start(
-        set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, angles, THREE, STILL
+        set_.gimbals.axes, set_.rotors.axes, set_.rotors.inertia_kg_m2, angles, THREE, STILL
     )
     np.testing.assert_allclose(torque_felt(body, rate, motor), torque, rtol=0, atol=3e-7)
     # All by the rotors.
     assert along @ (body.axles(angles) @ motor) == pytest.approx(-along @ torque, rel=1e-12)
-    fixed = CmgSet(set_.gimbal_axes, set_.spin_axes, set_.rotor_inertia_kg_m2, 1.0)
-    stuck, _ = fixed.drive(along, STILL, angles, THREE, 0.0)
+    fixed = cmg_set(set_.gimbals.axes, set_.rotors.axes, set_.rotors.inertia_kg_m2, 1.0)
+    stuck, _ = steered(fixed, along, STILL, angles, THREE, 0.0)
     assert np.linalg.norm(along @ fixed.jacobian(angles, THREE) * stuck) < 1e-14
 
 
@@ -484,8 +578,8 @@ def test_rotors_keep_their_speed_where_gimbals_suffice():
     """At angle zero A = 1 N m s, det A A^T = 1: the weights leave the rotors 0.25 exp(-10) of the torque."""
     set_ = variable()
     torque = np.array([0.3, -0.2, 0.1])
-    rate, motor = set_.drive(torque, STILL, np.zeros(3), THREE, 0.0)
-    axles = set_.spin_axes
+    rate, motor = steered(set_, torque, STILL, np.zeros(3), THREE, 0.0)
+    axles = set_.rotors.axes
     np.testing.assert_allclose(
         -set_.jacobian(np.zeros(3), THREE) @ rate - axles @ motor, torque, rtol=1e-12, atol=0
     )
@@ -499,8 +593,10 @@ def test_variable_speed_cmgs_give_the_commanded_torque_at_any_angle():
     rng = np.random.default_rng(4)
     for angles in rng.uniform(-np.pi, np.pi, (800, 3)):
         torque = 0.1 * rng.standard_normal(3)
-        rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
-        axles = Rotation.from_rotvec((set_.gimbal_axes * angles).T).apply(set_.spin_axes.T).T
+        rate, motor = steered(set_, torque, STILL, angles, THREE, 0.0)
+        axles = (
+            Rotation.from_rotvec((set_.gimbals.axes * angles).T).apply(set_.rotors.axes.T).T
+        )
         given = -set_.jacobian(angles, THREE) @ rate - axles @ motor
         np.testing.assert_allclose(given, torque, rtol=0, atol=1e-12)
 
@@ -511,10 +607,12 @@ def test_variable_speed_gyros_at_their_limits_keep_the_direction():
     along = np.array([2.0, 1.0, -2.0]) / 3
     angles = singular_angles(set_, along)
     for torque in (3.0 * along, 10 * np.array([1.0, 0, 1]) + 0.01 * along):
-        rate, motor = set_.drive(torque, STILL, angles, THREE, 0.0)
+        rate, motor = steered(set_, torque, STILL, angles, THREE, 0.0)
         used = max(np.abs(rate).max() / 1.0, np.abs(motor).max() / 0.05)
         assert used == pytest.approx(1, rel=1e-12)
-        axles = Rotation.from_rotvec((set_.gimbal_axes * angles).T).apply(set_.spin_axes.T).T
+        axles = (
+            Rotation.from_rotvec((set_.gimbals.axes * angles).T).apply(set_.rotors.axes.T).T
+        )
         given = -set_.jacobian(angles, THREE) @ rate - axles @ motor
         np.testing.assert_allclose(np.cross(given, torque), STILL, rtol=0, atol=1e-11)
         assert given @ torque > 0
@@ -524,8 +622,8 @@ def test_variable_speed_gyros_at_their_limits_keep_the_direction():
 def test_rotors_at_rest_work_as_wheels():
     set_ = variable()
     torque = np.array([0.1, 0.2, -0.1])
-    rate, motor = set_.drive(torque, STILL, np.zeros(3), np.zeros(3), 0.0)
-    np.testing.assert_allclose(-set_.spin_axes @ motor, torque, rtol=1e-12, atol=0)
+    rate, motor = steered(set_, torque, STILL, np.zeros(3), np.zeros(3), 0.0)
+    np.testing.assert_allclose(-set_.rotors.axes @ motor, torque, rtol=1e-12, atol=0)
     np.testing.assert_array_equal(rate, np.zeros(3))
 
 
@@ -537,7 +635,7 @@ PART = DesaturationConfig.model_validate(
 
 
 def test_desaturation_starts_and_stops_at_different_thresholds():
-    fan = Desaturator(PART)
+    fan = MomentumDump(fans(), 1.0, PART)
     size = [0.5, 0.99, 1.01, 0.8, 0.21, 0.19, 0.5, 0.99, 1.5]
     running = [bool(fan.torque(np.array([0, -h, 0])).any()) for h in size]
     assert running == [False, False, True, True, True, False, False, False, True]
@@ -545,7 +643,10 @@ def test_desaturation_starts_and_stops_at_different_thresholds():
 
 def test_the_desaturation_torque_opposes_the_momentum_over_its_time():
     np.testing.assert_allclose(
-        Desaturator(PART).torque(np.array([4.0, -8.0, 0])), [-0.5, 1, 0], rtol=1e-15, atol=0
+        MomentumDump(fans(), 1.0, PART).torque(np.array([4.0, -8.0, 0])),
+        [-0.5, 1, 0],
+        rtol=1e-15,
+        atol=0,
     )
 
 
@@ -553,21 +654,21 @@ def test_the_desaturation_torque_opposes_the_momentum_over_its_time():
 def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     """h falls as exp(-t / 8 s), from 1.5 to 0.2 N m s in 8 ln 7.5 = 16.1 s, and the body comes to rest where it was."""
     set_ = wheels(3)
-    fan = Desaturator(PART)
+    fan = MomentumDump(fans(), 1.0, PART)
     blow = fans(limit_n=1.0)
     body = Body.start(
-        np.eye(3), np.eye(3), set_.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL
+        np.eye(3), np.eye(3), set_.hinges.inertia_kg_m2, np.zeros(3), [50.0, -50, 25], STILL
     )
     period = 0.1
     stored = []
     turned = []
     fanned = []
     for _ in range(300):
-        held = set_.momentum(body.speed)
+        held = wheel_momentum(set_, body.speed)
         outside = blow.torque(blow.drive(fan.torque(held)))
         feedback = -BUS @ (4 * body.turn + 3.2 * body.rate) + np.cross(body.rate, body.whole)
         body = body.move(
-            period, motor=set_.drive(feedback, body.speed, period), outside=outside
+            period, motor=driven_wheels(set_, feedback, body.speed, period), outside=outside
         )
         stored.append(float(np.linalg.norm(held)))
         turned.append(float(np.linalg.norm(body.turn)))
@@ -590,5 +691,5 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
 
 def test_rotors_that_are_not_across_their_gimbals_are_refused_in_one_line() -> None:
     with pytest.raises(InputError, match=r"rotor axes: .*at right angles") as caught:
-        CmgSet(np.eye(3), np.eye(3), np.ones(3), 1.0)
+        cmg_set(np.eye(3), np.eye(3), np.ones(3), 1.0)
     assert "\n" not in str(caught.value)

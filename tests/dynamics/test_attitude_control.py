@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
 from skysim.core.types import Floats
-from skysim.dynamics.attitude_control import Pid, build_controller
+from skysim.dynamics.attitude_control import Pid
 from skysim.dynamics.guidance import Reference, plan
 from skysim.scene import loader
 from skysim.scene.sections.motion import ControlConfig, MotionConfig
 from skysim.simulation.flight import simulate_motion
 
 INERTIA = np.array([6.0, 6.5, 9.0])
+ABOUT_AXES = np.diag(INERTIA)
 AXES = Rotation.from_rotvec([0.2, -0.4, 0.3]).as_matrix()
 TENSOR = (
     AXES @ np.diag(INERTIA) @ AXES.T
@@ -35,9 +36,9 @@ def planned(*elements: object) -> Reference:
     return plan(MotionConfig.model_validate({"control": "pid", "maneuver": elements}))
 
 
-def holding(inertia: Floats = INERTIA, **part: object) -> Pid:
+def holding(inertia: Floats = ABOUT_AXES, **part: object) -> Pid:
     """A controller that holds the attitude (0, 0, 0)."""
-    return build_controller(planned(), inertia, ControlConfig.model_validate(part))
+    return Pid(planned(), inertia, ControlConfig.model_validate(part))
 
 
 def closed(
@@ -160,7 +161,7 @@ def test_the_feed_forward_torque_satisfies_eulers_equation() -> None:
     """On the reference itself the torque is J a + w x (J w + h), of a full inertia tensor and of stored momentum."""
     tour = planned(SLEW)
     lab_from_ref, rate, acceleration = tour.state_at(1.3)
-    torque = build_controller(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
+    torque = Pid(tour, TENSOR).torque_nm(1.3, lab_from_ref, rate, STORED)
     expected = TENSOR @ acceleration + np.cross(rate, TENSOR @ rate + STORED)
     np.testing.assert_allclose(torque, expected, rtol=0, atol=1e-14)
     assert np.abs(np.cross(rate, STORED)).max() > 0.1  # which is not nothing
@@ -171,7 +172,7 @@ def test_a_rigid_body_follows_the_reference_throughout_a_slew() -> None:
     """By feed-forward alone: no error arises that feedback would have to correct."""
     tour = planned(SLEW)
     t_s = np.linspace(0.5, tour.duration_s + 1, 15)
-    there, _ = closed(build_controller(tour, TENSOR), Rotation.identity(), NONE, t_s)
+    there, _ = closed(Pid(tour, TENSOR), Rotation.identity(), NONE, t_s)
     error = (tour.attitudes(t_s).inv() * there).as_rotvec()
     np.testing.assert_allclose(error, np.zeros((15, 3)), rtol=0, atol=1e-8)
 
@@ -223,9 +224,7 @@ def test_a_large_error_commands_at_most_a_rate_that_can_be_braked(
 ) -> None:
     """A radian off and at rest, kd J w_most; at that rate towards the reference, nothing: w = min(limit, sqrt(a e))."""
     config = ControlConfig.model_validate(PLACED)
-    law = build_controller(
-        planned(), INERTIA, config, authority_nm=0.9, rate_limit_rad_s=fastest
-    )
+    law = Pid(planned(), ABOUT_AXES, config, authority_nm=0.9, rate_limit_rad_s=fastest)
     here = quaternion.from_rotation(Rotation.from_rotvec([0, 0, 1.0]))
     torque = law.torque_nm(0.0, here, NONE, NONE)
     np.testing.assert_allclose(

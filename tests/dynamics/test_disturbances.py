@@ -44,9 +44,7 @@ def flown(duration_s: float, **changes: str) -> Flight:
 def room(
     config: DisturbancesConfig = QUIET, earth: Floats = NONE, knocks: tuple[Impulse, ...] = ()
 ) -> DisturbanceModel:
-    return DisturbanceModel.from_config(
-        config, earth, knocks, TENSOR, 0.01, np.random.default_rng(1)
-    )
+    return DisturbanceModel(config, earth, knocks, TENSOR, 0.01, np.random.default_rng(1))
 
 
 # --- the air ------------------------------------------------------------------------------------------------

@@ -526,10 +526,10 @@ def test_bumps_knock_at_their_times_and_a_caught_one_leaves_no_impulse() -> None
 def test_vibration_lasts_as_long_as_its_element() -> None:
     motion = motion_config(HOLD, SHAKE, turn_to(3, -4, 176), SHAKE | {"duration": "1 s"})
     rng = np.random.default_rng(1)
-    first, second = Vibration.draw(motion, rng).components
+    first, second = Vibration(motion, rng).components
     assert (first.begin_s, first.end_s) == (2.0, 5.0)
     assert first.sines.omega_rad_s[0] == pytest.approx(2 * np.pi * 30)
     assert (second.begin_s, second.end_s) == pytest.approx(
         (plan(motion).start_s[3], plan(motion).duration_s), abs=1e-12
     )
-    assert Vibration.draw(motion_config(HOLD, BUMP), rng).components == ()
+    assert Vibration(motion_config(HOLD, BUMP), rng).components == ()

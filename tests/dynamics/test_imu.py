@@ -22,9 +22,9 @@ from skysim.dynamics.imu import (
     Imu,
     Increments,
     Navigator,
+    Triad,
     earth_rate_lab_rad_s,
     ideal_increments,
-    response_matrix,
     tilt_rad,
 )
 from skysim.scene.sections.vehicle import ImuConfig, SiteConfig
@@ -83,7 +83,7 @@ def part(
 
 
 def unit(gyro: dict[str, Any] | None = None, seed: int = 200, draws: int = 1) -> Imu:
-    return Imu.from_config(part(gyro, seed=seed), np.random.default_rng(draws))
+    return Imu(part(gyro, seed=seed), np.random.default_rng(draws))
 
 
 def samples(
@@ -430,7 +430,7 @@ def test_one_knot_is_refused_and_no_samples_give_an_empty_result() -> None:
 def test_without_errors_the_imu_is_exact() -> None:
     """Zero parameters leave every bit."""
     ideal = CONE.felt(np.arange(0, 1.0005, 1e-3), np.arange(1, 401) * STEP, EARTH)
-    got = Imu.from_config(part(), np.random.default_rng(1)).measure(ideal)
+    got = Imu(part(), np.random.default_rng(1)).measure(ideal)
     np.testing.assert_array_equal(got.angle_rad, ideal.angle_rad)
     np.testing.assert_array_equal(got.velocity_m_s, ideal.velocity_m_s)
     np.testing.assert_array_equal(got.t_s, ideal.t_s)
@@ -440,8 +440,8 @@ def test_without_errors_the_imu_is_exact() -> None:
 @pytest.mark.parametrize("pieces", [1, 3, 400])
 def test_measuring_in_pieces_equals_measuring_at_once(pieces: int) -> None:
     ideal = CONE.felt(np.arange(0, 3.0005, 1e-3), np.arange(1, 1201) * STEP, EARTH)
-    whole = Imu.from_config(ImuConfig(), np.random.default_rng(5)).measure(ideal)
-    again = Imu.from_config(ImuConfig(), np.random.default_rng(5))
+    whole = Imu(ImuConfig(), np.random.default_rng(5)).measure(ideal)
+    again = Imu(ImuConfig(), np.random.default_rng(5))
     got = [
         again.measure(
             replace(
@@ -496,8 +496,7 @@ def test_a_further_error_does_not_change_the_noise() -> None:
 def test_turn_on_errors_of_units_scatter_as_declared() -> None:
     """2000 units: a standard deviation is sure to 1/sqrt(2 n), a mean to sigma/sqrt(n); 4 sigma of each."""
     many = [
-        Imu.from_config(ImuConfig(hardware_seed=seed), np.random.default_rng(0))
-        for seed in range(2000)
+        Imu(ImuConfig(hardware_seed=seed), np.random.default_rng(0)) for seed in range(2000)
     ]
     turn_on = np.array([one.gyro.turn_on_bias for one in many]) / DEG_H
     axes = np.array([one.gyro.matrix for one in many]) - np.eye(3)
@@ -516,7 +515,9 @@ def test_turn_on_errors_of_units_scatter_as_declared() -> None:
 
 def test_scale_errors_are_on_the_diagonal_and_misalignments_off_it() -> None:
     normal = np.random.default_rng(4).normal(size=(3, 3))
-    errors = response_matrix(500.0, 30.0, normal) - np.eye(3)
+    config = part({"scale_ppm": 500, "misalignment_arcsec": 30}).gyro
+    draws = np.vstack([np.zeros(3), normal])
+    errors = Triad(config, draws, np.zeros(3)).matrix - np.eye(3)
     np.testing.assert_allclose(np.diag(errors), 500e-6 * np.diag(normal), rtol=1e-9)
     off = ~np.eye(3, dtype=bool)
     np.testing.assert_allclose(errors[off], 30 * ARCSEC * normal[off], rtol=1e-12)
@@ -557,7 +558,7 @@ def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
         "bias_time": "1e15 s",
         "scale_ppm": 300,
     }
-    one = Imu.from_config(part(None, settings), np.random.default_rng(3))
+    one = Imu(part(None, settings), np.random.default_rng(3))
     ideal = still(Rotation.identity(), 60.0, STEP, np.zeros(3))
     got = one.measure(ideal)
     np.testing.assert_array_equal(got.angle_rad, ideal.angle_rad)
@@ -600,7 +601,7 @@ def test_gyros_and_accelerometers_have_separate_limits() -> None:
     below = unit({"rate_limit_deg_s": 10}).measure(steady(np.radians([9.99, -9.99, 0]), 5))
     assert not below.saturated.any()
     push = np.array([[0, 0, 0.5 * G], [0, 0, 3 * G], [0, -3 * G, 0]]) * STEP
-    got = Imu.from_config(part(None, {"limit_g": 2}), np.random.default_rng(1)).measure(
+    got = Imu(part(None, {"limit_g": 2}), np.random.default_rng(1)).measure(
         samples(0 * push, push)
     )
     np.testing.assert_array_equal(got.overloaded, [False, True, True])
@@ -638,7 +639,7 @@ def test_white_noise_has_the_declared_random_walk() -> None:
     for step_s in (2.5e-3, 0.1):
         settings = part({"arw_deg_sqrt_h": 0.07}, {"vrw_ug_sqrt_hz": 50})
         run = steady([0, 0, 0], 100_000, step_s)
-        got = Imu.from_config(settings, np.random.default_rng(7)).measure(run)
+        got = Imu(settings, np.random.default_rng(7)).measure(run)
         rate_deg_h = got.angle_rad / step_s / DEG_H
         force_ug = got.velocity_m_s / step_s / G * 1e6
         np.testing.assert_allclose(rate_deg_h.std(), 0.07 * 60 / np.sqrt(step_s), rtol=6e-3)
@@ -717,7 +718,7 @@ def test_allan_deviation_of_an_ln200_is_its_random_walk_at_one_second() -> None:
     """
     gyro = ImuConfig().gyro
     angle = (
-        Imu.from_config(ImuConfig(), np.random.default_rng(11))
+        Imu(ImuConfig(), np.random.default_rng(11))
         .measure(steady([0, 0, 0], 1_000_000))
         .angle_rad
         / DEG_H
@@ -752,7 +753,7 @@ def test_the_allan_deviation_of_a_long_run_at_400_hz_follows_theory() -> None:
 
     The scatter at 567 s is 1 / sqrt(2 * 3 * 1066) = 1.25 %.
     """
-    one = Imu.from_config(ImuConfig(), np.random.default_rng(13))
+    one = Imu(ImuConfig(), np.random.default_rng(13))
     seconds = []
     run = steady([0, 0, 0], 400_000)
     for _ in range(605):

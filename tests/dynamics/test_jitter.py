@@ -58,7 +58,7 @@ def turning(
 
 def shake(calm: Trajectory, parts: tuple, rng: np.random.Generator) -> Trajectory:
     """The trajectory with a vibration that is always active."""
-    return Vibration.draw(MotionConfig(jitter=parts), rng).add_to(calm)
+    return Vibration(MotionConfig(jitter=parts), rng).add_to(calm)
 
 
 def shaken_by(calm: Trajectory, shaken: Trajectory, t_s: np.ndarray) -> np.ndarray:
@@ -269,7 +269,7 @@ NOISE = [{"kind": "band", "from_hz": 5, "to_hz": 60, "rms_arcsec": RMS}]
 def test_a_vibration_interval_has_its_rms_between_rise_and_fall() -> None:
     """Four seconds from 1 s: a rise of 0.4 s, then 128 whole periods of 40 Hz."""
     calm = turning(6.0, samples=601)
-    shaken = Vibration.draw(shaking(4.0), np.random.default_rng(13)).add_to(calm)
+    shaken = Vibration(shaking(4.0), np.random.default_rng(13)).add_to(calm)
     phi = shaken_by(calm, shaken, 1.4 + np.arange(6400) / 2000)
     np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
     for begin, end in ((1.0, 1.4), (4.6, 5.0)):
@@ -283,7 +283,7 @@ def test_a_vibration_interval_has_its_rms_between_rise_and_fall() -> None:
 
 def test_a_long_vibration_interval_rises_within_a_second() -> None:
     calm = turning(32.0, samples=3201)
-    shaken = Vibration.draw(shaking(30.0), np.random.default_rng(14)).add_to(calm)
+    shaken = Vibration(shaking(30.0), np.random.default_rng(14)).add_to(calm)
     for begin in (2.0, 29.0):
         phi = shaken_by(calm, shaken, begin + np.arange(2000) / 2000)
         np.testing.assert_allclose(np.sqrt(np.mean(phi**2, axis=0)), RMS, rtol=1e-3)
@@ -292,7 +292,7 @@ def test_a_long_vibration_interval_rises_within_a_second() -> None:
 def test_there_is_no_vibration_outside_its_interval() -> None:
     calm = turning(8.0, rate=(0.1, 0.2, -0.1), samples=801)
     rng = np.random.default_rng(15)
-    vibration = Vibration.draw(shaking(2.0, 3.0), rng)
+    vibration = Vibration(shaking(2.0, 3.0), rng)
     shaken = vibration.add_to(calm)
     t = np.random.default_rng(16).uniform(0, 8, 4000)
     outside = (t < 1) | ((t > 3) & (t < 4)) | (t > 7)
@@ -310,7 +310,7 @@ def test_there_is_no_vibration_outside_its_interval() -> None:
 
 
 def test_two_intervals_of_the_same_vibration_have_independent_phases() -> None:
-    vibration = Vibration.draw(shaking(2.0, 2.0), np.random.default_rng(17))
+    vibration = Vibration(shaking(2.0, 2.0), np.random.default_rng(17))
     t = np.linspace(1.5, 2.5, 1000, endpoint=False)
     # 120 periods later
     first = vibration.evaluate(t)[0]
@@ -325,9 +325,7 @@ def test_the_vibration_within_its_interval_has_its_stated_derivative(
     always: list[object],
 ) -> None:
     """The envelope's own slope included: central differences of phi over the rise, the middle and the fall."""
-    vibration = Vibration.draw(
-        shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18)
-    )
+    vibration = Vibration(shaking(2.0, parts=LOUD, always=always), np.random.default_rng(18))
     h = 1e-6
     t = np.sort(np.random.default_rng(19).uniform(0.9, 3.1, 3000))
     before = vibration.evaluate(t - h)[0]
@@ -341,7 +339,7 @@ def test_the_vibration_within_its_interval_has_its_stated_derivative(
 def test_the_rate_with_vibration_is_the_derivative_of_the_attitude() -> None:
     """At its samples by central differences of lab_from_body exp(phi); between them it follows that too."""
     calm = turning(4.0, rate=(0.2, -0.1, 0.25), samples=4001)
-    vibration = Vibration.draw(shaking(2.0, parts=LOUD), np.random.default_rng(20))
+    vibration = Vibration(shaking(2.0, parts=LOUD), np.random.default_rng(20))
     shaken = vibration.add_to(calm)
     h = 1e-6
     at = shaken.t_s[(shaken.t_s > 0.9) & (shaken.t_s < 3.1)][::7]
@@ -363,7 +361,7 @@ def test_a_short_vibration_interval_is_sampled_for_its_envelope() -> None:
     """A tenth of a period of 0.5 Hz: only the rise and fall, 10 ms each, set the samples."""
     calm = turning(2.2, samples=3)
     slow = [{"kind": "line", "frequency_hz": 0.5, "rms_arcsec": RMS}]
-    vibration = Vibration.draw(shaking(0.1, parts=slow), np.random.default_rng(22))
+    vibration = Vibration(shaking(0.1, parts=slow), np.random.default_rng(22))
     shaken = vibration.add_to(calm)
     t = np.linspace(0.95, 1.15, 4000)
     wanted = vibration.evaluate(t)[0] / ARCSEC
@@ -378,7 +376,7 @@ def test_a_flight_in_pieces_has_the_jitter_of_the_whole() -> None:
     t = np.arange(0, 3.0 + 5e-4, 1e-3)
     rate = np.outer(1 + t, [0.1, 0.0, 0.2])
     angle = np.outer(t + t**2 / 2, [0.1, 0.0, 0.2])
-    vibration = Vibration.draw(
+    vibration = Vibration(
         shaking(1.0, parts=NOISE + LOUD, always=NOISE), np.random.default_rng(23)
     )
     whole = vibration.add_to(Trajectory(t, Rotation.from_rotvec(angle), rate))
@@ -401,17 +399,15 @@ def test_a_flight_in_pieces_has_the_jitter_of_the_whole() -> None:
 
 
 def test_a_piece_without_vibration_is_unchanged() -> None:
-    vibration = Vibration.draw(shaking(1.0), np.random.default_rng(25))
+    vibration = Vibration(shaking(1.0), np.random.default_rng(25))
     piece = turning(0.9)
     assert vibration.add_to(piece) is piece
-    assert Vibration.draw(MotionConfig(), np.random.default_rng(25)).components == ()
+    assert Vibration(MotionConfig(), np.random.default_rng(25)).components == ()
 
 
 def test_too_many_samples_of_a_vibration_are_refused_with_its_time() -> None:
     fast = [{"kind": "line", "frequency_hz": 1e6, "rms_arcsec": RMS}]
-    vibration = Vibration.draw(
-        shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26)
-    )
+    vibration = Vibration(shaking(1.0, parts=fast, always=NOISE), np.random.default_rng(26))
     flight = turning(3.0, samples=3001)
     with pytest.raises(
         InputError,

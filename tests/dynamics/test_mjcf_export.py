@@ -564,7 +564,7 @@ def test_the_shapes_of_a_laboratory_are_the_file_s_without_its_lights() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", (30.0, -5.0, 10.0), degrees=True)
     text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
-    lab = multibody.laboratory(text)
+    lab = multibody.Laboratory(text)
     (model, data) = loaded(text)
     by_name = {shape.name: shape for shape in lab.shapes}
     assert {"stage_floor", "stage_column", "stage_rim_inside", "stage_field"} < set(by_name)

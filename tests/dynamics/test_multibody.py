@@ -20,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics import multibody
-from skysim.dynamics.attitude_control import build_controller
+from skysim.dynamics.attitude_control import Pid
 from skysim.dynamics.guidance import plan, start_attitude
 from skysim.scene.sections.motion import MotionConfig
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -387,7 +387,7 @@ def test_pid_flies_the_afit_maneuver() -> None:
     motion = MotionConfig.model_validate(given["motion"])
     flown = multibody.build(VehicleConfig.model_validate(given["vehicle"]))
     reference = plan(motion)
-    law = build_controller(reference, flown.inertia_kg_m2)
+    law = Pid(reference, flown.inertia_kg_m2)
 
     def steer(t_s: float, here: Rotation, rate_rad_s: Floats) -> Floats:
         wanted = law.torque_nm(t_s, quaternion.from_rotation(here), rate_rad_s, STILL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -222,7 +223,9 @@ def test_a_box_hides_what_is_beyond_its_face_and_within_its_edges() -> None:
     box = '<geom type="box" size="0.1 0.1 0.1" pos="0.1 0 2.2"/>'
     mjcf = f'<mujoco><worldbody>{box}<body name="bus" mocap="true"/></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(mjcf)
-    obstacles = multibody.Obstacles(model, mujoco.MjData(model), np.array([0.1, 0.0, 0.2]))
+    obstacles: Any = SimpleNamespace(
+        model=model, data=mujoco.MjData(model), camera_body_m=np.array([0.1, 0.0, 0.2])
+    )
     # Depths beyond the pupil; the box is from 1.9 to 2.1 m.
     led_z_m = 0.2 + np.array([0.5, 1.9 - 1e-6, 1.9 + 1e-6, 3.0, 1e3, -1.9, -3.0])
     leds = [[0.1, 0.0, z, 1.0] for z in led_z_m]
@@ -246,14 +249,14 @@ def test_occlusion_uses_the_gimbals_initial_angles() -> None:
     given = loader.load("simsat_cmg", {"vehicle.cmgs.start_deg": "[10, 25, -30, 70]"})
     vehicle = multibody.build(given.vehicle)
     flown = Simulation(vehicle, Rotation.identity(), np.zeros(3), 0.1).data
-    things = multibody.build_obstacles(vehicle)
+    things = multibody.Obstacles(vehicle)
 
     def placed(data: Any) -> Floats:
         pose = np.hstack([data.geom_xpos, np.abs(data.geom_xmat)])
         return pose[np.lexsort(np.round(pose, 9).T)]
 
     np.testing.assert_allclose(placed(things.data), placed(flown), rtol=0, atol=1e-9)
-    level = multibody.build_obstacles(multibody.build(loader.load("simsat_cmg").vehicle))
+    level = multibody.Obstacles(multibody.build(loader.load("simsat_cmg").vehicle))
     assert np.abs(placed(things.data) - placed(level.data)).max() > 0.1
 
 

@@ -17,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.dynamics.guidance import plan, profile_start
 from skysim.dynamics.profile_samples import MAX_SAMPLES, Samples, check_samples
 from skysim.dynamics.profiles import read_profile
-from skysim.dynamics.reference_curves import fit_spline
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.results.files import run_export
 from skysim.scene.sections.motion import MotionConfig, ProfileConfig
 from skysim.sources.stars import cam_from_icrs
@@ -51,7 +51,7 @@ def attitudes(spline, t_s: np.ndarray) -> Rotation:
 
 @pytest.mark.compiles
 def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
-    spline = fit_spline(sampled())
+    spline = AttitudeSpline(sampled())
     assert angle(attitudes(spline, TIMES), tumble(TIMES)).max() < 1e-14
     between = np.linspace(-0.1, 6.2, 200)
     np.testing.assert_allclose(
@@ -62,7 +62,7 @@ def test_the_spline_goes_through_its_samples_with_a_unit_quaternion() -> None:
 @pytest.mark.compiles
 def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
     """Central differences within the steps, the continued ends included: off by their own h^2 and by rounding / h."""
-    spline = fit_spline(sampled())
+    spline = AttitudeSpline(sampled())
     h = 1e-4
     t = np.concatenate([TIMES[:-1] + 0.037, [-0.05, 6.05]])
     _, rate, acceleration = spline.states_at(t)
@@ -79,7 +79,7 @@ def test_rate_and_acceleration_are_the_derivatives_of_the_attitude() -> None:
 
 @pytest.mark.compiles
 def test_rate_and_acceleration_are_continuous_at_every_sample() -> None:
-    spline = fit_spline(sampled())
+    spline = AttitudeSpline(sampled())
     eps = 1e-9
     before = spline.states_at(TIMES[1:-1] - eps)
     after = spline.states_at(TIMES[1:-1] + eps)
@@ -98,7 +98,8 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
     errors = []
     for step_s in (0.1, 0.05):
         error = angle(
-            attitudes(fit_spline(sampled(np.arange(0, 6 + step_s / 2, step_s))), t), tumble(t)
+            attitudes(AttitudeSpline(sampled(np.arange(0, 6 + step_s / 2, step_s))), t),
+            tumble(t),
         )
         errors.append([error.max(), error[ends].max()])
     assert np.array(errors[0]) / errors[1] == pytest.approx([16, 16], rel=0.2)
@@ -108,13 +109,13 @@ def test_the_error_is_of_fourth_order_up_to_both_ends() -> None:
 def test_the_spline_beats_that_of_rotation_vectors_at_the_ends() -> None:
     """SciPy's RotationSpline is clamped to the mean rate of the outer steps."""
     t = np.linspace(0, 6, 4001)
-    ours = angle(attitudes(fit_spline(sampled()), t), tumble(t)).max()
+    ours = angle(attitudes(AttitudeSpline(sampled()), t), tumble(t)).max()
     theirs = angle(RotationSpline(TIMES, tumble(TIMES))(t), tumble(t)).max()
     assert ours < 0.01 * theirs
     middle = (t > 2) & (t < 4)
     np.testing.assert_allclose(
         angle(
-            attitudes(fit_spline(sampled()), t[middle]),
+            attitudes(AttitudeSpline(sampled()), t[middle]),
             RotationSpline(TIMES, tumble(TIMES))(t[middle]),
         ),
         0,
@@ -128,9 +129,9 @@ def test_a_quaternion_and_its_negative_are_the_same_attitude() -> None:
     columns = {"t_s": TIMES} | {
         f"lab_from_body_q{end}": flipped[:, n] for n, end in enumerate("xyzw")
     }
-    spline = fit_spline(read_profile(columns, START))
+    spline = AttitudeSpline(read_profile(columns, START))
     t = np.linspace(0, 6, 500)
-    assert angle(attitudes(spline, t), attitudes(fit_spline(sampled()), t)).max() < 1e-14
+    assert angle(attitudes(spline, t), attitudes(AttitudeSpline(sampled()), t)).max() < 1e-14
 
 
 def test_at_a_constant_rate_the_error_falls_with_the_fifth_power_of_the_step() -> None:
@@ -140,7 +141,7 @@ def test_at_a_constant_rate_the_error_falls_with_the_fifth_power_of_the_step() -
         rate = np.radians(step_deg) * np.array([0.6, 0, 0.8])
         t = np.arange(0.0, 20.0)
         spin = Rotation.from_rotvec(np.outer(t, rate))
-        spline = fit_spline(
+        spline = AttitudeSpline(
             check_samples(Samples("it", "row", np.arange(20), t, "lab", "body", spin))
         )
         between = np.linspace(0, 19, 4001)
@@ -959,8 +960,8 @@ def test_a_profile_counts_from_its_maneuver_or_from_the_scene() -> None:
     """After a hold of 2 s: t_s = 0 then, but epochs stay where they are."""
     from dataclasses import replace
 
-    relative = fit_spline(sampled())
-    absolute = replace(relative, absolute=True)
+    relative = AttitudeSpline(sampled())
+    absolute = AttitudeSpline(replace(sampled(), absolute=True))
     here = tumble(np.array([0.0]))[0]
     late = tumble(np.array([2.0]))[0]
     for spline, start, zero_s in ((relative, here, 2.0), (absolute, late, 0.0)):
@@ -974,7 +975,7 @@ def test_a_profile_counts_from_its_maneuver_or_from_the_scene() -> None:
 
 
 def test_after_its_end_a_profile_continues_at_its_last_rate() -> None:
-    spline = fit_spline(sampled())
+    spline = AttitudeSpline(sampled())
     motion = following().model_copy(update={"start": "profile"})
     reference = plan(motion, None, (spline,))
     attitude_at_end, rate, _ = spline.state_at(6.0)
@@ -988,13 +989,13 @@ def test_after_its_end_a_profile_continues_at_its_last_rate() -> None:
 
 
 def test_a_profile_that_does_not_start_where_the_previous_element_ends_is_refused() -> None:
-    spline = fit_spline(sampled())
+    spline = AttitudeSpline(sampled())
     with pytest.raises(
         InputError,
         match=r"motion.maneuver: it: begins \S+ deg and \S+ deg/s away .* motion.start: pro",
     ):
         plan(following(), Rotation.identity(), (spline,))
-    late = fit_spline(sampled(TIMES + 3.0))
+    late = AttitudeSpline(sampled(TIMES + 3.0))
     with pytest.raises(
         InputError,
         match=r"attitudes from 3 s to 9 s after .* allowed: from 0.1 s \(a step\) at most",
@@ -1003,12 +1004,12 @@ def test_a_profile_that_does_not_start_where_the_previous_element_ends_is_refuse
     first = following(begin="first_sample").model_copy(update={"start": "profile"})
     assert plan(first, None, (late,)).duration_s == pytest.approx(6.0, abs=1e-12)
     with pytest.raises(InputError, match="attitudes from -9 s to -3 s after"):
-        plan(following(), tumble(np.array([3.0]))[0], (fit_spline(sampled(TIMES - 9.0)),))
+        plan(following(), tumble(np.array([3.0]))[0], (AttitudeSpline(sampled(TIMES - 9.0)),))
 
 
 def test_the_vehicle_starts_at_the_first_profile_s_attitude() -> None:
-    first = fit_spline(sampled(TIMES + 3.0))
-    second = fit_spline(sampled(TIMES + 20.0))
+    first = AttitudeSpline(sampled(TIMES + 3.0))
+    second = AttitudeSpline(sampled(TIMES + 20.0))
     motion = following(begin="first_sample").model_copy(update={"start": "profile"})
     start_wxyz, _, _ = profile_start(motion, (first, second))
     assert (
@@ -1023,7 +1024,7 @@ def test_the_spline_matches_scipy(tmp_path: Path) -> None:
     t = np.linspace(0, 6, 700)
     p = cubic(t)
     np.testing.assert_allclose(
-        fit_spline(sampled()).states_at(t)[0],
+        AttitudeSpline(sampled()).states_at(t)[0],
         p / np.linalg.norm(p, axis=1)[:, None],
         rtol=0,
         atol=1e-14,

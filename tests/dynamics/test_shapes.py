@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.dynamics.multibody.scene_shapes import laboratory
+from skysim.dynamics.multibody.scene_shapes import Laboratory
 
 # The tetrahedron is neither centered nor turned as its principal axes are.
 POINTS = np.array([[0.1, 0.2, 0], [0.6, 0.2, 0.1], [0.1, 0.5, 0], [0.2, 0.2, 0.7]])
@@ -23,7 +23,7 @@ PARTS = f"""<mujoco>
 
 
 def test_shapes_have_the_kinds_and_sizes_of_the_file() -> None:
-    floor, box, sphere, cylinder, capsule, ellipsoid, mesh = laboratory(PARTS).shapes
+    floor, box, sphere, cylinder, capsule, ellipsoid, mesh = Laboratory(PARTS).shapes
     kinds = [shape.kind for shape in (floor, box, sphere, cylinder, capsule, ellipsoid, mesh)]
     assert kinds == ["plane", "box", "sphere", "cylinder", "capsule", "ellipsoid", "mesh"]
     assert box.size_m == (0.3, 0.2, 0.1)
@@ -40,7 +40,7 @@ def test_shapes_have_the_kinds_and_sizes_of_the_file() -> None:
 
 
 def test_shapes_are_where_the_file_puts_them() -> None:
-    lab = laboratory(PARTS)
+    lab = Laboratory(PARTS)
     _, _, sphere, cylinder, *_ = lab.shapes
     np.testing.assert_allclose(sphere.position_m, [0, 0, 0.7], atol=1e-12)
     np.testing.assert_allclose(cylinder.position_m, [0.1, 0, 0.5], atol=1e-12)
@@ -52,7 +52,7 @@ def test_shapes_are_where_the_file_puts_them() -> None:
 
 
 def test_a_mesh_has_its_vertices_in_its_own_axes() -> None:
-    mesh = laboratory(PARTS).shapes[-1]
+    mesh = Laboratory(PARTS).shapes[-1]
     turn = Rotation.from_euler("XYZ", [10, 20, 30], degrees=True)
     expected = np.array([0, 0.1, 0.5]) + turn.apply(POINTS)
     rotation = Rotation.from_quat(mesh.parent_from_shape_wxyz, scalar_first=True)

@@ -47,7 +47,7 @@ def ship(**thrusters: str) -> multibody.VehicleModel:
 
 def valves(**thrusters: str) -> tuple[multibody.VehicleModel, ValveDrive]:
     vehicle = ship(**thrusters)
-    (drive,) = build_drives(vehicle.config, vehicle.model)
+    (drive,) = build_drives(vehicle.config, vehicle)
     assert isinstance(drive, ValveDrive)
     return vehicle, drive
 
@@ -69,7 +69,7 @@ def inputs() -> ControlInput:
 
 def computer(**thrusters: str) -> tuple[multibody.VehicleModel, ThrusterActuator]:
     vehicle = ship(**thrusters)
-    found = build_actuators(vehicle.config, vehicle.model)["thrusters"]
+    found = build_actuators(vehicle.config, vehicle)["thrusters"]
     assert isinstance(found, ThrusterActuator)
     return vehicle, found
 

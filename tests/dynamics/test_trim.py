@@ -126,7 +126,7 @@ def driven(
     flying: multibody.VehicleModel, wanted_m: list[float], seconds: float, start: Rotation
 ) -> tuple[multibody.Simulation, np.ndarray]:
     """A flight with the displacements commanded from its start on, and the (K, 3) positions of the motors."""
-    (drive,) = build_drives(flying.config, flying.model)
+    (drive,) = build_drives(flying.config, flying)
     flight = multibody.Simulation(flying, start, np.zeros(3), seconds)
     motors = [flying.model.actuator(name).id for name in flying.trims.names]
     positions = []
@@ -177,7 +177,7 @@ def test_a_displaced_mass_tilts_the_table_by_its_weight_times_its_lever() -> Non
 def test_displacements_give_the_horizontal_part_of_a_torque() -> None:
     """T = m d a x g, of 0.2 kg each: on a level table x turns about +y, y about -x, and z about nothing."""
     table = vehicle(trims={"speed_limit": "1 m/s", "travel": "50 mm"})
-    actuator = build_actuators(table.config, table.model)["trims"]
+    actuator = build_actuators(table.config, table)["trims"]
     control = np.zeros(table.model.nu)
     level = ControlInput(0.0, 0.1, np.zeros(3), table.model.qpos0, np.zeros(table.model.nv))
     achieved = actuator.allocate(control, np.array([0.01, 0.02, 0.5]), level)

@@ -28,7 +28,7 @@ from skysim.dynamics.controllers import torque_of_reply
 from skysim.dynamics.multibody import mjcf
 from skysim.dynamics.profile_samples import check_samples
 from skysim.dynamics.profiles import read_profile
-from skysim.dynamics.reference_curves import fit_spline
+from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.experiments.characterize.frame_files import read_settings
 from skysim.experiments.dome_survey import survey_images
 from skysim.experiments.study import study_file as study_loader
@@ -227,7 +227,7 @@ def profiles(data: bytes) -> None:
     path = write_file(data, "profile.csv")
     for rotation in (None, "lab_from_body"):
         rejects(
-            lambda rotation=rotation: fit_spline(
+            lambda rotation=rotation: AttitudeSpline(
                 check_samples(read_profile(path, START, rotation))
             ),
             InputError,

@@ -46,7 +46,7 @@ def test_tetra3rs_solves_our_frames_without_bias(options: str) -> None:
     keys = {"tracker.name": "tetra3rs", "tracker.options": options, "exposure.frames": "12"}
     scene = loader.load("scoreboard", keys | {"motion.rate_deg_s": "[0.6, 0.8, 0]"})
     shots = list(open_flight(scene).shots())
-    rows = [scoring.score(shot).row for shot in shots]
+    rows = [scoring.Score(shot).row for shot in shots]
     assert sum(row.status == "solved" for row in rows) >= 11
     assert not any(row.wrong for row in rows)
     turns = [

@@ -52,7 +52,7 @@ def sky_flight(folder: Path) -> Flight:
     rows = []
     for shot in flight.shots():
         recording.write_frame(folder, shot.frame, shot.truth, scene)
-        rows.append(scoring.score(shot).row)
+        rows.append(scoring.Score(shot).row)
     files.write_table(
         folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene))
     )
@@ -80,13 +80,13 @@ def dome_flight(folder: Path) -> Flight:
 @pytest.fixture(scope="module")
 def stars(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("stars")
-    return sky_flight(folder), recording.open_recording(folder)
+    return sky_flight(folder), recording.Recording(folder)
 
 
 @pytest.fixture(scope="module")
 def dome(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("dome")
-    return dome_flight(folder), recording.open_recording(folder)
+    return dome_flight(folder), recording.Recording(folder)
 
 
 # Attitude
@@ -448,7 +448,7 @@ def test_bad_input_is_refused_in_one_line_and_leaves_no_file(
     with pytest.raises(
         InputError, match="no frames with truth files; allowed: a folder of a run"
     ):
-        recording.open_recording(tmp_path)
+        recording.Recording(tmp_path)
     with pytest.raises(
         InputError,
         match="unknown format 'jpeg'; allowed: aem, ecsv, parquet, tiff, zarr, video",
@@ -470,7 +470,7 @@ def test_a_damaged_frame_leaves_no_half_of_a_sequence(
     last = folder / "frame_0002.fits"
     last.write_bytes(last.read_bytes()[:100_000])
     with pytest.raises(InputError, match=r"frame_0002\.fits: not a complete FITS file"):
-        run_export.export(recording.open_recording(folder), [name], out, quiet)
+        run_export.export(recording.Recording(folder), [name], out, quiet)
     assert list(out.iterdir()) == []
 
 

@@ -6,6 +6,8 @@ import re
 import zlib
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,20 +23,20 @@ from skysim.results.files.gore_pages import (
     pages,
     write_pdf,
 )
-from skysim.results.files.templates import Circle, Dome, Polyline
+from skysim.results.files.templates import Circle, Polyline
 from skysim.sources.dome.surface import Ellipsoid
 
 RADIUS_M = 1.2
 # LEDs near the apex, in the middle and at the rim.
 TILT_RAD = np.radians([3.0, 20.0, 31.0])
 LED_M = RADIUS_M * np.column_stack([np.sin(TILT_RAD), 0 * TILT_RAD, np.cos(TILT_RAD)])
-DOME = Dome(
-    "mine",
-    Ellipsoid(np.zeros(3), np.full(3, RADIUS_M)),
-    32.0,
-    np.array([7, 8, 9]),
-    LED_M,
-    1e-3,
+DOME: Any = SimpleNamespace(
+    name="mine",
+    surface=Ellipsoid(np.zeros(3), np.full(3, RADIUS_M)),
+    cap_deg=32.0,
+    leds=SimpleNamespace(id=np.array([7, 8, 9])),
+    led_m=LED_M,
+    led_radius_m=1e-3,
 )
 POINT_MM = 25.4 / 72
 

@@ -13,8 +13,8 @@ from skysim.core.errors import InputError
 from skysim.results.files.parts import (
     COLUMNS,
     UNITS,
+    DomeDesign,
     PartsList,
-    build_design,
     find_prices,
     parts_list,
     read_prices,
@@ -77,9 +77,9 @@ def test_individually_driven_and_coded_leds_need_driver_channels() -> None:
 @pytest.mark.parametrize("winding", ["latitude", "spiral", "meridian"])
 def test_the_length_of_tape_is_the_sum_of_its_pitches(winding: str) -> None:
     scene = loader.load("afit_simsat", SPHERE | {"light.layout": TAPE % winding})
-    layout = build_design(scene).light.layout
+    layout = DomeDesign(scene).light.layout
     assert isinstance(layout, StringConfig)
-    leds = len(wind(layout, build_design(scene).surface).place_m)
+    leds = len(wind(layout, DomeDesign(scene).surface).place_m)
     found = bought(light__layout=TAPE % winding)
     assert found["tape"] == found["mounting_tape"] == pytest.approx(0.0333 * leds)
     assert "led" not in found

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Trajectory, Truth
 from skysim.results import metrics
-from skysim.results.scoring import score
+from skysim.results.scoring import Score
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import open_flight
@@ -119,7 +119,7 @@ def test_a_vibration_within_the_exposure_is_no_error_of_the_tracker() -> None:
     scored = []
     with open_flight(scene) as flight:
         for shot in flight.shots():
-            one = score(shot)
+            one = Score(shot)
             solution = one.attitude
             assert solution.cam_from_ref is not None
             assert solution.covariance_rad2 is not None

@@ -342,7 +342,7 @@ def test_a_run_exported_and_flown_again_has_the_same_centroids(
     flown = skysim.simulate(scene)
     folder = flown.save(tmp_path)
     run_export.export(
-        recording.open_recording(folder),
+        recording.Recording(folder),
         ["aem"],
         folder,
         lambda items, count, label: iter(items),

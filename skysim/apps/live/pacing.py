@@ -123,9 +123,8 @@ class Live:
             "height": scene.camera.height_px,
             "rate_hz": scene.exposure.rate_hz,
             "actuators": {
-                key: {"motors": len(command_map), "limit": limit}
+                key: {"motors": len(one.motor), "limit": one.limit}
                 for key, one in sets.items()
-                for command_map, limit in [one.command_map()]
             },
             "cam_from_body_xyzw": flight.lab.cameras[0]
             .mount.cam_from_body.as_quat()

@@ -9,8 +9,6 @@ from skysim.dynamics.multibody.model import build as build
 from skysim.dynamics.multibody.model import camera_mount as camera_mount
 from skysim.dynamics.multibody.model import imu_position_m as imu_position_m
 from skysim.dynamics.multibody.occlusion import Obstacles as Obstacles
-from skysim.dynamics.multibody.occlusion import build_obstacles as build_obstacles
 from skysim.dynamics.multibody.occlusion import occluded as occluded
 from skysim.dynamics.multibody.scene_shapes import Laboratory as Laboratory
 from skysim.dynamics.multibody.scene_shapes import Shape as Shape
-from skysim.dynamics.multibody.scene_shapes import laboratory as laboratory

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -42,8 +43,7 @@ class ControlInput(NamedTuple):
 class Actuators:
     """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
 
-    It stores no momentum, its torque is proportional to its commands, and a command beyond the limit is clipped. Kinds
-    override what differs.
+    It stores no momentum, and its torque is proportional to its commands. Kinds override what differs.
 
     Attributes
     ----------
@@ -62,7 +62,14 @@ class Actuators:
 
     def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
         """Write the commands into control; return the torque (3,) that they will give."""
-        return self.command(control, self.command_from_torque @ torque_nm, inputs)
+        return self.command(control, self.drive(torque_nm), inputs)
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        """The smallest commands (n,) that give the torque (3,), or the nearest to it in least squares.
+
+        One factor scales all commands to the limit, which keeps the direction of the torque.
+        """
+        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
@@ -76,10 +83,6 @@ class Actuators:
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) stored angular momentum, in body axes."""
         return np.zeros(3)
-
-    def command_map(self) -> tuple[Floats, float]:
-        """The map from torques to commands, and the limit of a command."""
-        return self.command_from_torque, self.limit
 
 
 class ActuatorDrive(Protocol):
@@ -119,13 +122,13 @@ class ActuatorKind:
     add
         (spec, compiled spec, config): adds its motors to the spec
     control
-        (compiled model, config): returns the set that the flight computer commands
+        (`VehicleModel`, config): returns the set that the flight computer commands
     start
         (model, data, config): sets the initial angles and speeds of its joints in the data
     check
         (spec, path of the file): raises InputError for joints that do not fit together
     drive
-        (compiled model, config): returns the hardware between commands and motors; None without any
+        (`VehicleModel`, config): returns the hardware between commands and motors; None without any
     """
 
     key: str
@@ -156,9 +159,8 @@ def inverse(torque_from_command: Floats) -> Floats:
 UNIT_GEAR = (1, 0, 0, 0, 0, 0)
 
 
-@dataclass(frozen=True, slots=True)
 class Hinges:
-    """Hinge joints of one kind, in the order of their names.
+    """All joints of a compiled model whose name begins with a prefix, in the order of their names.
 
     Attributes
     ----------
@@ -174,38 +176,31 @@ class Hinges:
         (n,) numbers of the actuators; -1 for a joint without one
     """
 
-    names: tuple[str, ...]
-    axes: Floats
-    inertia_kg_m2: Floats
-    qpos: Ints
-    dof: Ints
-    motor: Ints
-
-    @classmethod
-    def from_model(cls, model: Any, prefix: str) -> Hinges:
-        """All joints of a compiled model whose name begins with prefix."""
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
+    def __init__(self, model: Any, prefix: str) -> None:
+        data = at_zero(model)
         # The diagonal of the joint-space inertia matrix is the inertia about each axis.
         full = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(model, data, full)
-        names = sorted(all_names(model.joint, model.njnt, prefix))
-        ids = np.array([model.joint(name).id for name in names], dtype=np.int64)
-        dof = model.jnt_dofadr[ids].astype(np.int64)
+        self.names = tuple(sorted(all_names(model.joint, model.njnt, prefix)))
+        ids = np.array([model.joint(name).id for name in self.names], dtype=np.int64)
+        self.axes = data.xaxis[ids].T.copy()
+        self.qpos = model.jnt_qposadr[ids].astype(np.int64)
+        self.dof = model.jnt_dofadr[ids].astype(np.int64)
+        self.inertia_kg_m2 = full[self.dof, self.dof]
         # A motor has the name of its joint; MuJoCo gives -1 for a name that does not exist.
         kind = mujoco.mjtObj.mjOBJ_ACTUATOR
-        motor = [mujoco.mj_name2id(model, kind, name) for name in names]
-        return cls(
-            tuple(names),
-            data.xaxis[ids].T.copy(),
-            full[dof, dof],
-            model.jnt_qposadr[ids].astype(np.int64),
-            dof,
-            np.array(motor, dtype=np.int64),
-        )
+        motor = [mujoco.mj_name2id(model, kind, name) for name in self.names]
+        self.motor = np.array(motor, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.names)
+
+
+def at_zero(model: Any) -> Any:
+    """Data of a compiled model with all joints at zero, where the axes of the body are those of the lab."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
 
 
 def all_names(element: Any, count: int, prefix: str = "") -> list[str]:
@@ -213,18 +208,10 @@ def all_names(element: Any, count: int, prefix: str = "") -> list[str]:
     return [name for k in range(count) if (name := element(k).name).startswith(prefix)]
 
 
-def joints(spec: Any, prefix: str) -> list[Any]:
-    """The joints of a spec whose name begins with prefix, in the order of their names."""
+def named(elements: Iterable[Any], prefix: str) -> list[Any]:
+    """The joints or sites of a spec whose name begins with prefix, in the order of their names."""
     return sorted(
-        (j for j in spec.joints if j.name.startswith(prefix)), key=lambda joint: joint.name
-    )
-
-
-def sites(spec: Any, prefix: str) -> list[Any]:
-    """The sites of a spec whose name begins with prefix, in the order of their names."""
-    return sorted(
-        (site for site in spec.sites if site.name.startswith(prefix)),
-        key=lambda site: site.name,
+        (one for one in elements if one.name.startswith(prefix)), key=attrgetter("name")
     )
 
 
@@ -253,8 +240,8 @@ def add_servos(spec: Any, model: Any, prefix: str, tau_s: float) -> None:
 
     The inertia of a slide is its mass, and its angle a position.
     """
-    inertias = Hinges.from_model(model, prefix).inertia_kg_m2
-    for joint, inertia in zip(joints(spec, prefix), inertias, strict=True):
+    inertias = Hinges(model, prefix).inertia_kg_m2
+    for joint, inertia in zip(named(spec.joints, prefix), inertias, strict=True):
         servo = spec.add_actuator(
             name=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name
         )

@@ -13,13 +13,13 @@ import mujoco
 import numpy as np
 
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
     ActuatorKind,
     Actuators,
     add_motor,
-    joints,
-    sites,
+    named,
 )
 from skysim.dynamics.multibody.cmgs import CMGS
 from skysim.dynamics.multibody.fans import FANS
@@ -34,24 +34,30 @@ TORQUES = ("torque_x", "torque_y", "torque_z")
 PREFIXES = (*(prefix for kind in KINDS for prefix in (*kind.joints, *kind.sites)), TRIM)
 
 
+class IdealTorques(Actuators):
+    """Ideal torques about the body's axes, each of which is clipped by itself."""
+
+    def drive(self, torque_nm: Floats) -> Floats:
+        return torque_nm
+
+
 def kinds_on(vehicle: VehicleConfig) -> list[tuple[ActuatorKind, Any]]:
     """The kinds that a scene switches on, each with its section."""
     kinds = [(kind, getattr(vehicle, kind.key)) for kind in KINDS]
     return [(kind, config) for kind, config in kinds if config is not None]
 
 
-def build_actuators(vehicle: VehicleConfig, model: Any) -> dict[str, Actuators]:
+def build_actuators(config: VehicleConfig, vehicle: Any) -> dict[str, Actuators]:
     """All actuators that are switched on, by their key in `vehicle`, and `ideal` torques about the body's axes."""
-    motors = np.array([model.actuator(name).id for name in TORQUES])
-    ideal = Actuators(motors, np.eye(3), np.eye(3), vehicle.torque_limit_nm)
+    ideal = IdealTorques(vehicle.torques, np.eye(3), np.eye(3), config.torque_limit_nm)
     return {"ideal": ideal} | {
-        kind.key: kind.control(model, config) for kind, config in kinds_on(vehicle)
+        kind.key: kind.control(vehicle, own) for kind, own in kinds_on(config)
     }
 
 
-def build_drives(vehicle: VehicleConfig, model: Any) -> list[ActuatorDrive]:
+def build_drives(config: VehicleConfig, vehicle: Any) -> list[ActuatorDrive]:
     """The hardware between commands and motors of all actuators that are switched on."""
-    return [kind.drive(model, config) for kind, config in kinds_on(vehicle) if kind.drive]
+    return [kind.drive(vehicle, own) for kind, own in kinds_on(config) if kind.drive]
 
 
 def set_start(vehicle: VehicleConfig, model: Any, data: Any) -> None:
@@ -82,7 +88,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     prefixes_by_key = {kind.key: kind.joints for kind in KINDS} | {trim: (TRIM,)}
     for key, prefixes in prefixes_by_key.items():
         for prefix in prefixes:
-            found = joints(spec, prefix)
+            found = named(spec.joints, prefix)
             if getattr(vehicle, key) is None:
                 locked |= dict.fromkeys((joint.name for joint in found), f"vehicle.{key}")
                 for joint in found:
@@ -93,7 +99,7 @@ def lock_unused(spec: Any, vehicle: VehicleConfig, path: Path) -> dict[str, str]
     for kind, _ in kinds_on(vehicle):
         kind.check(spec, path)
         for prefix in kind.sites:
-            if not sites(spec, prefix):
+            if not named(spec.sites, prefix):
                 raise InputError(path, f"no site {prefix}*, which vehicle.{kind.key} needs")
     # 3. Names of the motors that `add_actuators` adds.
     for actuator in spec.actuators:

@@ -3,7 +3,7 @@
 Frames and signs are those of wheels.py. The steering of each control period:
 
 1. The rotor axles at the gimbal angles, and their derivative (`rotor_axles`).
-2. The Jacobian A of the stored momentum h by the gimbal angles: columns g x h (`CmgSet.jacobian`).
+2. The Jacobian A of the stored momentum h by the gimbal angles: columns g x h (`CmgActuator.jacobian`).
 3. Gimbal rates with A d(angle)/dt = dh/dt = -T, by a steering law of `STEERING`. Variable-speed CMGs also use rotor
    torques (`vscmg_commands`).
 4. One factor scales all commands to their limits, so the torque's direction is kept.
@@ -13,7 +13,6 @@ A is singular if all g x h are in a plane. Then no gimbal rate gives a torque al
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +31,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     add_motor,
     add_servos,
     inverse,
-    joints,
     member_values,
+    named,
     scale_to_limit,
 )
 from skysim.scene.sections.vehicle import CmgsConfig
@@ -160,29 +159,24 @@ def vscmg_commands(
     return rate * scale, torque * scale
 
 
-@dataclass(slots=True)
-class CmgSet:
-    """A set of n control moment gyroscopes: rotating the axle of a spinning rotor gives a torque.
+class CmgActuator(Actuators):
+    """Actuators of the flight computer: n control moment gyroscopes.
+
+    Rotating the axle of a spinning rotor gives a torque,
 
         torque on the body = -d(angle)/dt g x h
 
     g is the gimbal axis and h the rotor's momentum along its axle. The torque that accelerates a gimbal about its
-    own axis is left out.
+    own axis is left out. Variable-speed CMGs have no steering law.
 
     Attributes
     ----------
-    gimbal_axes
-        (3, n) unit vectors g in body axes
-    spin_axes
-        (3, n) unit vectors s of the rotors' axles at gimbal angle zero, at right angles to g
-    rotor_inertia_kg_m2
-        (n,) inertia of each rotor about its axle
-    gimbal_rate_limit_rad_s
-        Greatest gimbal rate
-    rotor_torque_limit_nm
-        Greatest motor torque of variable-speed CMGs; None for rotors that spin freely
-    steering
-        A key of STEERING, which variable-speed CMGs do not use
+    gimbals
+        Gimbals, whose axes are g
+    rotors
+        Rotors, whose axes s are those of the axles at gimbal angle zero, at right angles to g
+    cross_axes
+        (3, n) g x s
 
     Raises
     ------
@@ -190,33 +184,30 @@ class CmgSet:
         If axes are not at right angles.
     """
 
-    gimbal_axes: Floats
-    spin_axes: Floats
-    rotor_inertia_kg_m2: Floats
-    gimbal_rate_limit_rad_s: float
-    rotor_torque_limit_nm: float | None = None
-    steering: str = "singularity_robust"
-    cross_axes: Floats = field(init=False, repr=False)  # (3, n) g x s
-
-    def __post_init__(self) -> None:
-        if np.abs((self.gimbal_axes * self.spin_axes).sum(axis=0)).max() > 1e-6:
+    def __init__(self, vehicle: Any, config: CmgsConfig) -> None:
+        self.gimbals = gimbals = vehicle.gimbals
+        self.rotors = rotors = vehicle.rotors
+        if np.abs((gimbals.axes * rotors.axes).sum(axis=0)).max() > 1e-6:
             raise InputError(
                 "rotor axes", "", "one for each gimbal, at right angles to its axis"
             )
+        self.config = config
         # One memory layout, since numba compiles for each.
-        self.cross_axes = np.ascontiguousarray(
-            np.cross(self.gimbal_axes, self.spin_axes, axis=0)
-        )
+        self.cross_axes = np.ascontiguousarray(np.cross(gimbals.axes, rotors.axes, axis=0))
+        speeds = np.full(len(rotors), config.rotor_rpm * RPM_RAD_S)
+        jacobian = self.jacobian(np.zeros(len(gimbals)), speeds)
+        limit_rad_s = math.radians(config.gimbal_rate_limit_deg_s)
+        super().__init__(gimbals.motor, -jacobian, inverse(-jacobian), limit_rad_s)
 
     def momentum(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of the rotors relative to the body: h = sum axle inertia speed."""
-        axle, _ = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
-        return axle @ (self.rotor_inertia_kg_m2 * rotor_rad_s)
+        axle, _ = rotor_axles(self.rotors.axes, self.cross_axes, angle_rad)
+        return axle @ (self.rotors.inertia_kg_m2 * rotor_rad_s)
 
     def jacobian(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
         """(3, n) Jacobian A: derivative of the momentum by the gimbal angles, with columns g x h."""
-        _, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
-        return derivative * (self.rotor_inertia_kg_m2 * rotor_rad_s)
+        _, derivative = rotor_axles(self.rotors.axes, self.cross_axes, angle_rad)
+        return derivative * (self.rotors.inertia_kg_m2 * rotor_rad_s)
 
     def manipulability(self, angle_rad: Floats, rotor_rad_s: Floats) -> Floats:
         """Distance from singularity (...) at angles and speeds (..., n), between 0 and 1.
@@ -228,8 +219,8 @@ class CmgSet:
         """
         angle = angle_rad[..., None, :]
         spin = rotor_rad_s[..., None, :]
-        cross = self.cross_axes * np.cos(angle) - self.spin_axes * np.sin(angle)
-        jacobian = cross * (self.rotor_inertia_kg_m2 * spin)
+        cross = self.cross_axes * np.cos(angle) - self.rotors.axes * np.sin(angle)
+        jacobian = cross * (self.rotors.inertia_kg_m2 * spin)
         gram = jacobian @ jacobian.swapaxes(-1, -2)
         # det A A^T is greatest for three equal eigenvalues of the same trace.
         largest = (np.trace(gram, axis1=-2, axis2=-1) / 3) ** 3
@@ -237,15 +228,8 @@ class CmgSet:
             np.maximum(np.linalg.det(gram), 0.0) / np.where(largest > 0, largest, 1.0)
         )
 
-    def drive(
-        self,
-        torque_nm: Floats,
-        rate_body_rad_s: Floats,
-        angle_rad: Floats,
-        rotor_rad_s: Floats,
-        t_s: float,
-    ) -> tuple[Floats, Floats]:
-        """Gimbal rates (n,) and motor torques u (n,) on the rotors that give torque_nm (3,) on the body.
+    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
+        """Command gimbal rates (n,) and motor torques u (n,) on the rotors that give torque_nm (3,) on the body.
 
             torque on the body = -A d(angle)/dt - sum axle u
 
@@ -256,69 +240,42 @@ class CmgSet:
         keeps the torque's direction.
         """
         # 1. Axles.
-        axle, derivative = rotor_axles(self.spin_axes, self.cross_axes, angle_rad)
+        angle = inputs.angles_rad[self.gimbals.qpos]
+        axle, derivative = rotor_axles(self.rotors.axes, self.cross_axes, angle)
         # 2. Jacobian. A gimbal rotates the inertial angular momentum, which includes the body's rate along the axle.
-        spin_nms = self.rotor_inertia_kg_m2 * (rotor_rad_s + rate_body_rad_s @ axle)
+        speed = inputs.speeds_rad_s[self.rotors.dof] + inputs.rate_body_rad_s @ axle
+        spin_nms = self.rotors.inertia_kg_m2 * speed
         jacobian = derivative * spin_nms
         # The steering laws take A and dh/dt in units of the rotors' mean momentum.
         unit_nms = float(np.abs(spin_nms).mean())
         # 3. and 4. Steering within the limits. Rotors at rest give no gyroscopic torque.
-        if self.rotor_torque_limit_nm is not None:
-            limits = self.gimbal_rate_limit_rad_s, self.rotor_torque_limit_nm
-            return vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
+        torque_limit_nm = self.config.rotor_torque_limit_nm
+        if torque_limit_nm is not None:
+            limits = self.limit, torque_limit_nm
+            rate, motor = vscmg_commands(axle, jacobian, unit_nms, -torque_nm, *limits)
+            control[self.rotors.motor] = motor
+            # sum axle u is the momentum of speeds u / inertia.
+            given_nm = self.momentum(angle, motor / self.rotors.inertia_kg_m2)
+            return self.command(control, rate, inputs) - given_nm
         rate = np.zeros_like(spin_nms)
         if unit_nms:
-            rate = STEERING[self.steering](jacobian / unit_nms, torque_nm / -unit_nms, t_s)
-        return scale_to_limit(rate, self.gimbal_rate_limit_rad_s), np.zeros_like(rate)
-
-
-class CmgActuator(Actuators):
-    """Actuators of the flight computer: control moment gyroscopes, see `CmgSet`."""
-
-    def __init__(self, model: Any, config: CmgsConfig) -> None:
-        self.gimbals = gimbals = Hinges.from_model(model, GIMBAL)
-        self.rotors = rotors = Hinges.from_model(model, ROTOR)
-        limit_rad_s = math.radians(config.gimbal_rate_limit_deg_s)
-        self.model = CmgSet(
-            gimbals.axes,
-            rotors.axes,
-            rotors.inertia_kg_m2,
-            limit_rad_s,
-            config.rotor_torque_limit_nm,
-            config.steering,
-        )
-        speeds = np.full(len(rotors), config.rotor_rpm * RPM_RAD_S)
-        jacobian = self.model.jacobian(np.zeros(len(gimbals)), speeds)
-        super().__init__(gimbals.motor, -jacobian, inverse(-jacobian), limit_rad_s)
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        angle = inputs.angles_rad[self.gimbals.qpos]
-        spin = inputs.speeds_rad_s[self.rotors.dof]
-        rate, torque = self.model.drive(
-            torque_nm, inputs.rate_body_rad_s, angle, spin, inputs.t_s
-        )
-        # T = -A d(angle)/dt - sum axle u; the second term is the momentum of speeds u / inertia.
-        achieved_nm = self.command(control, rate, inputs)
-        if self.model.rotor_torque_limit_nm is not None:
-            control[self.rotors.motor] = torque
-            achieved_nm -= self.model.momentum(angle, torque / self.model.rotor_inertia_kg_m2)
-        return achieved_nm
+            steering = STEERING[self.config.steering]
+            rate = steering(jacobian / unit_nms, torque_nm / -unit_nms, inputs.t_s)
+        return self.command(control, scale_to_limit(rate, self.limit), inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         super().command(control, commands, inputs)
         angle = inputs.angles_rad[self.gimbals.qpos]
-        jacobian = self.model.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
+        jacobian = self.jacobian(angle, inputs.speeds_rad_s[self.rotors.dof])
         return -jacobian @ control[self.motor]
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return self.model.momentum(
-            angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof]
-        )
+        return self.momentum(angles_rad[self.gimbals.qpos], speeds_rad_s[self.rotors.dof])
 
 
 def check_rotor_pairs(spec: Any, path: Path) -> None:
     """Raise InputError unless each rotor is on the gimbal with the same suffix."""
-    for gimbal in joints(spec, GIMBAL):
+    for gimbal in named(spec.joints, GIMBAL):
         suffix = gimbal.name.removeprefix(GIMBAL)
         rotor = spec.joint(ROTOR + suffix)
         if rotor is None or rotor.parent.parent != gimbal.parent:
@@ -326,7 +283,7 @@ def check_rotor_pairs(spec: Any, path: Path) -> None:
                 path,
                 f"joint {gimbal.name} has no joint {ROTOR}{suffix} on a child body of its own",
             )
-    if len(joints(spec, ROTOR)) != len(joints(spec, GIMBAL)):
+    if len(named(spec.joints, ROTOR)) != len(named(spec.joints, GIMBAL)):
         raise InputError(path, f"a joint {ROTOR}* has no joint {GIMBAL}* of the same suffix")
 
 
@@ -337,14 +294,14 @@ def add_cmgs(spec: Any, model: Any, cmgs: CmgsConfig) -> None:
     not hold it.
     """
     add_servos(spec, model, GIMBAL, cmgs.gimbal_time_constant_s)
-    for joint in joints(spec, ROTOR):
+    for joint in named(spec.joints, ROTOR):
         if cmgs.rotor_torque_limit_nm:
             add_motor(spec, joint.name, cmgs.rotor_torque_limit_nm)
 
 
 def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     """Set the gimbal angles and rotor speeds at the start."""
-    gimbals = Hinges.from_model(model, GIMBAL)
+    gimbals = Hinges(model, GIMBAL)
     angles = np.radians(
         member_values(config.start_deg, len(gimbals), "vehicle.cmgs.start_deg")
     )
@@ -352,7 +309,7 @@ def start_cmgs(model: Any, data: Any, config: CmgsConfig) -> None:
     driven = gimbals.motor >= 0
     # A servo whose set-point differs from the angle would jerk the gimbal.
     data.act[model.actuator_actadr[gimbals.motor[driven]]] = angles[driven]
-    data.qvel[Hinges.from_model(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
+    data.qvel[Hinges(model, ROTOR).dof] = config.rotor_rpm * RPM_RAD_S
 
 
 CMGS = ActuatorKind(

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     Actuators,
     ControlInput,
     add_motor,
     all_names,
+    at_zero,
     inverse,
-    scale_to_limit,
-    sites,
+    named,
 )
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import FansConfig
 
 FAN = "fan_"
 
-NO_MOTORS = np.zeros(0, dtype=np.int64)
 
-
-@dataclass(frozen=True, slots=True)
 class Fans:
-    """Fans, or thrusters, of a compiled model, in the order of their names.
+    """Fans, or thrusters, of a compiled model: sites with an actuator whose name begins with a prefix, in their order.
 
     Attributes
     ----------
@@ -44,82 +40,45 @@ class Fans:
         (n,) numbers of the actuators
     """
 
-    names: tuple[str, ...]
-    axes: Floats
-    positions_m: Floats
-    motor: Ints
-
-    @classmethod
-    def from_model(cls, model: Any, prefix: str = FAN) -> Fans:
-        """The sites whose name begins with prefix and that have an actuator."""
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        names = sorted(all_names(model.actuator, model.nu, prefix))
-        sites = [model.site(name).id for name in names]
-        # z axes of the sites; at zero joint angles lab and body axes coincide.
-        axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
-        motor = np.array([model.actuator(name).id for name in names], dtype=np.int64)
-        return cls(tuple(names), axes.T.copy(), data.site_xpos[sites].T.copy(), motor)
+    def __init__(self, model: Any, prefix: str) -> None:
+        data = at_zero(model)
+        self.names = tuple(sorted(all_names(model.actuator, model.nu, prefix)))
+        sites = [model.site(name).id for name in self.names]
+        # z axes of the sites.
+        self.axes = data.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2].T.copy()
+        self.positions_m = data.site_xpos[sites].T.copy()
+        motor = [model.actuator(name).id for name in self.names]
+        self.motor = np.array(motor, dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.names)
 
 
 class FanSet(Actuators):
-    """Actuators of the flight computer: n fans, commanded as if they had no lag.
+    """Actuators of the flight computer: n fans, commanded as if they had no lag. Each can blow either way.
 
-    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust.
-
-    Parameters
-    ----------
-    force_axes
-        (3, n) unit vectors along which a positive thrust pushes the body, in body axes
-    positions_m
-        (3, n) positions from the center of rotation, in body axes
-    thrust_limit_n
-        Greatest thrust of each fan
-    motor
-        Numbers of the motors; none without a model
+    A thrust has a lever arm about the bearing's center, T = sum position x axis thrust. The bearing takes the net
+    force.
     """
 
-    def __init__(
-        self,
-        force_axes: Floats,
-        positions_m: Floats,
-        thrust_limit_n: float,
-        motor: Ints = NO_MOTORS,
-    ) -> None:
-        lever_m = np.cross(positions_m, force_axes, axis=0)
-        super().__init__(motor, lever_m, inverse(lever_m), thrust_limit_n)
-
-    def drive(self, torque_nm: Floats) -> Floats:
-        """The smallest thrusts (n,) that give the torque (3,), or the nearest to it in least squares.
-
-        One factor scales all thrusts to the limit, which keeps the direction of the torque. Each fan can blow either
-        way. The bearing takes the net force.
-        """
-        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        return self.command(control, self.drive(torque_nm), inputs)
+    def __init__(self, fans: Fans, thrust_limit_n: float) -> None:
+        lever_m = np.cross(fans.positions_m, fans.axes, axis=0)
+        super().__init__(fans.motor, lever_m, inverse(lever_m), thrust_limit_n)
 
 
-def fan_actuators(model: Any, config: FansConfig) -> FanSet:
-    """The fans of a compiled model."""
-    fans = Fans.from_model(model)
-    return FanSet(fans.axes, fans.positions_m, config.thrust_limit_n, fans.motor)
-
-
-@dataclass(slots=True)
-class Desaturator:
-    """Law of momentum dumping: torque -h / time on the body, once the stored momentum h exceeds a threshold.
+class MomentumDump:
+    """Momentum dumping by fans, with a model of their lag: torque -h / time once the stored momentum h is too large.
 
     The controller holds the body still against this torque. The wheels or CMGs absorb it, and h decays as
     exp(-t / time). Stateful: one object per motion.
     """
 
-    config: DesaturationConfig
-    running: bool = False
+    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
+        self.fans = fans
+        self.lag_s = lag_s
+        self.config = config
+        self.running = False
+        self.fan_torque_nm = np.zeros(3)
 
     def torque(self, momentum_nms: Floats) -> Floats:
         """Torque (3,) that the fans should give: zero until |h| > start, then -h / time until |h| < stop."""
@@ -132,22 +91,10 @@ class Desaturator:
         )
         return momentum_nms * (-1.0 / self.config.time_s) if self.running else np.zeros(3)
 
-
-class MomentumDump:
-    """Momentum dumping by fans, with a model of their lag."""
-
-    def __init__(self, fans: Actuators, lag_s: float, config: DesaturationConfig) -> None:
-        self.fans = fans
-        self.lag_s = lag_s
-        self.desaturator = Desaturator(config)
-        self.fan_torque_nm = np.zeros(3)
-
     def allocate(self, control: Floats, momentum_nms: Floats, inputs: ControlInput) -> Floats:
         """Command the fans; return the torque (3,) that they give now according to the lag model."""
         present_nm = self.fan_torque_nm
-        commanded_nm = self.fans.allocate(
-            control, self.desaturator.torque(momentum_nms), inputs
-        )
+        commanded_nm = self.fans.allocate(control, self.torque(momentum_nms), inputs)
         # First-order lag over one period, T' = T + (command - T) (1 - exp(-period / lag)). The torque at its start
         # acts now.
         self.fan_torque_nm = present_nm + (commanded_nm - present_nm) * -math.expm1(
@@ -163,11 +110,16 @@ def add_force(spec: Any, site: str, limit_n: float) -> Any:
 
 def add_fans(spec: Any, _: Any, config: FansConfig) -> None:
     """Add a force at each fan along z of its site, which follows the command with a first-order lag."""
-    for site in sites(spec, FAN):
+    for site in named(spec.sites, FAN):
         fan = add_force(spec, site.name, config.thrust_limit_n)
         # Not FILTEREXACT, which is exact for Euler steps only: with Runge-Kutta it adds half a step of lag.
         fan.dyntype = mujoco.mjtDyn.mjDYN_FILTER
         fan.dynprm[0] = config.time_constant_s
 
 
-FANS = ActuatorKind("fans", add_fans, fan_actuators, sites=(FAN,))
+FANS = ActuatorKind(
+    "fans",
+    add_fans,
+    lambda vehicle, config: FanSet(vehicle.fans, config.thrust_limit_n),
+    sites=(FAN,),
+)

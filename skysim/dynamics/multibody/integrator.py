@@ -107,12 +107,12 @@ class Simulation:
     @property
     def lab_from_body_wxyz(self) -> Floats:
         """(4,) present attitude, scalar first."""
-        return self.states[self.row, 1:5]
+        return self.angles_rad[:4]
 
     @property
     def rate_body_rad_s(self) -> Floats:
         """(3,) present rate in body axes."""
-        return self.states[self.row, 1 + self.model.nq :][:3]
+        return self.speeds_rad_s[:3]
 
     @property
     def angles_rad(self) -> Floats:

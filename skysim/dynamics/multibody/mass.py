@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.dynamics.multibody.actuator_kind import joints
+from skysim.dynamics.multibody.actuator_kind import Hinges, at_zero, named
 from skysim.dynamics.multibody.trims import TRIM
 from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 
@@ -50,9 +50,7 @@ def tree_mass(model: Any, without_bus: bool = False) -> MassProperties:
 
     M = sum m,    center = sum m c / M,    J = sum R diag(I) R^T + m (c.c E - c c^T)    (Steiner)
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    # At zero joint angles the body frame is the lab frame, so lab positions and axes are those in body axes.
+    data = at_zero(model)
     bus = model.body("bus").id
     counted = model.body_rootid == bus
     counted[bus] &= not without_bus
@@ -262,13 +260,11 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
     Their joints are removed unless motors move them in flight.
     """
     # 1. Axes and centers at position zero, from the compiled model.
-    slides = joints(spec, TRIM) if vehicle.trim or vehicle.trims else []
-    names = tuple(joint.name for joint in slides)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    ids = [model.joint(name).id for name in names]
-    bodies = model.jnt_bodyid[ids]
-    axes = data.xaxis[ids].T.copy()
+    slides = named(spec.joints, TRIM)
+    hinges = Hinges(model, TRIM)
+    names = hinges.names
+    bodies = [model.joint(name).bodyid[0] for name in names]
+    data = at_zero(model)
     centers_m = data.subtree_com[bodies].T.copy()
     # 2. Move the bodies.
     position_m = np.zeros(len(names))
@@ -287,7 +283,7 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
             "vehicle.trim.position",
             f"beyond vehicle.trims.travel {vehicle.trims.travel_m:g} m",
         )
-    for joint, axis, at_m in zip(slides, axes.T, position_m, strict=True):
+    for joint, axis, at_m in zip(slides, hinges.axes.T, position_m, strict=True):
         body = joint.parent
         if body.parent.name != "bus" or body.frame is not None:
             raise InputError(
@@ -299,4 +295,5 @@ def hold_trims(spec: Any, model: Any, vehicle: VehicleConfig, path: Path) -> Tri
         joint.ref = at_m
         if vehicle.trims is None:
             spec.delete(joint)
-    return Trims(names, axes, centers_m, model.body_subtreemass[bodies].copy(), position_m)
+    mass_kg = model.body_subtreemass[bodies].copy()
+    return Trims(names, hinges.axes, centers_m, mass_kg, position_m)

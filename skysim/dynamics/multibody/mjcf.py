@@ -242,10 +242,8 @@ def load(path: Path) -> Any:
     check_confined(path)
     if fault := trial_fault(path, path.stat().st_mtime_ns):
         raise InputError(path, f"not a MuJoCo model that skysim reads: {fault}")
-    try:
+    with mujoco_errors(path, "not a MuJoCo model"):
         return mujoco.MjSpec.from_file(str(path))
-    except (ValueError, mujoco.FatalError) as error:
-        raise InputError(path, f"not a MuJoCo model: {one_line(error)}") from error
 
 
 @lru_cache(maxsize=64)
@@ -267,10 +265,17 @@ def trial_fault(path: Path, modified_ns: int) -> str:
 
 def compile_spec(spec: Any, path: Path) -> Any:
     """The compiled model of a spec that was read from path. Raises InputError with MuJoCo's message."""
-    try:
+    with mujoco_errors(path, "MuJoCo cannot compile it"):
         return spec.compile()
+
+
+@contextmanager
+def mujoco_errors(path: Path, problem: str) -> Iterator[None]:
+    """Turn MuJoCo's errors into an InputError of a file."""
+    try:
+        yield
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(path, f"MuJoCo cannot compile it: {one_line(error)}") from error
+        raise InputError(path, f"{problem}: {one_line(error)}") from error
 
 
 @contextmanager

@@ -201,8 +201,6 @@ def add_room(spec: Any, room: RoomConfig | None) -> None:
         name="stage_tiles", texrepeat=[2.0, 2.0], texuniform=True, reflectance=0.08
     )
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "stage_tiles"
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
     bottom = -FLOOR_BELOW_M
     half_m = [6.0, 6.0]
     if room and room.bearing_height_m is not None:
@@ -214,7 +212,7 @@ def add_room(spec: Any, room: RoomConfig | None) -> None:
     add_visual_geom(
         spec.worldbody,
         "stage_floor",
-        plane,
+        mujoco.mjtGeom.mjGEOM_PLANE,
         size=[*half_m, 0.1],
         pos=[0, 0, bottom],
         material="stage_tiles",
@@ -224,13 +222,12 @@ def add_room(spec: Any, room: RoomConfig | None) -> None:
         ("column", 0.10, bottom, -0.35),
         ("neck", 0.05, -0.35, -0.06),
     ):
-        fromto = [0.0, 0.0, low, 0.0, 0.0, high]
         add_visual_geom(
             spec.worldbody,
             f"stage_{name}",
-            cylinder,
+            mujoco.mjtGeom.mjGEOM_CYLINDER,
             size=[radius, 0, 0],
-            fromto=fromto,
+            fromto=[0.0, 0.0, low, 0.0, 0.0, high],
             rgba=[0.36, 0.39, 0.44, 1],
         )
 
@@ -274,27 +271,26 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
        lower than about a third of the surface's height are ignored.
     3. The rings are at equal steps between the first and the last ray in each direction that meets the surface.
     """
-    azimuth = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-    around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
+    azimuth = np.linspace(0, 2 * np.pi, SECTORS, endpoint=False)
     # 1. Panel: circles about its center, clipped to its edges.
     if isinstance(inside, Plane):
         outer_m = inside.height_m * np.tan(min(cap_rad + 0.1, 1.3))
         radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
+        around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
         panel_m = np.clip(radius_m * around, -half_m, half_m)
         return inside.center_m + panel_m @ inside.lab_from_own.as_matrix().T
 
     def points_at(polar: Floats) -> Floats:
         """(..., 3) points at these polar angles (..., SECTORS)."""
-        rays = np.sin(polar)[..., None] * around + np.cos(polar)[..., None] * up
+        rays = surface.directions(polar, azimuth)
         return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
 
     # 2. The first and the last ray in each direction that meets the surface. A wall that begins below the cap has none.
     for lowest_rad in (
         (cap_rad, np.radians(80)) if inside.rim.unbounded else (np.radians(80),)
     ):
-        polar = np.linspace(1e-3, lowest_rad, 400)[:, None] * np.ones(len(around))
+        polar = np.linspace(1e-3, lowest_rad, 400)[:, None] * np.ones(SECTORS)
         height_m = np.nan_to_num(points_at(polar)[..., 2], nan=-np.inf)
         on_surface = height_m > 0.35 * height_m.max()
         if on_surface.any(axis=0).all():
@@ -388,7 +384,7 @@ def octahedra(position_m: Floats, radius_m: Floats) -> tuple[Floats, Ints]:
     """(6 N, 3) vertices and (8 N, 3) faces of N octahedra: corners on the axes, a face in every octant."""
     # Corners 0 to 2 are on the positive axes, 3 to 5 on the negative ones.
     corners = np.concatenate([np.eye(3), -np.eye(3)])
-    signs = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 3)])
+    signs = np.array([*product((0, 3), repeat=3)])
     faces = signs + np.arange(3)
     # A mirrored octant reverses the order of the corners; undo that, so that all faces are outwards.
     odd = (signs > 0).sum(axis=1) % 2 == 1
@@ -468,18 +464,16 @@ def sky_view(
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
     # A direction across the boresight, from the axis that is least along it.
     beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
-    back = beside / np.linalg.norm(beside) - 0.5 * boresight
-    up = Rotation.from_rotvec(np.radians(-40.0) * back / np.linalg.norm(back)).apply(
-        boresight
-    )
+    back = normalized(beside) - 0.5 * boresight
+    up = Rotation.from_rotvec(np.radians(-40.0) * normalized(back)).apply(boresight)
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
 
 
 def look_at(spec: Any, eye_m: Floats, middle_m: Floats, up: Floats, size_m: float) -> None:
     """Add the camera `lab` and set the initial view of MuJoCo's viewer."""
     # MuJoCo's cameras look along -z, y is up.
-    back = (eye_m - middle_m) / np.linalg.norm(eye_m - middle_m)
-    right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+    back = normalized(eye_m - middle_m)
+    right = normalized(np.cross(up, back))
     lab_from_view = Rotation.from_matrix(
         np.column_stack([right, np.cross(back, right), back])
     )

@@ -27,7 +27,7 @@ from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Ints, Mount
-from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, joints
+from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, at_zero, named
 from skysim.dynamics.multibody.actuators import (
     KINDS,
     PREFIXES,
@@ -37,7 +37,7 @@ from skysim.dynamics.multibody.actuators import (
     locked_joint_hint,
 )
 from skysim.dynamics.multibody.cmgs import GIMBAL, ROTOR
-from skysim.dynamics.multibody.fans import Fans
+from skysim.dynamics.multibody.fans import FAN, Fans
 from skysim.dynamics.multibody.mass import (
     CAMERA,
     MassProperties,
@@ -47,7 +47,7 @@ from skysim.dynamics.multibody.mass import (
     tree_mass,
     unbalance,
 )
-from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings, one_line
+from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_errors, mujoco_warnings
 from skysim.dynamics.multibody.thrusters import THRUSTER
 from skysim.dynamics.multibody.wheels import WHEEL
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -141,12 +141,12 @@ def build(vehicle: VehicleConfig) -> VehicleModel:
         vehicle,
         mass,
         np.array([model.actuator(name).id for name in TORQUES]),
-        Hinges.from_model(model, WHEEL),
-        Hinges.from_model(model, GIMBAL),
-        Hinges.from_model(model, ROTOR),
-        Fans.from_model(model),
+        Hinges(model, WHEEL),
+        Hinges(model, GIMBAL),
+        Hinges(model, ROTOR),
+        Fans(model, FAN),
         trims,
-        Fans.from_model(model, THRUSTER),
+        Fans(model, THRUSTER),
     )
 
 
@@ -181,18 +181,14 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
         )
     # 5. Bearing.
     check_options(spec, vehicle, path)
-    try:
+    with mujoco_errors(path, "a name is reserved for skysim's bearing"):
         add_bearing(spec, bus, vehicle)
-    except ValueError as error:  # a name is taken
-        raise InputError(
-            path, f"a name is reserved for skysim's bearing: {one_line(error)}"
-        ) from error
     # 6. Check while the wheels are balanced, since `unbalance` changes the mass properties on purpose.
     balanced = compile_spec(spec, path)
     check_compiled(balanced, mass, path)
     # 7. Actuators.
     if vehicle.wheels:
-        unbalance(balanced, joints(spec, WHEEL), vehicle.wheels, path)
+        unbalance(balanced, named(spec.joints, WHEEL), vehicle.wheels, path)
     add_actuators(spec, balanced, vehicle)
     trims = hold_trims(spec, balanced, vehicle, path)
     return spec, trims.moved_mass(mass), trims
@@ -345,9 +341,7 @@ def check_compiled(model: Any, declared: MassProperties, path: Path) -> None:
     mass = tree_mass(model)
     for prefix in (prefix for kind in KINDS for prefix in kind.sites):
         bodies = [
-            model.site(k).bodyid[0]
-            for k in range(model.nsite)
-            if model.site(k).name.startswith(prefix)
+            model.site(name).bodyid[0] for name in all_names(model.site, model.nsite, prefix)
         ]
         if any(model.body_rootid[body] != bus for body in bodies):
             raise InputError(path, f"sites {prefix}* must be on body bus or its children")
@@ -375,8 +369,7 @@ def camera_mount(vehicle: VehicleModel) -> Mount:
 
     Only this function converts MuJoCo's camera axes to skysim's.
     """
-    data = mujoco.MjData(vehicle.model)
-    mujoco.mj_forward(vehicle.model, data)  # at qpos0 the body frame is the lab frame
+    data = at_zero(vehicle.model)
     camera = data.camera(CAMERA)
     body_from_mjcam = Rotation.from_matrix(camera.xmat.reshape(3, 3))
     return Mount(np.array(camera.xpos), CAM_FROM_MJCAM * body_from_mjcam.inv())
@@ -384,8 +377,7 @@ def camera_mount(vehicle: VehicleModel) -> Mount:
 
 def imu_position_m(vehicle: VehicleModel) -> Floats:
     """(3,) position of the accelerometers in body axes: site `imu`, or the bearing's center if there is none."""
-    if IMU not in [vehicle.model.site(k).name for k in range(vehicle.model.nsite)]:
+    if vehicle.spec.site(IMU) is None:
         return np.zeros(3)
-    data = mujoco.MjData(vehicle.model)
-    mujoco.mj_forward(vehicle.model, data)
+    data = at_zero(vehicle.model)
     return np.array(data.site(IMU).xpos)

@@ -1,6 +1,6 @@
 """Occlusion of sources by the vehicle and the lab, by MuJoCo's ray casting.
 
-1. `build_obstacles` compiles the vehicle once, with its attitude free to set, and finds the geoms of the camera's
+1. `Obstacles` compiles the vehicle once, with its attitude free to set, and finds the geoms of the camera's
    housing, which let light through.
 2. `occluded` sets the attitude and casts a ray from the pupil to each source.
 
@@ -9,8 +9,6 @@ initial angles.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -36,9 +34,18 @@ TRANSPARENT = 5
 GROUPS = np.array([1, 0, 0, 0, 0, 0], dtype=np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
 class Obstacles:
-    """The geoms that can hide a source, on a vehicle whose attitude can be set.
+    """The geoms that can hide a source from the main camera, or from a further camera with the given mount.
+
+    The attitude of the vehicle can be set.
+
+    1. Compile the vehicle's file again with separate bodies, since the simulated model has all rigid bodies fused
+       into bus.
+    2. The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and
+       any geom that surrounds the pupil, since the camera then looks out through a hole in it. A further camera has
+       no housing of its own, and the housing of the main camera blocks its light.
+
+    MuJoCo's rays ignore geoms with an alpha of 0.
 
     Attributes
     ----------
@@ -48,44 +55,29 @@ class Obstacles:
         (3,) position of the pupil, where all rays begin, in body axes
     """
 
-    model: Any
-    data: Any
-    camera_body_m: Floats
+    def __init__(self, vehicle: VehicleModel, mount: Mount | None = None) -> None:
+        # 1. Model with the initial angles of wheels and gimbals.
+        path = SCENES / vehicle.config.model
+        with mujoco_warnings():
+            spec = load(path)
+            spec.compiler.fusestatic = False
+            bus = put_at_origin(spec, path)
+            place_camera(spec, vehicle.config)
+            bus.mocap = True  # the pose of a mocap body is set, not simulated
+            lock_unused(spec, vehicle.config, path)
+            self.model = compile_spec(spec, path)
+        self.data = mujoco.MjData(self.model)
+        set_start(vehicle.config, self.model, self.data)
+        mujoco.mj_kinematics(self.model, self.data)
+        # 2. Housing.
+        self.camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
+        housing = camera_housing(self, is_main=mount is None)
+        self.model.geom_group[:] = np.where(housing, TRANSPARENT, OPAQUE)
 
 
-def build_obstacles(vehicle: VehicleModel, mount: Mount | None = None) -> Obstacles:
-    """The obstacles of a vehicle for its main camera, or for a further camera with the given mount.
-
-    1. Compile the vehicle's file again with separate bodies, since the simulated model has all rigid bodies fused
-       into bus.
-    2. The camera's housing lets light through: all geoms of the body that carries the camera, if it is not bus, and
-       any geom that surrounds the pupil, since the camera then looks out through a hole in it. A further camera has
-       no housing of its own, and the housing of the main camera blocks its light.
-
-    MuJoCo's rays ignore geoms with an alpha of 0.
-    """
-    # 1. Model with the initial angles of wheels and gimbals.
-    path = SCENES / vehicle.config.model
-    with mujoco_warnings():
-        spec = load(path)
-        spec.compiler.fusestatic = False
-        bus = put_at_origin(spec, path)
-        place_camera(spec, vehicle.config)
-        bus.mocap = True  # the pose of a mocap body is set, not simulated
-        lock_unused(spec, vehicle.config, path)
-        model = compile_spec(spec, path)
-    data = mujoco.MjData(model)
-    set_start(vehicle.config, model, data)
-    mujoco.mj_kinematics(model, data)
-    # 2. Housing.
-    camera_body_m = (mount or camera_mount(vehicle)).camera_body_m
-    housing = camera_housing(model, data, camera_body_m, is_main=mount is None)
-    model.geom_group[:] = np.where(housing, TRANSPARENT, OPAQUE)
-    return Obstacles(model, data, camera_body_m)
-
-
-def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) -> Bools:
+def camera_housing(obstacles: Obstacles, is_main: bool) -> Bools:
     """(ngeom,) whether each geom belongs to the camera's housing. Overwrites the geoms' groups."""
+    model = obstacles.model
     body = model.cam_bodyid[model.camera(CAMERA).id]
     is_housing = (model.geom_bodyid == body) & (body != model.body("bus").id) & is_main
     # A geom surrounds the pupil if rays in six directions meet it, with all other geoms transparent.
@@ -93,7 +85,7 @@ def camera_housing(model: Any, data: Any, camera_body_m: Floats, is_main: bool) 
     for geom in np.flatnonzero(~is_housing):
         model.geom_group[:] = TRANSPARENT
         model.geom_group[geom] = OPAQUE
-        distance_m = free_distance_m(model, data, camera_body_m, six_directions)
+        distance_m = free_distance_m(obstacles, obstacles.camera_body_m, six_directions)
         is_housing[geom] = np.isfinite(distance_m).all()
     return np.asarray(is_housing)
 
@@ -117,7 +109,7 @@ def occluded(obstacles: Obstacles, lab_from_body: Rotation, place: Floats) -> Bo
     # 2. Pose of the vehicle, and the nearest geom on each ray.
     obstacles.data.mocap_quat[obstacles.model.body("bus").mocapid[0]] = lab_from_body_wxyz
     mujoco.mj_kinematics(obstacles.model, obstacles.data)
-    return free_distance_m(obstacles.model, obstacles.data, camera_m, rays) < end_m
+    return free_distance_m(obstacles, camera_m, rays) < end_m
 
 
 @jit
@@ -138,25 +130,23 @@ def _rays(place: Floats, camera_m: Floats) -> tuple[Floats, Floats]:
     return rays, end_m
 
 
-def free_distance_m(model: Any, data: Any, from_m: Floats, rays: Floats) -> Floats:
+def free_distance_m(obstacles: Obstacles, from_m: Floats, rays: Floats) -> Floats:
     """(N,) distance in m from a point of the lab along unit vectors (N, 3) to the next opaque geom; inf if none."""
     count = len(rays)
     geom = np.empty(count, np.int32)
     distance_m = np.empty(count)
-    if count:
-        directions = np.ascontiguousarray(rays).ravel()
-        mujoco.mj_multiRay(
-            model,
-            data,
-            from_m,
-            directions,
-            GROUPS,
-            True,
-            -1,
-            geom,
-            distance_m,
-            None,
-            count,
-            mujoco.mjMAXVAL,
-        )
+    mujoco.mj_multiRay(
+        obstacles.model,
+        obstacles.data,
+        from_m,
+        np.ascontiguousarray(rays).ravel(),
+        GROUPS,
+        True,
+        -1,
+        geom,
+        distance_m,
+        None,
+        count,
+        mujoco.mjMAXVAL,
+    )
     return np.where(distance_m >= 0, distance_m, np.inf)

@@ -57,8 +57,13 @@ class Shape(NamedTuple):
     faces: NDArray[np.int32]
 
 
-class Laboratory(NamedTuple):
+class Laboratory:
     """All visible shapes of a laboratory except its lights, and the view of the camera `lab`.
+
+    Parameters
+    ----------
+    mjcf
+        Text from `mjcf_export.mjcf`
 
     Attributes
     ----------
@@ -68,20 +73,15 @@ class Laboratory(NamedTuple):
         (3,) positions in the lab of the camera and of the point at which it looks
     """
 
-    shapes: tuple[Shape, ...]
-    eye_m: Floats
-    target_m: Floats
-
-
-def laboratory(mjcf: str) -> Laboratory:
-    """The laboratory of an MJCF text from `mjcf_export.mjcf`."""
-    with mujoco_warnings():
-        model = mujoco.MjModel.from_xml_string(mjcf)
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-    shown = [n for n in range(model.ngeom) if is_shown(model, n)]
-    shapes = tuple(shape(model, data, n) for n in shown)
-    return Laboratory(shapes, model.camera(LAB_CAMERA).pos.copy(), model.stat.center.copy())
+    def __init__(self, mjcf: str) -> None:
+        with mujoco_warnings():
+            model = mujoco.MjModel.from_xml_string(mjcf)
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
+        shown = [n for n in range(model.ngeom) if is_shown(model, n)]
+        self.shapes = tuple(shape(model, data, n) for n in shown)
+        self.eye_m = model.camera(LAB_CAMERA).pos.copy()
+        self.target_m = model.stat.center.copy()
 
 
 def is_shown(model: mujoco.MjModel, n: int) -> bool:

@@ -26,10 +26,10 @@ from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
     ControlInput,
+    named,
     scale_to_limit,
-    sites,
 )
-from skysim.dynamics.multibody.fans import Fans, FanSet, add_force
+from skysim.dynamics.multibody.fans import FanSet, add_force
 from skysim.scene.sections.vehicle import ThrustersConfig
 
 THRUSTER = "thruster_"
@@ -44,20 +44,17 @@ class ThrusterActuator(FanSet):
 
     Parameters
     ----------
-    model
-        Compiled model
+    vehicle
+        `VehicleModel`
     config
         The scene's `vehicle.thrusters`
     """
 
-    def __init__(self, model: Any, config: ThrustersConfig) -> None:
-        thrusters = Fans.from_model(model, THRUSTER)
-        super().__init__(
-            thrusters.axes, thrusters.positions_m, config.thrust_n, thrusters.motor
-        )
+    def __init__(self, vehicle: Any, config: ThrustersConfig) -> None:
+        super().__init__(vehicle.thrusters, config.thrust_n)
         lever_m = self.torque_from_command
         self.weighted_m = np.vstack(
-            (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(thrusters)))
+            (lever_m, SHARING * np.linalg.norm(lever_m) * np.eye(len(self.motor)))
         )
         # The map is that of thrusters that push both ways, scaled to the greatest thrust of one-sided ones. The scale
         # is 2 if each thruster has an opposite one; else it is that of the worst of 26 directions.
@@ -95,8 +92,8 @@ class ValveDrive:
 
     Parameters
     ----------
-    model
-        Compiled model
+    vehicle
+        `VehicleModel`
     config
         The scene's `vehicle.thrusters`
 
@@ -110,10 +107,10 @@ class ValveDrive:
         (n,) impulses saved up for a pulse, and left of a pulse that goes on, both of the full thrust at the start
     """
 
-    def __init__(self, model: Any, config: ThrustersConfig) -> None:
+    def __init__(self, vehicle: Any, config: ThrustersConfig) -> None:
         self.config = config
-        self.motor = Fans.from_model(model, THRUSTER).motor
-        self.step_s = np.float64(model.opt.timestep)
+        self.motor = vehicle.thrusters.motor
+        self.step_s = np.float64(vehicle.model.opt.timestep)
         self.lag_s = max(config.time_constant_s, SHORTEST_LAG_S)
         zeros = np.zeros(len(self.motor))
         self.thrust_n = self.saved_ns = self.begun_ns = zeros
@@ -185,7 +182,7 @@ class ValveDrive:
 
 def add_thrusters(spec: Any, _: Any, config: ThrustersConfig) -> None:
     """Add a one-sided force at each thruster along z of its site; `ValveDrive` has its lag."""
-    for site in sites(spec, THRUSTER):
+    for site in named(spec.sites, THRUSTER):
         add_force(spec, site.name, config.thrust_n).ctrlrange = [0.0, config.thrust_n]
 
 

@@ -40,8 +40,8 @@ class TrimMotors:
 
     Parameters
     ----------
-    model
-        Compiled model
+    vehicle
+        `VehicleModel`
     config
         The scene's `vehicle.trims`
 
@@ -51,12 +51,12 @@ class TrimMotors:
         (n,) positions along the slides at the start and now
     """
 
-    def __init__(self, model: Any, config: TrimsConfig) -> None:
-        self.model = model
+    def __init__(self, vehicle: Any, config: TrimsConfig) -> None:
+        self.model = vehicle.model
         self.config = config
-        self.slides = Hinges.from_model(model, TRIM)
+        self.slides = Hinges(self.model, TRIM)
         self.motor = self.slides.motor
-        self.start_m = model.qpos0[self.slides.qpos]
+        self.start_m = self.model.qpos0[self.slides.qpos]
         self.position_m = self.start_m
 
     def moved(self, displacement_m: Floats, times_s: Floats) -> Floats:
@@ -74,9 +74,9 @@ class TrimActuator(TrimMotors, Actuators):
     The computer measures the vertical as an inclinometer without errors would.
     """
 
-    def __init__(self, model: Any, config: TrimsConfig) -> None:
-        TrimMotors.__init__(self, model, config)
-        lever_n = self.levers_n(model.qpos0)
+    def __init__(self, vehicle: Any, config: TrimsConfig) -> None:
+        TrimMotors.__init__(self, vehicle, config)
+        lever_n = self.levers_n(self.model.qpos0)
         Actuators.__init__(self, self.motor, lever_n, inverse(lever_n), config.travel_m)
 
     def levers_n(self, angles_rad: Floats) -> Floats:
@@ -137,7 +137,7 @@ def add_trims(spec: Any, model: Any, _: TrimsConfig) -> None:
 
 def start_trims(model: Any, data: Any, _: TrimsConfig) -> None:
     """Set the set-points of the servos to the positions at the start, less what gravity makes them yield."""
-    slides = Hinges.from_model(model, TRIM)
+    slides = Hinges(model, TRIM)
     if (slides.motor < 0).any():
         return  # a model without motors, of the shapes alone
     sag_m = SERVO_S**2 * (gravity_body_m_s2(model, data.qpos) @ slides.axes)

@@ -12,7 +12,6 @@ A wheel at rest, or whose speed crosses zero, sticks while the torque on its bea
 (`Stiction`); from there on the friction is that of a moving wheel.
 """
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,8 @@ from skysim.dynamics.multibody.actuator_kind import (
     Hinges,
     add_motor,
     inverse,
-    joints,
     member_values,
-    scale_to_limit,
+    named,
 )
 from skysim.scene.sections.vehicle import WheelsConfig
 
@@ -39,82 +37,41 @@ REST_RAD_S = 1e-6  # speed below which a wheel is at rest
 HARD_FRICTION = ([2e-3, 1.0], [0.9999, 0.9999, 1e-3, 0.5, 2.0])
 
 
-@dataclass(slots=True)
-class WheelSet:
-    """A set of n reaction wheels. A motor torque u on a wheel acts oppositely on the body: T = -sum axis u.
+class WheelActuator(Actuators):
+    """Actuators of the flight computer: n reaction wheels.
+
+    A motor torque u on a wheel acts oppositely on the body, T = -sum axis u. `drive` scales the torques to their limit,
+    which keeps the direction of T; the speed limit may change it.
 
     Attributes
     ----------
-    axes
-        (3, n) unit vectors in body axes; a positive speed is right-handed about them
-    inertia_kg_m2
-        (n,) inertia of each wheel about its axle
-    torque_limit_nm
-        Greatest motor torque
-    speed_limit_rad_s
-        Greatest speed relative to the body
-    motor_from_torque
-        (n, 3) minus the pseudo-inverse of the axes
+    hinges
+        Axles of the wheels; a positive speed is right-handed about them
     """
 
-    axes: Floats
-    inertia_kg_m2: Floats
-    torque_limit_nm: float
-    speed_limit_rad_s: float
-    motor_from_torque: Floats = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, vehicle: Any, config: WheelsConfig) -> None:
+        self.hinges = hinges = vehicle.wheels
         # T = -axes u, solved for u.
-        self.motor_from_torque = -inverse(self.axes)
+        motor_from_torque = -inverse(hinges.axes)
+        super().__init__(
+            hinges.motor, -hinges.axes, motor_from_torque, config.torque_limit_nm
+        )
+        self.speed_limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
 
-    def momentum(self, speed_rad_s: Floats) -> Floats:
-        """Angular momentum (3,) of wheels at speeds (n,) relative to the body: h = sum axis inertia speed."""
-        return self.axes @ (self.inertia_kg_m2 * speed_rad_s)
-
-    def drive(self, torque_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
-        """Motor torques (n,) on the wheels that give torque_nm (3,) on the body for the next period_s.
-
-        1. The smallest torques that give it, u = -axes^+ T; if the axes do not span space (n < 3, or all in a plane),
-           the nearest in least squares.
-        2. One factor scales them to the torque limit, which keeps the direction of T.
-        3. `within_limits`, which may change the direction.
-        """
-        motor = scale_to_limit(self.motor_from_torque @ torque_nm, self.torque_limit_nm)
-        return self.within_limits(motor, speed_rad_s, period_s)
-
-    def within_limits(self, motor_nm: Floats, speed_rad_s: Floats, period_s: float) -> Floats:
-        """Motor torques (n,), each clipped to what just reaches the speed limit within period_s.
+    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
+        """Each motor torque is also clipped to what just reaches the speed limit within the period.
 
         By inertia d(speed)/dt = u, without the body's own acceleration. A wheel at its limit can only be braked.
         """
-        torque_per_speed = self.inertia_kg_m2 / period_s
-        upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speed_rad_s), 0.0)
-        lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speed_rad_s), 0.0)
-        return np.clip(motor_nm, lower, upper)
-
-
-class WheelActuator(Actuators):
-    """Actuators of the flight computer: reaction wheels, see `WheelSet`."""
-
-    def __init__(self, model: Any, config: WheelsConfig) -> None:
-        self.joints = hinges = Hinges.from_model(model, WHEEL)
-        limit_nm = config.torque_limit_nm
-        limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
-        self.model = WheelSet(hinges.axes, hinges.inertia_kg_m2, limit_nm, limit_rad_s)
-        super().__init__(hinges.motor, -hinges.axes, self.model.motor_from_torque, limit_nm)
-
-    def allocate(self, control: Floats, torque_nm: Floats, inputs: ControlInput) -> Floats:
-        speeds = inputs.speeds_rad_s[self.joints.dof]
-        motor = self.model.drive(torque_nm, speeds, inputs.period_s)
-        return super().command(control, motor, inputs)
-
-    def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
-        speeds = inputs.speeds_rad_s[self.joints.dof]
-        motor = self.model.within_limits(commands, speeds, inputs.period_s)
-        return super().command(control, motor, inputs)
+        speeds = inputs.speeds_rad_s[self.hinges.dof]
+        torque_per_speed = self.hinges.inertia_kg_m2 / inputs.period_s
+        upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speeds), 0.0)
+        lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speeds), 0.0)
+        return super().command(control, np.clip(commands, lower, upper), inputs)
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        return self.model.momentum(speeds_rad_s[self.joints.dof])
+        """Angular momentum (3,) of the wheels relative to the body: h = sum axis inertia speed."""
+        return self.hinges.axes @ (self.hinges.inertia_kg_m2 * speeds_rad_s[self.hinges.dof])
 
 
 class Stiction:
@@ -141,7 +98,7 @@ class Stiction:
     def __init__(self, model: Any, config: WheelsConfig) -> None:
         self.model = model
         self.config = config
-        self.joints = Hinges.from_model(model, WHEEL)
+        self.joints = Hinges(model, WHEEL)
         self.sticks = np.zeros(len(self.joints), dtype=bool)
         self.before_rad_s = np.zeros(len(self.joints))
 
@@ -167,7 +124,7 @@ class Stiction:
 def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
     """Add a motor at each wheel, and the friction of its axle; MuJoCo's Coulomb friction also holds a wheel at rest."""
     # T = coulomb sign(speed) + viscous speed.
-    for joint in joints(spec, WHEEL):
+    for joint in named(spec.joints, WHEEL):
         joint.frictionloss = wheels.coulomb_nm
         joint.damping = [wheels.viscous_nms, 0.0, 0.0]
         if wheels.stiction_nm:
@@ -177,7 +134,7 @@ def add_wheels(spec: Any, _: Any, wheels: WheelsConfig) -> None:
 
 def start_wheels(model: Any, data: Any, config: WheelsConfig) -> None:
     """Set the wheel speeds at the start."""
-    hinges = Hinges.from_model(model, WHEEL)
+    hinges = Hinges(model, WHEEL)
     data.qvel[hinges.dof] = (
         member_values(config.start_rpm, len(hinges), "vehicle.wheels.start_rpm") * RPM_RAD_S
     )

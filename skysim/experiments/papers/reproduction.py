@@ -181,7 +181,7 @@ def run_numbers(experiment: Experiment, options: Options) -> tuple[list[str], Nu
         else:
             # What `skysim run --json` prints of a flight, without the files.
             with open_flight(scene) as flight:
-                rows = [scoring.score(shot).row for shot in flight.shots()]
+                rows = [scoring.Score(shot).row for shot in flight.shots()]
                 motion = telemetry_report.summary(flight.telemetry())
             found = {"flight": motion, "rows": [asdict(row) for row in rows]}
             results.append(run_report.summary(rows) | found)

@@ -82,7 +82,7 @@ class LabUnit:
         self.outputs: Record = {}
         if not lab.scene.motion.is_prescribed:
             sets = self.flight.motion.flight_computer.actuator_sets
-            motors = {key: len(one.command_map()[0]) for key, one in sets.items()}
+            motors = {key: len(one.motor) for key, one in sets.items()}
             for name, size in {"torque_nm": 3, **motors}.items():
                 self.inputs |= {name: np.zeros(size), f"{name}_given": False}
         for camera in lab.cameras:

@@ -14,13 +14,13 @@ import numpy as np
 from skysim.core import files
 from skysim.core.constants import INCH_M
 from skysim.core.errors import check_name
+from skysim.results.files.parts import DomeDesign
 from skysim.results.files.templates import (
     CAPTION_MM,
     GAP_MM,
     MARGIN_MM,
     RULE_MM,
     Circle,
-    Dome,
     Gore,
     Polyline,
     Shape,
@@ -52,7 +52,7 @@ class Page(NamedTuple):
     shapes: list[Shape]
 
 
-def pages(dome: Dome, paper: str) -> Iterator[Page]:
+def pages(dome: DomeDesign, paper: str) -> Iterator[Page]:
     """The pages of a dome's gores. Raises InputError for an unknown paper."""
     check_name("paper", "paper", paper, PAPERS)
     width_mm, height_mm = SHEETS_MM.get(paper, (math.inf, math.inf))
@@ -110,7 +110,7 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
         yield Page(width_mm, height_mm, name, (-half_mm, top_mm), shapes)
 
 
-def write_pdf(path: Path, dome: Dome, paper: str) -> int:
+def write_pdf(path: Path, dome: DomeDesign, paper: str) -> int:
     """Write the pages, and return how many they are. Raises InputError for an unknown paper."""
     from matplotlib.backends.backend_pdf import PdfPages
     from matplotlib.figure import Figure

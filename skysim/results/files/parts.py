@@ -19,16 +19,15 @@ import numpy as np
 from skysim.core.errors import InputError, Where
 from skysim.core.paths import DATA
 from skysim.core.text import excerpt, read_lines
-from skysim.core.types import Floats, Ints, Sources
+from skysim.core.types import Floats, Ints
 from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
 from skysim.scene.sections.leds import PwmConfig, SequentialConfig
-from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import tilts_rad
 from skysim.sources.dome.layouts.string import mean_meridian, wind
-from skysim.sources.dome.surface import Surface, build_surface, cap_area_m2
+from skysim.sources.dome.surface import build_surface, cap_area_m2
 from skysim.sources.photometry import Band
 
 # Prices of a dome's parts: a CSV table that the user edits; the shipped one, `assumed`, is a guess
@@ -238,13 +237,35 @@ class PartsList(NamedTuple):
         return {name: round(value, 2) for name, value in groups.items()}
 
 
-class DomeDesign(NamedTuple):
-    """A dome as designed; boards may stand out beyond the cap of the layout."""
+class DomeDesign:
+    """A scene's dome as designed; boards may stand out beyond the cap of the layout.
 
-    light: DomeConfig
-    surface: Surface
-    leds: Sources
-    cap_deg: float
+    Raises
+    ------
+    InputError
+        Without a dome, which has no `what`.
+    """
+
+    def __init__(self, scene: Scene, what: str = "parts") -> None:
+        light = scene.dome
+        if light is None:
+            raise InputError("light.kind", f"{scene.light.kind} has no {what}", "dome")
+        self.name = scene.name
+        self.light = light
+        self.surface = build_surface(light.surface)
+        self.leds = design_leds(light, self.surface, Band.from_camera(scene.camera))
+        # Boards stand out.
+        self.cap_deg = max(light.points.cap_deg, max_tilt_deg(self.led_m))
+
+    @property
+    def led_m(self) -> Floats:
+        """(N, 3) places of the LEDs."""
+        return self.leds.place[:, :3]
+
+    @property
+    def led_radius_m(self) -> float:
+        """Radius of an LED's disk."""
+        return self.light.led.disk_diameter_m / 2
 
     def to_rim_m(self, place_m: Floats) -> Floats:
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
@@ -275,7 +296,7 @@ def parts_list(scene: Scene, prices: Prices) -> PartsList:
 
 def quantities(scene: Scene, prices: Prices) -> Quantities:
     """How much of each part the scene's dome needs, in its unit; of electronics the LEDs or channels to be served."""
-    design = build_design(scene)
+    design = DomeDesign(scene)
     layout = design.light.layout
     leds = len(design.leds)
     found: Quantities = {"panel": 1}  # an LCD panel comes with all that drives it
@@ -294,29 +315,17 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     return found
 
 
-def build_design(scene: Scene, what: str = "parts") -> DomeDesign:
-    """The scene's dome as designed. Raises InputError without a dome, which has no `what`."""
-    light = scene.dome
-    if light is None:
-        raise InputError("light.kind", f"{scene.light.kind} has no {what}", "dome")
-    surface = build_surface(light.surface)
-    leds = design_leds(light, surface, Band.from_camera(scene.camera))
-    # Boards stand out.
-    cap_deg = max(light.points.cap_deg, max_tilt_deg(leds.place[:, :3]))
-    return DomeDesign(light, surface, leds, cap_deg)
-
-
 def single_leds(design: DomeDesign) -> Quantities:
     """LEDs one by one, each in its hole, or at the rim with a fiber to its hole."""
     count = len(design.leds)
     line = "fiber" if design.light.layout.kind == "fibers" else "wire"
-    length_m = float(design.to_rim_m(design.leds.place[:, :3]).sum())
+    length_m = float(design.to_rim_m(design.led_m).sum())
     return {"led": count, "mounting_led": count, line: length_m}
 
 
 def boards(design: DomeDesign) -> Quantities:
     """Patch boards; a board's wire goes to its LED next to the rim."""
-    length_m = nearest_m(design.to_rim_m(design.leds.place[:, :3]), design.leds.id // HOLES)
+    length_m = nearest_m(design.to_rim_m(design.led_m), design.leds.id // HOLES)
     count = len(length_m)
     return {
         "board": count,

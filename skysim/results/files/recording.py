@@ -5,7 +5,6 @@ import datetime
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,13 +24,12 @@ from skysim.core.files import (
 )
 from skysim.core.images import TOP_DOWN_CARD, read_image
 from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
+from skysim.dynamics.profile_table import BODY_ANGLES, CAMERA_ANGLES
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
-SKY_ANGLES = ("ra_deg", "dec_deg", "roll_deg")
-LAB_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
 
 class FrameTruth(NamedTuple):
@@ -49,12 +47,29 @@ class FrameTruth(NamedTuple):
     sources: Any
 
 
-@dataclass(frozen=True)
 class Recording:
-    """A finished run: its folder, and the frames' file paths without suffix, in frame order."""
+    """A finished run: its folder, and the frames' file paths without suffix, in frame order.
 
-    folder: Path
-    stems: list[Path] = field(repr=False)
+    Raises
+    ------
+    InputError
+        If the folder holds no frame with its truth.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        stems = {}
+        for path in folder.glob("frame_*.fits"):
+            number = re.fullmatch(r"frame_(\d{4,})", path.stem)
+            if number and path.with_suffix(".ecsv").is_file():
+                stems[int(number[1])] = path.with_suffix("")
+        if not stems:
+            raise InputError(
+                folder,
+                "no frames with truth files",
+                "a folder of a run, or of rendered frames",
+            )
+        self.folder = folder
+        self.stems = [stems[index] for index in sorted(stems)]
 
     @cached_property
     def meta(self) -> Record:
@@ -92,35 +107,38 @@ class Recording:
         path = self.folder / f"{name}.ecsv"
         return read_table(path) if path.is_file() else None
 
-    def _require(self, name: str, table: Any, columns: Sequence[str]) -> None:
-        """Raise InputError for a table of the run that lacks a column."""
-        for column in columns:
+    def _attitudes(
+        self, name: str, key: str, angles: Sequence[str], is_celestial: bool
+    ) -> tuple[NDArray[Any], Rotation] | None:
+        """(K,) values of a column of a table, and the attitudes of these rows; None without any.
+
+        Raises InputError if a column is missing.
+        """
+        table = self.table(name)
+        if table is None:
+            return None
+        for column in (key, *angles):
             if column not in table.colnames:
                 path = self.folder / f"{name}.ecsv"
                 raise InputError(path, f"missing column {column}", "a table of a run")
+        angles_deg = np.column_stack(
+            [np.ma.filled(table[column].astype(float), np.nan) for column in angles]
+        )
+        valid = np.isfinite(angles_deg).all(axis=1)
+        if not valid.any():
+            return None
+        return np.asarray(table[key])[valid], attitudes(angles_deg[valid], is_celestial)
 
-    def solved(self) -> tuple[NDArray[np.int64], Rotation] | None:
+    def solved(self) -> tuple[NDArray[Any], Rotation] | None:
         """(K,) indices of the solved frames and their attitudes.
 
         Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
         table of solutions or no frame was solved. Raises InputError if a column is missing.
         """
-        solutions = self.table("solutions")
-        if solutions is None:
-            return None
-        names = SKY_ANGLES if self.is_celestial else LAB_ANGLES
-        self._require("solutions", solutions, ("frame", *names))
-        angles = np.column_stack(
-            [np.ma.filled(solutions[name].astype(float), np.nan) for name in names]
-        )
-        valid = np.isfinite(angles).all(axis=1)
-        if not valid.any():
-            return None
-        return np.asarray(solutions["frame"], np.int64)[valid], attitudes(
-            angles[valid], self.is_celestial
-        )
+        names = CAMERA_ANGLES if self.is_celestial else BODY_ANGLES
+        return self._attitudes("solutions", "frame", names, self.is_celestial)
 
-    def motion(self) -> tuple[Floats, Rotation] | None:
+    def motion(self) -> tuple[NDArray[Any], Rotation] | None:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
 
         Raises
@@ -128,17 +146,8 @@ class Recording:
         InputError
             If a column is missing.
         """
-        telemetry = self.table("telemetry")
-        if telemetry is None:
-            return None
-        columns = [f"true_{name}" for name in LAB_ANGLES]
-        self._require("telemetry", telemetry, ("t_s", *columns))
-        angles = np.column_stack(
-            [np.asarray(telemetry[name], dtype=float) for name in columns]
-        )
-        return np.asarray(telemetry["t_s"], dtype=float), attitudes(
-            angles, is_celestial=False
-        )
+        names = [f"true_{name}" for name in BODY_ANGLES]
+        return self._attitudes("telemetry", "t_s", names, is_celestial=False)
 
 
 def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
@@ -148,22 +157,8 @@ def attitudes(angles_deg: Floats, is_celestial: bool) -> Rotation:
     sequence.
     """
     if is_celestial:
-        return Rotation.concatenate([stars.cam_from_icrs(*row).inv() for row in angles_deg])
+        return stars.cam_from_icrs(*angles_deg.T).inv()
     return Rotation.from_euler("ZYX", angles_deg[:, ::-1], degrees=True)
-
-
-def open_recording(folder: Path) -> Recording:
-    """The run in a folder. Raises InputError if the folder holds no frame with its truth."""
-    stems = {}
-    for path in folder.glob("frame_*.fits"):
-        number = re.fullmatch(r"frame_(\d{4,})", path.stem)
-        if number and path.with_suffix(".ecsv").is_file():
-            stems[int(number[1])] = path.with_suffix("")
-    if not stems:
-        raise InputError(
-            folder, "no frames with truth files", "a folder of a run, or of rendered frames"
-        )
-    return Recording(folder, [stems[index] for index in sorted(stems)])
 
 
 def read_truth(path: Path) -> FrameTruth:
@@ -269,15 +264,18 @@ def fits_image(frame: Frame, scene: Scene, wcs_cards: Any, comment: str) -> Any:
     """A FITS image: uint16 (float64 for a noise-free frame) with exposure, time, scene and seed in the header."""
     from astropy.io import fits
 
-    header = fits.Header()
-    header["EXPTIME"] = (frame.exposure_s, "exposure [s]")
-    header["DATE-OBS"] = (utc_text(scene, frame.t_mid_s), "mid-exposure [UTC]")
-    header["TMID"] = (frame.t_mid_s, "mid-exposure since the scene's start [s]")
-    header["SCENE"] = (scene.name, "scene")
-    header["SEED"] = (scene.seed, "seed of every random stream")
-    header["FRAME"] = (frame.index, "index of the frame")
-    header.append(TOP_DOWN_CARD)
-    header["SATURATE"] = (frame.saturation_dn, "saturation [DN]")
+    header = fits.Header(
+        [
+            ("EXPTIME", frame.exposure_s, "exposure [s]"),
+            ("DATE-OBS", utc_text(scene, frame.t_mid_s), "mid-exposure [UTC]"),
+            ("TMID", frame.t_mid_s, "mid-exposure since the scene's start [s]"),
+            ("SCENE", scene.name, "scene"),
+            ("SEED", scene.seed, "seed of every random stream"),
+            ("FRAME", frame.index, "index of the frame"),
+            TOP_DOWN_CARD,
+            ("SATURATE", frame.saturation_dn, "saturation [DN]"),
+        ]
+    )
     header.update(wcs_cards)
     header["COMMENT"] = comment
     return fits.PrimaryHDU(frame.image_dn, header)

@@ -17,7 +17,7 @@ from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
 from skysim.core.types import ATTITUDES, Floats, Record
-from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB
+from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
 from skysim.results.files.row_parts import EXTRA
@@ -103,13 +103,10 @@ def message(
 def continuous_quaternions(xyzw: Floats) -> Floats:
     """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
 
-    q and -q are the same attitude. Each quaternion takes the sign that makes its dot product with the previous one
-    positive, so that other tools can interpolate between them.
+    Other tools can interpolate between them.
     """
-    dot = np.sum(xyzw[1:] * xyzw[:-1], axis=1)
     first = -1.0 if xyzw[0, 3] < 0 else 1.0
-    sign = first * np.concatenate([[1.0], np.cumprod(np.where(dot < 0, -1.0, 1.0))])
-    return xyzw * sign[:, None] + 0.0  # + 0.0 turns -0.0 into 0.0
+    return first * continuous(xyzw) + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 def epoch(utc: datetime.datetime) -> str:
@@ -368,7 +365,6 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
 def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str, str]]:
     """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
-    yield "frame", np.array([truth.frame for truth in frame_truths]), "", ""
     yield (
         "mid_utc",
         np.array(utc, dtype="datetime64[us]").astype(np.int64),
@@ -376,6 +372,7 @@ def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str
         "microseconds since 1970-01-01",
     )
     for name, axis in (
+        ("frame", ""),
         ("t_mid_s", ""),
         ("exposure_s", ""),
         ("rate_cam_rad_s", "xyz"),

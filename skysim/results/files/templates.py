@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.types import Floats, normalized
-from skysim.results.files.parts import build_design
+from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
 from skysim.sources.dome.layouts.string import directions
@@ -151,41 +151,9 @@ SECTORS = 180
 MARK_M = 4e-3  # size of an LED's mark on the mesh
 
 
-class Dome(NamedTuple):
-    """What the builder makes: the surface to the cap's rim, and LEDs by number (N,) at (N, 3) places.
-
-    Attributes
-    ----------
-    name
-        Name of the scene
-    led_radius_m
-        Radius of an LED's disk
-    """
-
-    name: str
-    surface: Surface
-    cap_deg: float
-    led: NDArray[np.int64]
-    led_m: Floats
-    led_radius_m: float
-
-
 def template(lab: Lab, ending: str) -> str:
     """The text of a template for a scene's dome, by its file's ending. Raises InputError without a dome."""
-    return TEMPLATES[ending](dome_of(lab))
-
-
-def dome_of(lab: Lab) -> Dome:
-    """The dome that a scene's builder makes. Raises InputError without a dome."""
-    design = build_design(lab.scene, "templates")
-    return Dome(
-        lab.scene.name,
-        design.surface,
-        design.cap_deg,
-        design.leds.id,
-        design.leds.place[:, :3],
-        design.light.led.disk_diameter_m / 2,
-    )
+    return TEMPLATES[ending](DomeDesign(lab.scene, "templates"))
 
 
 def at(surface: Surface, rays: Floats) -> Floats:
@@ -220,7 +188,7 @@ def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     return np.column_stack([x_m, y_m])
 
 
-def gore_count(dome: Dome, widest_m: float = MAX_WIDTH_M) -> int:
+def gore_count(dome: DomeDesign, widest_m: float = MAX_WIDTH_M) -> int:
     """The least number of gores of which none is wider than a sheet, nor than MAX_WIDTH_M."""
     tilt_rad = np.radians(np.arange(1, dome.cap_deg + 1))
     azimuth_rad = np.radians(np.arange(0, 360, 10.0))
@@ -238,7 +206,7 @@ class Gore(NamedTuple):
     shapes: list[Shape]
 
 
-def gore(dome: Dome, number: int, count: int) -> Gore:
+def gore(dome: DomeDesign, number: int, count: int) -> Gore:
     """Gore `number`, from 0, of `count`: outline, meridian, title, a circle and a number for each LED."""
     rays = normalized(dome.led_m)
     turns = np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)
@@ -256,7 +224,7 @@ def gore(dome: Dome, number: int, count: int) -> Gore:
         Polyline(outline_mm, closed=True),
         Polyline(meridian_mm, dashed=True),
         SheetText(x_mm - 12, y_mm - 2, 4.0, title),
-        *marks(dome.led[own], leds_mm, 1e3 * dome.led_radius_m),
+        *marks(dome.leds.id[own], leds_mm, 1e3 * dome.led_radius_m),
     ]
     return Gore(outline_mm, shapes)
 
@@ -268,7 +236,7 @@ def moved(shape: Shape, x_mm: float, y_mm: float) -> Shape:
     return shape._replace(x_mm=shape.x_mm + x_mm, y_mm=shape.y_mm + y_mm)
 
 
-def gores(dome: Dome) -> Drawing:
+def gores(dome: DomeDesign) -> Drawing:
     """The gores of a dome side by side at full scale; a line of RULE_MM tells whether the print is to scale."""
     count = gore_count(dome)
     shapes = list[Shape]()
@@ -322,7 +290,7 @@ def cross(x_mm: float, y_mm: float, reach_mm: float, layer: str) -> Iterator[Sha
         yield Polyline(np.add(np.outer([-1, 1], arm), (x_mm, y_mm)), layer=layer)
 
 
-def shell_obj(dome: Dome) -> str:
+def shell_obj(dome: DomeDesign) -> str:
     """The inner surface to the cap's rim as a mesh in mm, and for each LED an object `led_NUMBER`, a small pyramid
     whose base is on the surface and whose tip points outward.
     """
@@ -345,7 +313,7 @@ def shell_obj(dome: Dome) -> str:
         high = 2 + (ring + 1) * SECTORS
         corners = zip(around + low, onward + low, onward + high, around + high, strict=True)
         lines += [f"f {a} {b} {c} {d}" for a, b, c, d in corners]
-    leds = zip(dome.led, dome.led_m, dome.surface.inward(dome.led_m), strict=True)
+    leds = zip(dome.leds.id, dome.led_m, dome.surface.inward(dome.led_m), strict=True)
     for n, (number, place_m, inward) in enumerate(leds):
         # A face counts from the pyramid's first vertex, 1-based.
         first = len(vertices_m) + 4 * n + 1
@@ -367,7 +335,7 @@ def vertex_lines(points_m: Floats) -> list[str]:
     return [f"v {x:.4f} {y:.4f} {z:.4f}" for x, y, z in 1e3 * points_m]
 
 
-TEMPLATES: dict[str, Callable[[Dome], str]] = {
+TEMPLATES: dict[str, Callable[[DomeDesign], str]] = {
     ".svg": lambda dome: to_svg(gores(dome)),
     ".dxf": lambda dome: to_dxf(gores(dome)),
     ".obj": shell_obj,

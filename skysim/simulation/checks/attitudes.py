@@ -86,7 +86,7 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
     """
     scene = lab.scene
     reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-    vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), reference)
+    vibration = Vibration(scene.motion, random_stream(scene.seed, JITTER, 0), reference)
     if not vibration.components:
         return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 1, 3))
     after_s = exposure_s * np.linspace(-0.5, 0.5, SAMPLES)

@@ -80,7 +80,7 @@ def build_lights(plan: LightPlan) -> tuple[Light, ...]:
         found.append(Baffle(camera.baffle))
     # A collimated display has no obstacles in its beam.
     if getattr(scene.light, "occlusion", False):
-        found.append(Vehicle(multibody.build_obstacles(plan.vehicle, plan.mount)))
+        found.append(Vehicle(multibody.Obstacles(plan.vehicle, plan.mount)))
         if dome:
             found.append(DomeWall(build_surface(dome.surface)))
     if camera.ghosts:

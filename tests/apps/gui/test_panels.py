@@ -816,7 +816,7 @@ def test_a_flight_equals_that_of_the_command_line_and_keeps_its_frames() -> None
             assert set(log) >= {"momentum", "pointing"}
             # They are the frames of the command line: the same truth, errors and lights.
             flight = open_flight(loader.load("simsat_slew", {"exposure.frames": "4"}))
-            expected = [scoring.score(shot).row for shot in flight.shots()]
+            expected = [scoring.Score(shot).row for shot in flight.shots()]
             np.testing.assert_array_equal(
                 [row.cross_arcsec for row in rows], [one.cross_arcsec for one in expected]
             )

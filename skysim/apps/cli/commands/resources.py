@@ -67,7 +67,7 @@ def scenes_export(
         Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page).
     """
     from skysim.core import files
-    from skysim.results.files import fmu, gore_pages, templates
+    from skysim.results.files import fmu, gore_pages, parts, templates
     from skysim.simulation.lab import build_lab
     from skysim.sources.dome.layouts.led_list import led_list
 
@@ -82,7 +82,7 @@ def scenes_export(
     use = f"python -m mujoco.viewer --mjcf={path}"
     if ending == ".pdf":
         files.make_folder(path.parent)
-        count = gore_pages.write_pdf(path, templates.dome_of(lab), paper)
+        count = gore_pages.write_pdf(path, parts.DomeDesign(loaded, "templates"), paper)
         print(f"{path}: {count} pages; print them at 100 %")
         return
     if ending == ".csv":
@@ -204,7 +204,7 @@ def export(
     from skysim.results.files import recording
     from skysim.results.files import run_export as export_files
 
-    run = recording.open_recording(folder)
+    run = recording.Recording(folder)
     written = export_files.export(run, to, out or folder, progress)
     if json:
         print_json([str(path) for path in written])

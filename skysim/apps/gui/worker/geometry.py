@@ -37,7 +37,7 @@ def lab_geometry(lab: Lab) -> Record:
     It has the shapes of the MJCF file that `skysim scenes export` writes, without the lights; the lights, stars on a
     sphere; the places to look from, by name; and the length of the drawn axes.
     """
-    model = multibody.laboratory(lab.export_mjcf())
+    model = multibody.Laboratory(lab.export_mjcf())
     ids, place_m, radius_m, lit = lights(lab.camera.sources)
     return {
         "shapes": [

@@ -434,7 +434,7 @@ def replay_flight(
         recorder = Recorder(folder, flight.lab.camera)
         for shot in flight.shots(cameras=[0]):
             assert shot.report is not None
-            recorder.add(scoring.score(shot))
+            recorder.add(scoring.Score(shot))
             if shot.frame.index < MAX_FRAMES:
                 write_annotated(folder, shot.frame, shot.truth, shot.report)
         if not recorder.rows:
