@@ -48,7 +48,7 @@ def joined(parts: Sequence[Kind]) -> Kind:
     return kind(*map(np.concatenate, columns))
 
 
-def taken(columns: Columns, which: Any) -> Columns:
+def taken(columns: Kind, which: Any) -> Kind:
     """The rows of a named tuple of columns that a mask, indices, a slice or one index select."""
     table: Any = columns
     return table._make(column[which] for column in table)
