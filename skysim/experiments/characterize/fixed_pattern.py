@@ -254,7 +254,7 @@ Planes = tuple[Floats, Floats, Floats]
 def dark_planes(darks: Sequence[Level], transfer: Transfer) -> Planes:
     """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature."""
     times = exposures_s(darks)
-    every = np.ones(darks[0].first_dn.shape, bool)
+    every = np.ones(darks[0].mean_dn.shape, bool)
     weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
     weight /= weight.sum()
     middle = weight @ times

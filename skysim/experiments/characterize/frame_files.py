@@ -7,8 +7,7 @@ temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or
 
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +25,6 @@ from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
-    LevelBuilder,
     blocks,
     exposures_s,
     median_and_spread,
@@ -49,14 +47,11 @@ class Setting(NamedTuple):
     temperature_c: float | None
 
 
-@dataclass
-class Stack:
-    """The levels of a folder's frames, and the median of each frame."""
+class Stack(NamedTuple):
+    """The levels of a folder's frames."""
 
     folder: Path
-    levels: list[Level] = field(default_factory=list)
-    medians: dict[Setting, list[tuple[float, Path]]] = field(default_factory=dict)
-    shape: tuple[int, ...] = ()
+    levels: list[Level]
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -148,8 +143,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     shape
         (height, width) of the camera's frames
     """
-    builders: dict[Setting, LevelBuilder] = {}
-    stack = Stack(folder)
+    levels: dict[Setting, Level] = {}
     shift = None
     for path, setting, frame in read_frames(folder):
         images.check_size(path, frame, shape)
@@ -161,12 +155,13 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
                 f"{numbers.max()} DN",
                 f"up to {2**bits - 1}, the {bits} bits of the camera",
             )
-        builders.setdefault(setting, LevelBuilder()).add(numbers)
-        stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
-    check_settings(stack, builders)
-    order = sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
-    stack.levels += [builders[setting].level(*setting) for setting in order]
-    return stack
+        level = levels.setdefault(setting, Level(*setting))
+        level.add(numbers)
+        level.medians.append((float(np.median(numbers)), path))
+    found = list(levels.values())
+    check_settings(found)
+    found.sort(key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
+    return Stack(folder, found)
 
 
 def padding_bits(frame: Numbers, bits: int) -> int:
@@ -178,23 +173,21 @@ def padding_bits(frame: Numbers, bits: int) -> int:
     return min(zeros, 16 - bits)
 
 
-def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
+def check_settings(levels: Sequence[Level]) -> None:
     """Raise InputError if an exposure has a single frame, or if only some frames have a temperature."""
-    for setting, builder in builders.items():
-        if builder.frames < 2:
-            path = stack.medians[setting][0][1]
-            raise InputError(
-                path, f"the only frame of {describe(setting)}", "2 or more, alike"
-            )
-    unknown = [setting for setting in builders if setting.temperature_c is None]
-    if unknown and len(unknown) < len(builders):
-        path = stack.medians[unknown[0]][0][1]
+    for one in levels:
+        if not one.pairs:
+            path = one.medians[0][1]
+            raise InputError(path, f"the only frame of {describe(one)}", "2 or more, alike")
+    unknown = [one for one in levels if one.temperature_c is None]
+    if unknown and len(unknown) < len(levels):
+        path = unknown[0].medians[0][1]
         raise InputError(
             path, "no temperature, which other frames have", "of all frames, or of none"
         )
 
 
-def describe(one: Setting | Level) -> str:
+def describe(one: Level) -> str:
     """An exposure and temperature for a message."""
     at = "" if one.temperature_c is None else f" at {one.temperature_c:g} °C"
     return f"{one.exposure_s:g} s{at}"
@@ -311,10 +304,9 @@ POLYPLETS = 110
 def check_darks(darks: Stack) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
     for level in darks.levels:
-        medians = darks.medians[Setting(level.exposure_s, level.temperature_c)]
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
-        middle = float(np.median([median for median, _ in medians]))
-        worst, path = max(medians)
+        middle = float(np.median([median for median, _ in level.medians]))
+        worst, path = max(level.medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
                 path,
@@ -360,8 +352,7 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
-    both = np.minimum(level.first_dn, level.second_dn)
-    bright = both > np.median(mean) + SPOT_SIGMAS * max(
+    bright = level.halves_dn.min(axis=0) > np.median(mean) + SPOT_SIGMAS * max(
         median_and_spread(mean)[1], noise_dn / math.sqrt(level.count)
     )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))

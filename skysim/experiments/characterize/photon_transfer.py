@@ -21,7 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,43 +143,74 @@ class Moments(NamedTuple):
     variance_sigma_dn2: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(eq=False)
 class Level:
-    """Frames of one exposure time and temperature.
+    """Frames of one exposure time and temperature, added one after the other: no more than one of them is in memory.
 
     Attributes
     ----------
-    count
-        Number of frames, even
-    greatest_dn, least_dn
-        Greatest and least number of all pixels
-    first_dn, second_dn
-        (H, W) means of the first and of the second frames of the pairs
-    variance_dn2
-        (H, W) temporal variance of every pixel, from count / 2 pairs
-    difference_dn2
-        Mean square of the difference of the frames of a pair, averaged over the frame
+    medians
+        Median of each frame, and its file
+    pairs
+        Number of complete pairs
+    greatest_dn
+        Greatest number of all pixels
+    first
+        A frame that waits for the second one of its pair
+    sums
+        (3, H, W) sums over the pairs: first frames, second frames, squares of their differences
+    square_dn2
+        Sum over the pairs of the square of the difference, averaged over the frame
     """
 
     exposure_s: float
     temperature_c: float | None
-    count: int
-    first_dn: Floats32
-    second_dn: Floats32
-    variance_dn2: Floats32
-    difference_dn2: float
-    least_dn: int
-    greatest_dn: int
+    medians: list[tuple[float, Path]] = field(default_factory=list)
+    pairs: int = 0
+    greatest_dn: int = 0
+    first: NDArray | None = None
+    sums: Any = 0
+    square_dn2: float = 0.0
+
+    def add(self, frame: NDArray) -> None:
+        """Add a frame of digital numbers; every second one completes a pair, and an odd last one is left out."""
+        if self.first is None:
+            self.first = frame
+            return
+        difference = self.first.astype(np.float32) - frame
+        offset_dn = trimmed_mean(difference)
+        difference -= np.float32(offset_dn)
+        pair = np.stack([self.first, frame, np.square(difference)])
+        self.sums += pair
+        self.greatest_dn = max(self.greatest_dn, int(pair[:2].max()))
+        self.square_dn2 += offset_dn**2
+        self.pairs += 1
+        self.first = None
+
+    @property
+    def count(self) -> int:
+        """Number of frames, even."""
+        return 2 * self.pairs
 
     @property
     def halves_dn(self) -> Floats32:
         """(2, H, W) means of the first and of the second frames of the pairs."""
-        return np.stack([self.first_dn, self.second_dn])
+        return self.sums[:2] / np.float32(self.pairs)
 
     @property
     def mean_dn(self) -> Floats:
         """(H, W) mean of all frames."""
         return self.halves_dn.mean(axis=0, dtype=np.float64)
+
+    @property
+    def variance_dn2(self) -> Floats32:
+        """(H, W) temporal variance of every pixel."""
+        return self.sums[2] / np.float32(self.count)
+
+    @property
+    def difference_dn2(self) -> float:
+        """Mean square of the difference of the frames of a pair, averaged over the frame."""
+        return self.square_dn2 / self.pairs
 
     def moments(self, used: Bools) -> Moments:
         """Mean and variance over the used pixels.
@@ -191,55 +223,6 @@ class Level:
             math.sqrt(variance.mean() / self.count / variance.size),
             float(variance.mean()),
             float(variance.std() / np.sqrt(variance.size)),
-        )
-
-
-class LevelBuilder:
-    """Adds frames of one size to a level, one after the other, so that no more than one is in memory."""
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self.first: NDArray | None = None
-        self.sums: list[Floats32] = []
-        self.difference_dn2 = 0.0
-        self.least_dn = np.iinfo(np.int64).max
-        self.greatest_dn = 0
-
-    def add(self, frame: NDArray) -> None:
-        """Add a frame of digital numbers; every second one completes a pair."""
-        self.frames += 1
-        if self.first is None:
-            self.first = frame
-            return
-        difference = self.first.astype(np.float32) - frame
-        offset_dn = trimmed_mean(difference)
-        difference -= np.float32(offset_dn)
-        np.square(difference, out=difference)
-        self.sums = self.sums or [np.zeros(frame.shape, np.float32) for _ in range(3)]
-        for total, one in zip(self.sums, (self.first, frame, difference), strict=True):
-            total += one
-        self.least_dn = min(self.least_dn, int(self.first.min()), int(frame.min()))
-        self.greatest_dn = max(self.greatest_dn, int(self.first.max()), int(frame.max()))
-        self.difference_dn2 += offset_dn**2
-        self.first = None
-
-    def level(self, exposure_s: float, temperature_c: float | None) -> Level:
-        """The level of the pairs so far, at least one; an odd last frame is left out."""
-        pairs = self.frames // 2
-        first, second, squares = (
-            total / np.float32(divisor)
-            for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
-        )
-        return Level(
-            exposure_s,
-            temperature_c,
-            2 * pairs,
-            first,
-            second,
-            squares,
-            self.difference_dn2 / pairs,
-            self.least_dn,
-            self.greatest_dn,
         )
 
 

@@ -139,7 +139,7 @@ def usable_pixels(darks: Levels) -> Bools:
 
     Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
     """
-    usable = np.ones(darks[0].first_dn.shape, bool)
+    usable = np.ones(darks[0].mean_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
         median, spread = median_and_spread(mean)
@@ -154,7 +154,7 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Bools:
 
     Each half is the mean of count / 2 frames, so their difference has the variance 4 variance_dn2 / count.
     """
-    return np.abs(one.first_dn - one.second_dn) <= HIT_SIGMAS * np.sqrt(
+    return np.ptp(one.halves_dn, axis=0) <= HIT_SIGMAS * np.sqrt(
         4 * np.maximum(variance_dn2, 0.2) / one.count
     )
 

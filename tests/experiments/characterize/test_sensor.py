@@ -23,7 +23,6 @@ from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
-    LevelBuilder,
     Moments,
     TransferPoint,
     propagate,
@@ -68,10 +67,10 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
 
 def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
     """The level of two frames or more."""
-    builder = LevelBuilder()
+    found = Level(exposure_s, temperature_c)
     for frame in frames:
-        builder.add(frame)
-    return builder.level(exposure_s, temperature_c)
+        found.add(frame)
+    return found
 
 
 def measured(
