@@ -255,7 +255,7 @@ def dark_planes(darks: Sequence[Level], transfer: Transfer) -> Planes:
     """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature."""
     times = exposures_s(darks)
     every = np.ones(darks[0].mean_dn.shape, bool)
-    weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
+    weight = np.array([one.count / one.point(every).variance_dn2[0] for one in darks])
     weight /= weight.sum()
     middle = weight @ times
     spread = weight @ (times - middle) ** 2
