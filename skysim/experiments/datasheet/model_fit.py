@@ -74,11 +74,8 @@ def unit_mean(sheet: MeasuredFrames) -> Floats:
 def unit_scatter(errors: Floats) -> Floats:
     """(3,) standard deviation among units of the (3, fields, units, states, attitudes, frames) errors' means."""
     means = errors.mean(axis=(3, 4, 5))
-    units = means.shape[2]
-    if units == 1:
-        return np.zeros(3)
     apart = means - means.mean(axis=2, keepdims=True)
-    return rms_of_term(common_square(apart).sum(axis=2) / (units - 1))
+    return rms_of_term(common_square(apart).sum(axis=2) / max(means.shape[2] - 1, 1))
 
 
 def log_scale(first: Floats, second: Floats) -> float:
