@@ -331,12 +331,13 @@ def measure_sensor(
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
     darks = frame_files.read_stack(darks_folder, shape, bits)
-    frame_files.check_darks(darks)
+    frame_files.check_darks(darks_folder, darks)
     flats = frame_files.read_stack(flats_folder, shape, bits)
-    usable = sensor_fit.usable_pixels(darks.levels)
-    shortest = min(darks.levels, key=lambda one: one.exposure_s)
-    frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
-    return sensor_fit.characterize(darks.levels, flats.levels)
+    usable = sensor_fit.usable_pixels(darks)
+    shortest = min(darks, key=lambda one: one.exposure_s)
+    black_dn = float(np.median(shortest.mean_dn))
+    frame_files.check_flats(flats_folder, flats, usable, black_dn)
+    return sensor_fit.characterize(darks, flats)
 
 
 def measure_night(

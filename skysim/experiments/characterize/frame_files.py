@@ -47,13 +47,6 @@ class Setting(NamedTuple):
     temperature_c: float | None
 
 
-class Stack(NamedTuple):
-    """The levels of a folder's frames."""
-
-    folder: Path
-    levels: list[Level]
-
-
 def image_files(folder: Path) -> list[Path]:
     """The images of a folder and its subfolders by name; FITS if one name has several formats. Raises InputError."""
     found = images.best_images(folder, lambda path: not images.is_fits(path), recursive=True)
@@ -133,7 +126,7 @@ def read_settings(path: Path) -> dict[str, Setting]:
     }
 
 
-def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
+def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> list[Level]:
     """The levels of a folder's frames, by exposure. Raises InputError with one line.
 
     Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
@@ -161,7 +154,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     found = list(levels.values())
     check_settings(found)
     found.sort(key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
-    return Stack(folder, found)
+    return found
 
 
 def padding_bits(frame: Numbers, bits: int) -> int:
@@ -301,9 +294,9 @@ MAX_SPOTS = 3  # greatest number of spots beyond those expected by chance
 POLYPLETS = 110
 
 
-def check_darks(darks: Stack) -> None:
+def check_darks(folder: Path, darks: Sequence[Level]) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
-    for level in darks.levels:
+    for level in darks:
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
         middle = float(np.median([median for median, _ in level.medians]))
         worst, path = max(level.medians)
@@ -313,21 +306,20 @@ def check_darks(darks: Stack) -> None:
                 f"not dark: median {worst:g} DN, the other frames of {describe(level)} {middle:g} DN",
                 "darks with the lens capped",
             )
-    for level in darks.levels:
-        check_dark(darks, level)
-    times = {one.exposure_s for one in darks.levels}
+    for level in darks:
+        check_dark(folder, level)
+    times = {one.exposure_s for one in darks}
     if len(times) < 2:
         only = times.pop()
         raise InputError(
-            darks.folder,
+            folder,
             f"darks of {only:g} s only",
             f"two exposures or more: add 4 of the shortest and 4 of {max(10 * only, 10):g} s",
         )
 
 
-def check_dark(darks: Stack, level: Level) -> None:
+def check_dark(folder: Path, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
-    folder = darks.folder
     which = f"the darks of {describe(level)}"
     mean = level.mean_dn
     noise_dn = max(math.sqrt(np.median(level.variance_dn2)), 0.3)
@@ -368,15 +360,15 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
 
 
-def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
+def check_flats(folder: Path, flats: Sequence[Level], usable: Bools, black_dn: float) -> None:
     """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
-    signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
-    times = exposures_s(flats.levels)
+    signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats])
+    times = exposures_s(flats)
     top = signals.max()
     below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
         raise InputError(
-            flats.folder,
+            folder,
             f"all saturated, at {top + black_dn:.0f} DN",
             f"{LEAST_LEVELS} levels or more below: exposures shorter than {times.min():.3g} s",
         )
@@ -384,23 +376,23 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
         lacking = LEAST_LEVELS - int(below.sum())
         longest = float(times[signals >= top].min())
         raise InputError(
-            flats.folder,
+            folder,
             f"{int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
             f"{LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
             f" {0.6 * longest:.2g} s",
         )
-    for one, signal in zip(flats.levels, signals, strict=True):
+    for one, signal in zip(flats, signals, strict=True):
         which = f"the flats of {describe(one)}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
-                flats.folder,
+                folder,
                 f"{which} are equal in every pixel",
                 "frames of their own, no copies",
             )
         change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
         if change > MAX_PAIR_CHANGE:
             raise InputError(
-                flats.folder,
+                folder,
                 f"{which} differ by {100 * change:.2g} % from frame to frame",
                 f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
             )
@@ -409,7 +401,7 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
             extent = float(np.ptp(medians) / medians.mean())
             if extent > MAX_FLAT_RANGE:
                 raise InputError(
-                    flats.folder,
+                    folder,
                     f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
                     f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
                 )

@@ -31,10 +31,8 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats, Ints
+from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.results.metrics import SIGMAS, TAILS
-
-Floats32 = NDArray[np.float32]
 
 # A measured number with its interval.
 
@@ -208,7 +206,7 @@ class Level:
         return 2 * self.pairs
 
     @property
-    def halves_dn(self) -> Floats32:
+    def halves_dn(self) -> Singles:
         """(2, H, W) means of the first and of the second frames of the pairs."""
         return self.sums[:2] / np.float32(self.pairs)
 
@@ -218,7 +216,7 @@ class Level:
         return self.halves_dn.mean(axis=0, dtype=np.float64)
 
     @property
-    def variance_dn2(self) -> Floats32:
+    def variance_dn2(self) -> Singles:
         """(H, W) temporal variance of every pixel."""
         return self.sums[2] / np.float32(self.count)
 
@@ -245,7 +243,7 @@ class Level:
         return TransferPoints(*np.atleast_1d(*values))
 
 
-def trimmed_mean(difference: Floats32) -> float:
+def trimmed_mean(difference: Singles) -> float:
     """Mean of the pixels within TRIM interquartile ranges of the median, which excludes those that a particle hit."""
     low, middle, high = np.quantile(
         difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)

@@ -228,11 +228,13 @@ def dark_parameters(
     _, pixel_rates, weights = planes
     gain = transfer.values[GAIN]
     read = transfer.values[READ] + ROUNDING_DN2
-    steady = np.ones(pixel_rates[0].shape, bool)
-    for one in darks:
-        steady &= steady_pixels(
-            one, read + gain * np.maximum(one.mean_dn - transfer.values[BLACK], 0.0)
-        )
+    black = transfer.values[BLACK]
+    steady = np.logical_and.reduce(
+        [
+            steady_pixels(one, read + gain * np.maximum(one.mean_dn - black, 0.0))
+            for one in darks
+        ]
+    )
     rates = pixel_rates.mean(axis=0)[steady]
     counts = np.array([one.count for one in darks])
     times = exposures_s(darks)
@@ -242,7 +244,7 @@ def dark_parameters(
     )
     top_dn = max(one.greatest_dn for one in darks)
     full_dn = np.array(0.98 * top_dn)
-    greatest = float(transfer.linear_dn(full_dn - transfer.values[BLACK]) / times.max())
+    greatest = float(transfer.linear_dn(full_dn - black) / times.max())
     # A pixel that saturates in the longest dark has a greater rate than the line through its darks.
     longest = max(darks, key=lambda one: one.exposure_s)
     rates[longest.mean_dn[steady] >= full_dn] = greatest

@@ -191,16 +191,9 @@ class Designer:
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
         self.under_stars = scene.stars is not None
         self.noise = 0
-
-    @property
-    def units(self) -> int:
-        """Number of units; 1 if all units of the scene are equal."""
-        return self.size.units if self.seeds else 1
-
-    @property
-    def states(self) -> int:
-        """Number of thermal states."""
-        return max(len(self.temperatures_c), 1)
+        # Equal units are one, as is a scene without thermal states.
+        self.units = size.units if self.seeds else 1
+        self.states = max(len(self.temperatures_c), 1)
 
     def settings(
         self, unit: int = 0, state: int = 0, attitude: int = 0, turn_deg: float = 0.0
@@ -403,10 +396,6 @@ class MeasuredFrames(NamedTuple):
         return list(
             dict.fromkeys(self.cells[row].levels[name] for row in self.rows(experiment))
         )
-
-    def column(self, name: str, rows: CellRows) -> NDArray[Any]:
-        """(cells, fields) values of a column in some cells."""
-        return self.columns[name][rows]
 
     def right(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame was solved and is not false."""
