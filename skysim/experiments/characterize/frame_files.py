@@ -89,10 +89,7 @@ def frame_setting(
     """Exposure and temperature of a frame. Raises InputError without an exposure."""
     if path.name in table:
         return table[path.name]
-    names = [
-        path.name[: -len(images.image_suffix(path.name))],
-        *path.relative_to(root).parts[-2::-1],
-    ]
+    names = [images.stem_of(path), *path.relative_to(root).parts[-2::-1]]
     exposure_s = picture.exposure_s
     temperature_c = picture.temperature_c
     for name in names:
@@ -389,7 +386,9 @@ def check_flats(folder: Path, flats: Sequence[Level], usable: Bools, black_dn: f
                 f"{which} are equal in every pixel",
                 "frames of their own, no copies",
             )
-        change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
+        change = (
+            math.sqrt(one.square_dn2 / one.pairs) / signal if signal > 0.02 * top else 0.0
+        )
         if change > MAX_PAIR_CHANGE:
             raise InputError(
                 folder,

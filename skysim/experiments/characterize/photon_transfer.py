@@ -142,6 +142,8 @@ class TransferPoints:
         1 for a flat, 0 for a dark
     dark
         Index of the temperature of its dark current
+    difference_dn2
+        Mean square of the difference of the frames of a pair, averaged over the frame
     """
 
     exposure_s: Floats
@@ -151,6 +153,7 @@ class TransferPoints:
     mean_sigma_dn: Floats
     variance_dn2: Floats
     variance_sigma_dn2: Floats
+    difference_dn2: Floats
 
     def take(self, which: Bools | Ints) -> TransferPoints:
         return TransferPoints(*(getattr(self, name)[which] for name in self.__slots__))
@@ -220,11 +223,6 @@ class Level:
         """(H, W) temporal variance of every pixel."""
         return self.sums[2] / np.float32(self.count)
 
-    @property
-    def difference_dn2(self) -> float:
-        """Mean square of the difference of the frames of a pair, averaged over the frame."""
-        return self.square_dn2 / self.pairs
-
     def point(self, used: Bools, lit: int = 0, dark: int = 0) -> TransferPoints:
         """The level as one point, by its used pixels.
 
@@ -239,6 +237,7 @@ class Level:
             math.sqrt(variance.mean() / self.count / variance.size),
             variance.mean(),
             variance.std() / np.sqrt(variance.size),
+            self.square_dn2 / self.pairs,
         )
         return TransferPoints(*np.atleast_1d(*values))
 
@@ -425,12 +424,7 @@ def saturated(points: TransferPoints) -> Bools:
     return brighter & (variance < COLLAPSED * variance.max())
 
 
-def lamp_flicker(
-    points: TransferPoints,
-    difference_dn2: Sequence[float],
-    black_dn: float,
-    pixels: int,
-) -> float:
+def lamp_flicker(points: TransferPoints, black_dn: float, pixels: int) -> float:
     """Relative flicker from frame to frame, from differences between the means of a pair that noise does not explain.
 
     The frames of a pair are independent, so the mean square difference is 2 (flicker signal)^2 + 2 variance / pixels.
@@ -439,7 +433,7 @@ def lamp_flicker(
     """
     signal = points.mean_dn - black_dn
     noise = 2 * points.variance_dn2 / pixels
-    excess = (np.array(difference_dn2) - noise) / (2 * signal**2)
+    excess = (points.difference_dn2 - noise) / (2 * signal**2)
     chance = math.sqrt(2 / len(signal)) * math.sqrt(np.mean((noise / (2 * signal**2)) ** 2))
     mean = float(np.mean(excess))
     return math.sqrt(mean) if mean > SIGNIFICANT * chance else 0.0

@@ -123,8 +123,7 @@ def fitted_transfer(
     below = signal <= photon_transfer.FIT_RANGE * signal.max()
     fitted = list(compress(flats, below))
     lit = flat_points.take(below)
-    changes = [one.difference_dn2 for one in fitted]
-    flicker = photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum()))
+    flicker = photon_transfer.lamp_flicker(lit, black_dn, int(usable.sum()))
     return photon_transfer.fit(joined([dark_points, lit]), flicker), fitted
 
 

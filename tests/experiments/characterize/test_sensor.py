@@ -122,7 +122,7 @@ def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_a
         sigma**2 * np.sqrt(2 / 2 / pattern.size), rel=0.02
     )
     assert abs(moments.mean_dn - pattern.mean() - 1.5) < 4 * sigma / np.sqrt(4 * pattern.size)
-    assert found.difference_dn2 == pytest.approx(1.0, rel=0.2)
+    assert moments.difference_dn2 == pytest.approx(1.0, rel=0.2)
 
 
 def test_an_odd_last_frame_is_left_out() -> None:
@@ -154,7 +154,9 @@ def exact_points(
             w = weight[:, None] * by / by.sum()
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
-            points.append((t_s, lit, 0, black_dn + mean, 1e-3, variance, 1e-3 * variance))
+            points.append(
+                (t_s, lit, 0, black_dn + mean, 1e-3, variance, 1e-3 * variance, 0.0)
+            )
     return TransferPoints(*map(np.array, zip(*points, strict=True)))
 
 
@@ -188,13 +190,11 @@ def test_the_lamp_s_flicker_is_the_variance_beyond_noise() -> None:
     pixels = 4000
     flicker = 0.004
     points = []
-    changes = []
     for mean in np.linspace(500, 3000, 400):
-        points.append((1.0, 1, 0, 100 + mean, 0.0, mean, 0.0))
         change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
-        changes.append(change**2)
+        points.append((1.0, 1, 0, 100 + mean, 0.0, mean, 0.0, change**2))
     levels = TransferPoints(*map(np.array, zip(*points, strict=True)))
-    assert photon_transfer.lamp_flicker(levels, changes, 100.0, pixels) == pytest.approx(
+    assert photon_transfer.lamp_flicker(levels, 100.0, pixels) == pytest.approx(
         flicker, rel=0.1
     )
 
