@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
-from skysim.core.types import Record
+from skysim.core.types import Record, joined
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
@@ -21,8 +21,6 @@ from skysim.experiments.characterize.photon_transfer import (
     GAIN,
     LIGHT,
     Estimate,
-    by_level,
-    exposures_s,
     interval_digits,
     interval_text,
     model,
@@ -145,17 +143,16 @@ def draw_transfer(found: MeasuredSensor, fig: Any) -> None:
     black = transfer.values[BLACK]
     curvature = transfer.values[CURVATURE]
     fitted = transfer.points
-    beyond = [one for one in found.flats if one not in fitted]
+    fitted_flats = fitted.take(fitted.lit > 0)
+    beyond = found.flats.take(found.flats.mean_dn > fitted_flats.mean_dn.max())
     groups = (
-        ("darks", [one for one in fitted if not one.lit], {"color": INK[1]}),
-        ("flats", [one for one in fitted if one.lit], {"color": INK[0]}),
+        ("darks", fitted.take(fitted.lit == 0), {"color": INK[1]}),
+        ("flats", fitted_flats, {"color": INK[0]}),
         ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
     )
     for name, points, colors in groups:
-        signal = by_level(points, "mean_dn") - black
-        variance = by_level(points, "variance_dn2")
-        shown = np.maximum(signal, 0.1), np.maximum(variance, 0.05)
-        curve.scatter(*shown, 18, label=name, **colors)
+        signal = np.maximum(points.mean_dn - black, 0.1)
+        curve.scatter(signal, np.maximum(points.variance_dn2, 0.05), 18, label=name, **colors)
     expected_mean, expected_variance = model(fitted, transfer.values)
     order = np.argsort(expected_mean)
     x = np.maximum(expected_mean[order] - black, 0.1)
@@ -164,10 +161,10 @@ def draw_transfer(found: MeasuredSensor, fig: Any) -> None:
         xscale="log", yscale="log", xlabel="signal [DN]", ylabel="temporal variance [DN²]"
     )
     curve.legend()
-    flats = [one for one in fitted if one.lit] + beyond
-    time_s = exposures_s(flats)
-    signal = by_level(flats, "mean_dn") - black
-    linear = (transfer.values[LIGHT] + transfer.values[FIRST_DARK + flats[0].dark]) * time_s
+    flats = joined([fitted_flats, beyond])
+    signal = flats.mean_dn - black
+    rate = transfer.values[LIGHT] + transfer.values[FIRST_DARK + flats.dark]
+    linear = rate * flats.exposure_s
     inside = signal < 0.98 * signal.max()
     line.scatter(linear[inside], 100 * (signal / linear - 1)[inside], 18, color=INK[0])
     x = np.linspace(0, linear[inside].max(), 50)
@@ -334,12 +331,13 @@ def measure_sensor(
     shape = (camera.height_px, camera.width_px)
     bits = camera.detector.bits
     darks = frame_files.read_stack(darks_folder, shape, bits)
-    frame_files.check_darks(darks)
+    frame_files.check_darks(darks_folder, darks)
     flats = frame_files.read_stack(flats_folder, shape, bits)
-    usable = sensor_fit.usable_pixels(darks.levels)
-    shortest = min(darks.levels, key=lambda one: one.exposure_s)
-    frame_files.check_flats(flats, usable, float(np.median(shortest.mean_dn)))
-    return sensor_fit.characterize(darks.levels, flats.levels)
+    usable = sensor_fit.usable_pixels(darks)
+    shortest = min(darks, key=lambda one: one.exposure_s)
+    black_dn = float(np.median(shortest.mean_dn))
+    frame_files.check_flats(flats_folder, flats, usable, black_dn)
+    return sensor_fit.characterize(darks, flats)
 
 
 def measure_night(

@@ -144,7 +144,7 @@ def hot_tail(
     An exponential has no memory: the excess over the limit has the mean H too, and the fraction
     exp(-(limit - core) / H) of the hot pixels is beyond it. Rates beyond `greatest` count as at least that.
     """
-    core, _, limit = core_values(rates, noise)
+    core, _, limit, _ = core_values(rates, noise)
     hot = rates[rates > limit]
     below = int(np.count_nonzero(hot < greatest))
     if below < LEAST_HOT:
@@ -218,21 +218,20 @@ def maximize(
     return theta, np.linalg.inv(information)
 
 
-def core_values(rates: Floats, noise: RateNoise) -> tuple[float, float, float]:
-    """Mean and DSNU of the core from robust moments, and the rate above which pixels are hot."""
+def core_values(rates: Floats, noise: RateNoise) -> tuple[float, float, float, float]:
+    """Mean and DSNU of the core from robust moments, the rate above which pixels are hot, and the robust deviation."""
     median, spread = median_and_spread(rates)
     core = max(median, 1e-3 * spread, 1e-12)
     own = max(spread**2 - noise.reading - noise.counting * core, (0.02 * spread) ** 2)
     dsnu = min(math.sqrt(own) / core, 2.0)
     width = math.sqrt(math.log1p(dsnu**2))
     limit = max(core * math.exp(HOT_SIGMAS / 1.6 * width), core + HOT_SIGMAS * spread)
-    return core, dsnu, limit
+    return core, dsnu, limit, spread
 
 
 def start_values(rates: Floats, noise: RateNoise) -> tuple[Floats, int]:
     """Parameters from moments of the core, and the number of pixels far above it."""
-    core, dsnu, limit = core_values(rates, noise)
-    _, spread = median_and_spread(rates)
+    core, dsnu, limit, spread = core_values(rates, noise)
     hot = rates[rates > limit]
     excess = max(float(hot.mean()) - limit, spread) if hot.size else spread
     share = max(hot.size, 1) / rates.size * math.exp(min((limit - core) / excess, 3.0))
@@ -254,8 +253,8 @@ Planes = tuple[Floats, Floats, Floats]
 def dark_planes(darks: Sequence[Level], transfer: Transfer) -> Planes:
     """Line of every pixel against the exposure, by weighted least squares over the darks of one temperature."""
     times = exposures_s(darks)
-    every = np.ones(darks[0].first_dn.shape, bool)
-    weight = np.array([one.count / one.moments(every).variance_dn2 for one in darks])
+    every = np.ones(darks[0].mean_dn.shape, bool)
+    weight = np.array([one.count / one.point(every).variance_dn2[0] for one in darks])
     weight /= weight.sum()
     middle = weight @ times
     spread = weight @ (times - middle) ** 2

@@ -7,8 +7,7 @@ temperature_c), else of its FITS header (EXPTIME, CCD-TEMP), else of its name or
 
 import math
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +25,6 @@ from skysim.core.types import Bools, Floats
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
-    LevelBuilder,
     blocks,
     exposures_s,
     median_and_spread,
@@ -47,16 +45,6 @@ class Setting(NamedTuple):
 
     exposure_s: float
     temperature_c: float | None
-
-
-@dataclass
-class Stack:
-    """The levels of a folder's frames, and the median of each frame."""
-
-    folder: Path
-    levels: list[Level] = field(default_factory=list)
-    medians: dict[Setting, list[tuple[float, Path]]] = field(default_factory=dict)
-    shape: tuple[int, ...] = ()
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -101,10 +89,7 @@ def frame_setting(
     """Exposure and temperature of a frame. Raises InputError without an exposure."""
     if path.name in table:
         return table[path.name]
-    names = [
-        path.name[: -len(images.image_suffix(path.name))],
-        *path.relative_to(root).parts[-2::-1],
-    ]
+    names = [images.stem_of(path), *path.relative_to(root).parts[-2::-1]]
     exposure_s = picture.exposure_s
     temperature_c = picture.temperature_c
     for name in names:
@@ -138,7 +123,7 @@ def read_settings(path: Path) -> dict[str, Setting]:
     }
 
 
-def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
+def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> list[Level]:
     """The levels of a folder's frames, by exposure. Raises InputError with one line.
 
     Numbers that a camera or program has shifted to the upper bits of 16 are shifted back, if all are multiples.
@@ -148,8 +133,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
     shape
         (height, width) of the camera's frames
     """
-    builders: dict[Setting, LevelBuilder] = {}
-    stack = Stack(folder)
+    levels: dict[Setting, Level] = {}
     shift = None
     for path, setting, frame in read_frames(folder):
         images.check_size(path, frame, shape)
@@ -161,12 +145,13 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> Stack:
                 f"{numbers.max()} DN",
                 f"up to {2**bits - 1}, the {bits} bits of the camera",
             )
-        builders.setdefault(setting, LevelBuilder()).add(numbers)
-        stack.medians.setdefault(setting, []).append((float(np.median(numbers)), path))
-    check_settings(stack, builders)
-    order = sorted(builders, key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
-    stack.levels += [builders[setting].level(*setting) for setting in order]
-    return stack
+        level = levels.setdefault(setting, Level(*setting))
+        level.add(numbers)
+        level.medians.append((float(np.median(numbers)), path))
+    found = list(levels.values())
+    check_settings(found)
+    found.sort(key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
+    return found
 
 
 def padding_bits(frame: Numbers, bits: int) -> int:
@@ -178,23 +163,21 @@ def padding_bits(frame: Numbers, bits: int) -> int:
     return min(zeros, 16 - bits)
 
 
-def check_settings(stack: Stack, builders: dict[Setting, LevelBuilder]) -> None:
+def check_settings(levels: Sequence[Level]) -> None:
     """Raise InputError if an exposure has a single frame, or if only some frames have a temperature."""
-    for setting, builder in builders.items():
-        if builder.frames < 2:
-            path = stack.medians[setting][0][1]
-            raise InputError(
-                path, f"the only frame of {describe(setting)}", "2 or more, alike"
-            )
-    unknown = [setting for setting in builders if setting.temperature_c is None]
-    if unknown and len(unknown) < len(builders):
-        path = stack.medians[unknown[0]][0][1]
+    for one in levels:
+        if not one.pairs:
+            path = one.medians[0][1]
+            raise InputError(path, f"the only frame of {describe(one)}", "2 or more, alike")
+    unknown = [one for one in levels if one.temperature_c is None]
+    if unknown and len(unknown) < len(levels):
+        path = unknown[0].medians[0][1]
         raise InputError(
             path, "no temperature, which other frames have", "of all frames, or of none"
         )
 
 
-def describe(one: Setting | Level) -> str:
+def describe(one: Level) -> str:
     """An exposure and temperature for a message."""
     at = "" if one.temperature_c is None else f" at {one.temperature_c:g} °C"
     return f"{one.exposure_s:g} s{at}"
@@ -308,34 +291,32 @@ MAX_SPOTS = 3  # greatest number of spots beyond those expected by chance
 POLYPLETS = 110
 
 
-def check_darks(darks: Stack) -> None:
+def check_darks(folder: Path, darks: Sequence[Level]) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
-    for level in darks.levels:
-        medians = darks.medians[Setting(level.exposure_s, level.temperature_c)]
+    for level in darks:
         noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
-        middle = float(np.median([median for median, _ in medians]))
-        worst, path = max(medians)
+        middle = float(np.median([median for median, _ in level.medians]))
+        worst, path = max(level.medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(
                 path,
                 f"not dark: median {worst:g} DN, the other frames of {describe(level)} {middle:g} DN",
                 "darks with the lens capped",
             )
-    for level in darks.levels:
-        check_dark(darks, level)
-    times = {one.exposure_s for one in darks.levels}
+    for level in darks:
+        check_dark(folder, level)
+    times = {one.exposure_s for one in darks}
     if len(times) < 2:
         only = times.pop()
         raise InputError(
-            darks.folder,
+            folder,
             f"darks of {only:g} s only",
             f"two exposures or more: add 4 of the shortest and 4 of {max(10 * only, 10):g} s",
         )
 
 
-def check_dark(darks: Stack, level: Level) -> None:
+def check_dark(folder: Path, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
-    folder = darks.folder
     which = f"the darks of {describe(level)}"
     mean = level.mean_dn
     noise_dn = max(math.sqrt(np.median(level.variance_dn2)), 0.3)
@@ -360,8 +341,7 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
-    both = np.minimum(level.first_dn, level.second_dn)
-    bright = both > np.median(mean) + SPOT_SIGMAS * max(
+    bright = level.halves_dn.min(axis=0) > np.median(mean) + SPOT_SIGMAS * max(
         median_and_spread(mean)[1], noise_dn / math.sqrt(level.count)
     )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))
@@ -377,15 +357,15 @@ def check_dark(darks: Stack, level: Level) -> None:
         )
 
 
-def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
+def check_flats(folder: Path, flats: Sequence[Level], usable: Bools, black_dn: float) -> None:
     """Raise InputError unless these are flats of LEAST_LEVELS levels or more below saturation, flat and steady."""
-    signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats.levels])
-    times = exposures_s(flats.levels)
+    signals = np.array([float(one.mean_dn[usable].mean()) - black_dn for one in flats])
+    times = exposures_s(flats)
     top = signals.max()
     below = (signals < FIT_RANGE * top) & (signals > 0.01 * top)
     if signals.min() > 0.95 * top and times.max() > 1.2 * times.min():
         raise InputError(
-            flats.folder,
+            folder,
             f"all saturated, at {top + black_dn:.0f} DN",
             f"{LEAST_LEVELS} levels or more below: exposures shorter than {times.min():.3g} s",
         )
@@ -393,23 +373,25 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
         lacking = LEAST_LEVELS - int(below.sum())
         longest = float(times[signals >= top].min())
         raise InputError(
-            flats.folder,
+            folder,
             f"{int(below.sum())} levels from 1 to {100 * FIT_RANGE:.0f} % of the brightest",
             f"{LEAST_LEVELS} or more: add pairs at {lacking} exposures from {0.05 * longest:.2g} to"
             f" {0.6 * longest:.2g} s",
         )
-    for one, signal in zip(flats.levels, signals, strict=True):
+    for one, signal in zip(flats, signals, strict=True):
         which = f"the flats of {describe(one)}"
         if not one.variance_dn2.any() and signal < 0.95 * top:
             raise InputError(
-                flats.folder,
+                folder,
                 f"{which} are equal in every pixel",
                 "frames of their own, no copies",
             )
-        change = math.sqrt(one.difference_dn2) / signal if signal > 0.02 * top else 0.0
+        change = (
+            math.sqrt(one.square_dn2 / one.pairs) / signal if signal > 0.02 * top else 0.0
+        )
         if change > MAX_PAIR_CHANGE:
             raise InputError(
-                flats.folder,
+                folder,
                 f"{which} differ by {100 * change:.2g} % from frame to frame",
                 f"{100 * MAX_PAIR_CHANGE:g} %: a steady lamp, warmed up, on direct current",
             )
@@ -418,7 +400,7 @@ def check_flats(flats: Stack, usable: Bools, black_dn: float) -> None:
             extent = float(np.ptp(medians) / medians.mean())
             if extent > MAX_FLAT_RANGE:
                 raise InputError(
-                    flats.folder,
+                    folder,
                     f"{which} are not flat: {100 * extent:.0f} % brighter at {extremes(medians)}",
                     f"{100 * MAX_FLAT_RANGE:.0f} %: an integrating sphere or a diffuser, no lens",
                 )

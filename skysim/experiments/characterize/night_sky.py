@@ -352,14 +352,11 @@ def measurable(
 ) -> Floats:
     """(N, 2) pixels of stars that are bright, not saturated, and away from the border and from other stars."""
     xy = centroids.xy_px
-    if not len(xy):
-        return np.zeros((0, 2))
-    height, width = numbers.shape
-    inside = np.all((xy >= HALF_PX) & (xy <= np.array([width, height]) - 1 - HALF_PX), axis=1)
-    near = cKDTree(xy).query(xy, k=2)[0][:, 1] if len(xy) > 1 else np.array([np.inf])
-    x, y = np.rint(xy).astype(int).T
+    last = np.array(numbers.shape[::-1]) - 1
+    inside = np.all((xy >= HALF_PX) & (xy <= last - HALF_PX), axis=1)
+    near = cKDTree(xy).query(xy, k=2)[0][:, 1]
+    x, y = np.clip(np.rint(xy).astype(int), 0, last).T
     background = float(np.median(numbers))
-    peak = numbers[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     gain, _, read, black = transfer.values[: BLACK + 1]
     dark_e2 = (background - black) / gain + read / gain**2
     flux_e = centroids.flux / gain
@@ -367,38 +364,29 @@ def measurable(
     kept = (
         inside
         & (near > HALF_PX * math.sqrt(2))
-        & (peak < MAX_PEAK * saturation_dn)
+        & (numbers[y, x] < MAX_PEAK * saturation_dn)
         & (snr > LEAST_SNR)
     )
     return xy[kept]
 
 
-def trail_px2(stars: StarImages) -> tuple[float, float]:
-    """Median difference of the variances along the rows and along the columns, and twice the median covariance."""
-    if len(stars.chi2) < LEAST_TRAILED:
-        return 0.0, 0.0
-    along, across = np.median(stars.stretch_px2, axis=0)
-    return float(along), float(across)
-
-
 def without_trail(stars: StarImages) -> StarImages:
     """The images without the effect of a common trail on their mean variance: half of the stretch minus its error."""
-    count = max(len(stars.chi2), 1)
-    noise2 = (
-        float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count
-        if count > 1
-        else 0.0
-    )
-    added = math.sqrt(max(math.hypot(*trail_px2(stars)) ** 2 - noise2, 0.0)) / 2
+    count = len(stars.chi2)
+    if count < LEAST_TRAILED:
+        return stars
+    noise2 = float(np.sum(np.var(stars.stretch_px2, axis=0))) * MEDIAN_COST**2 / count
+    trail_px2 = math.hypot(*np.median(stars.stretch_px2, axis=0))
+    added = math.sqrt(max(trail_px2**2 - noise2, 0.0)) / 2
     return stars._replace(variance_px2=stars.variance_px2 - added)
 
 
 def check_trails(frames: list[NightFrame]) -> None:
     """Raise InputError for a frame whose stars trail: their images are longer in one direction."""
     for one in frames:
-        if not len(one.stars.chi2):
+        if len(one.stars.chi2) < LEAST_TRAILED:
             continue
-        along, across = trail_px2(one.stars)
+        along, across = np.median(one.stars.stretch_px2, axis=0).tolist()
         stretch = math.hypot(along, across)
         variance = float(np.median(one.stars.variance_px2))
         if stretch > MAX_STRETCH * variance:

@@ -21,7 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,10 +31,8 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.results.metrics import SIGMAS, TAILS
-
-Floats32 = NDArray[np.float32]
 
 # A measured number with its interval.
 
@@ -133,117 +132,117 @@ TRIM = 5.0  # interquartile ranges from the median within which pixels are avera
 SAMPLES = 100_000  # number of pixels from which the quartiles are computed
 
 
-class Moments(NamedTuple):
-    """Mean and temporal variance over the pixels of a level, in DN, with their standard errors."""
-
-    mean_dn: float
-    mean_sigma_dn: float
-    variance_dn2: float
-    variance_sigma_dn2: float
-
-
 @dataclass(frozen=True, slots=True)
-class Level:
-    """Frames of one exposure time and temperature.
+class TransferPoints:
+    """L levels as input of the fit, (L,) each: mean and temporal variance over the pixels with their standard errors.
 
     Attributes
     ----------
-    count
-        Number of frames, even
-    greatest_dn, least_dn
-        Greatest and least number of all pixels
-    first_dn, second_dn
-        (H, W) means of the first and of the second frames of the pairs
-    variance_dn2
-        (H, W) temporal variance of every pixel, from count / 2 pairs
+    lit
+        1 for a flat, 0 for a dark
+    dark
+        Index of the temperature of its dark current
     difference_dn2
         Mean square of the difference of the frames of a pair, averaged over the frame
     """
 
+    exposure_s: Floats
+    lit: Ints
+    dark: Ints
+    mean_dn: Floats
+    mean_sigma_dn: Floats
+    variance_dn2: Floats
+    variance_sigma_dn2: Floats
+    difference_dn2: Floats
+
+    def take(self, which: Bools | Ints) -> TransferPoints:
+        return TransferPoints(*(getattr(self, name)[which] for name in self.__slots__))
+
+
+@dataclass(eq=False)
+class Level:
+    """Frames of one exposure time and temperature, added one after the other: no more than one of them is in memory.
+
+    Attributes
+    ----------
+    medians
+        Median of each frame, and its file
+    pairs
+        Number of complete pairs
+    greatest_dn
+        Greatest number of all pixels
+    first
+        A frame that waits for the second one of its pair
+    sums
+        (3, H, W) sums over the pairs: first frames, second frames, squares of their differences
+    square_dn2
+        Sum over the pairs of the square of the difference, averaged over the frame
+    """
+
     exposure_s: float
     temperature_c: float | None
-    count: int
-    first_dn: Floats32
-    second_dn: Floats32
-    variance_dn2: Floats32
-    difference_dn2: float
-    least_dn: int
-    greatest_dn: int
-
-    @property
-    def halves_dn(self) -> Floats32:
-        """(2, H, W) means of the first and of the second frames of the pairs."""
-        return np.stack([self.first_dn, self.second_dn])
-
-    @property
-    def mean_dn(self) -> Floats:
-        """(H, W) mean of all frames."""
-        return self.halves_dn.mean(axis=0, dtype=np.float64)
-
-    def moments(self, used: Bools) -> Moments:
-        """Mean and variance over the used pixels.
-
-        Standard errors are empirical, from the scatter of the pixels' variances, since hot pixels have more noise.
-        """
-        variance = self.variance_dn2[used].astype(np.float64)
-        return Moments(
-            float(self.halves_dn[:, used].mean(dtype=np.float64)),
-            math.sqrt(variance.mean() / self.count / variance.size),
-            float(variance.mean()),
-            float(variance.std() / np.sqrt(variance.size)),
-        )
-
-
-class LevelBuilder:
-    """Adds frames of one size to a level, one after the other, so that no more than one is in memory."""
-
-    def __init__(self) -> None:
-        self.frames = 0
-        self.first: NDArray | None = None
-        self.sums: list[Floats32] = []
-        self.difference_dn2 = 0.0
-        self.least_dn = np.iinfo(np.int64).max
-        self.greatest_dn = 0
+    medians: list[tuple[float, Path]] = field(default_factory=list)
+    pairs: int = 0
+    greatest_dn: int = 0
+    first: NDArray | None = None
+    sums: Any = 0
+    square_dn2: float = 0.0
 
     def add(self, frame: NDArray) -> None:
-        """Add a frame of digital numbers; every second one completes a pair."""
-        self.frames += 1
+        """Add a frame of digital numbers; every second one completes a pair, and an odd last one is left out."""
         if self.first is None:
             self.first = frame
             return
         difference = self.first.astype(np.float32) - frame
         offset_dn = trimmed_mean(difference)
         difference -= np.float32(offset_dn)
-        np.square(difference, out=difference)
-        self.sums = self.sums or [np.zeros(frame.shape, np.float32) for _ in range(3)]
-        for total, one in zip(self.sums, (self.first, frame, difference), strict=True):
-            total += one
-        self.least_dn = min(self.least_dn, int(self.first.min()), int(frame.min()))
-        self.greatest_dn = max(self.greatest_dn, int(self.first.max()), int(frame.max()))
-        self.difference_dn2 += offset_dn**2
+        pair = np.stack([self.first, frame, np.square(difference)])
+        self.sums += pair
+        self.greatest_dn = max(self.greatest_dn, int(pair[:2].max()))
+        self.square_dn2 += offset_dn**2
+        self.pairs += 1
         self.first = None
 
-    def level(self, exposure_s: float, temperature_c: float | None) -> Level:
-        """The level of the pairs so far, at least one; an odd last frame is left out."""
-        pairs = self.frames // 2
-        first, second, squares = (
-            total / np.float32(divisor)
-            for total, divisor in zip(self.sums, (pairs, pairs, 2 * pairs), strict=True)
+    @property
+    def count(self) -> int:
+        """Number of frames, even."""
+        return 2 * self.pairs
+
+    @property
+    def halves_dn(self) -> Singles:
+        """(2, H, W) means of the first and of the second frames of the pairs."""
+        return self.sums[:2] / np.float32(self.pairs)
+
+    @property
+    def mean_dn(self) -> Floats:
+        """(H, W) mean of all frames."""
+        return self.halves_dn.mean(axis=0, dtype=np.float64)
+
+    @property
+    def variance_dn2(self) -> Singles:
+        """(H, W) temporal variance of every pixel."""
+        return self.sums[2] / np.float32(self.count)
+
+    def point(self, used: Bools, lit: int = 0, dark: int = 0) -> TransferPoints:
+        """The level as one point, by its used pixels.
+
+        Standard errors are empirical, from the scatter of the pixels' variances, since hot pixels have more noise.
+        """
+        variance = self.variance_dn2[used].astype(np.float64)
+        values = (
+            self.exposure_s,
+            lit,
+            dark,
+            self.halves_dn[:, used].mean(dtype=np.float64),
+            math.sqrt(variance.mean() / self.count / variance.size),
+            variance.mean(),
+            variance.std() / np.sqrt(variance.size),
+            self.square_dn2 / self.pairs,
         )
-        return Level(
-            exposure_s,
-            temperature_c,
-            2 * pairs,
-            first,
-            second,
-            squares,
-            self.difference_dn2 / pairs,
-            self.least_dn,
-            self.greatest_dn,
-        )
+        return TransferPoints(*np.atleast_1d(*values))
 
 
-def trimmed_mean(difference: Floats32) -> float:
+def trimmed_mean(difference: Singles) -> float:
     """Mean of the pixels within TRIM interquartile ranges of the median, which excludes those that a particle hit."""
     low, middle, high = np.quantile(
         difference.ravel()[:: max(difference.size // SAMPLES, 1)], (0.25, 0.5, 0.75)
@@ -260,34 +259,9 @@ COLLAPSED = 0.5  # a level beyond the turnover is saturated if its variance is b
 GAIN, CURVATURE, READ, BLACK, LIGHT, FIRST_DARK = range(6)  # places of the parameters
 
 
-class TransferPoint(NamedTuple):
-    """A level as input of the fit.
-
-    Attributes
-    ----------
-    lit
-        1 for a flat, 0 for a dark
-    dark
-        Index of the temperature of its dark current
-    """
-
-    exposure_s: float
-    lit: int
-    dark: int
-    moments: Moments
-
-
-Points = Sequence[TransferPoint]
-
-
-def exposures_s(levels: Sequence[Level | TransferPoint]) -> Floats:
+def exposures_s(levels: Sequence[Level]) -> Floats:
     """(L,) exposure times."""
     return np.array([one.exposure_s for one in levels])
-
-
-def by_level(points: Points, name: str) -> Floats:
-    """(L,) one of the moments of each level."""
-    return np.array([getattr(one.moments, name) for one in points])
 
 
 class Transfer(NamedTuple):
@@ -314,7 +288,7 @@ class Transfer(NamedTuple):
     covariance: Floats
     flicker: float
     misfit: float
-    points: list[TransferPoint]
+    points: TransferPoints
     drift: float = 0.0
 
     @property
@@ -343,22 +317,17 @@ def linear_dn(signal_dn: Floats, curvature: float) -> Floats:
 
 
 def model(
-    points: Points, values: Floats, light: Floats | float = 1.0
+    points: TransferPoints, values: Floats, light: Floats | float = 1.0
 ) -> tuple[Floats, Floats]:
     """Means and variances of the levels. `light`: that of each level, relative to the lamp's mean."""
-    t_s = exposures_s(points)
-    lit = np.array([one.lit for one in points])
-    rate = (
-        lit * light * values[LIGHT]
-        + values[FIRST_DARK + np.array([one.dark for one in points])]
-    )
-    x = rate * t_s
-    slope = 1 - 2 * values[CURVATURE] * rate * t_s
+    rate = points.lit * light * values[LIGHT] + values[FIRST_DARK + points.dark]
+    x = rate * points.exposure_s
+    slope = 1 - 2 * values[CURVATURE] * rate * points.exposure_s
     mean = values[BLACK] + x - values[CURVATURE] * x**2
     return mean, slope**2 * (values[GAIN] * x + values[READ]) + ROUNDING_DN2
 
 
-def fit(points: Points, flicker: float) -> Transfer:
+def fit(points: TransferPoints, flicker: float) -> Transfer:
     """Fit levels of darks and flats with the relative flicker of the lamp from `lamp_flicker`.
 
     If the flats' means scatter about the law by more than noise and flicker, by SIGNIFICANT sigmas of chi-square, the
@@ -369,7 +338,7 @@ def fit(points: Points, flicker: float) -> Transfer:
     steady = flicker / math.sqrt(2)
     found, excess = fit_levels(points, flicker, steady)
     # The lamp's rate and the curvature are fitted.
-    freedom = sum(one.lit for one in points) - 2
+    freedom = int(points.lit.sum()) - 2
     if excess <= freedom + SIGNIFICANT * math.sqrt(2 * freedom):
         return found
 
@@ -384,29 +353,29 @@ def fit(points: Points, flicker: float) -> Transfer:
     return fit_levels(points, flicker, drift)[0]._replace(drift=drift)
 
 
-def fit_levels(points: Points, flicker: float, scatter: float) -> tuple[Transfer, float]:
+def fit_levels(
+    points: TransferPoints, flicker: float, scatter: float
+) -> tuple[Transfer, float]:
     """The fit with a relative standard deviation of the light of the levels, and chi-square of the flats' means."""
-    kept = list(points)
-    mean, mean_sigma, variance, variance_sigma = np.array([one.moments for one in kept]).T
-    black = min(mean)
-    lit = np.array([one.lit for one in kept])
-    start = start_values(kept)
+    mean = points.mean_dn
+    lit = points.lit > 0
+    start = start_values(points)
     size = len(start)
 
     def residuals(values: Floats) -> Floats:
-        light = np.ones(len(kept))
-        light[lit > 0] += scatter * values[size:]
-        expected_mean, expected_variance = model(kept, values[:size], light)
+        light = np.ones(len(mean))
+        light[lit] += scatter * values[size:]
+        expected_mean, expected_variance = model(points, values[:size], light)
         return np.concatenate(
             [
                 values[size:],
-                (mean - expected_mean) / mean_sigma,
-                (variance - expected_variance) / variance_sigma,
+                (mean - expected_mean) / points.mean_sigma_dn,
+                (points.variance_dn2 - expected_variance) / points.variance_sigma_dn2,
             ]
         )
 
     scale = np.maximum(np.abs(start), 1e-9)
-    scale[CURVATURE] = 0.01 / max(mean.max() - black, 1.0)
+    scale[CURVATURE] = 0.01 / max(np.ptp(mean), 1.0)
     # The errors of the light are in units of their prior's standard deviation.
     levels = np.count_nonzero(lit)
     scale = np.append(scale, np.ones(levels))
@@ -415,56 +384,56 @@ def fit_levels(points: Points, flicker: float, scatter: float) -> tuple[Transfer
         lambda p: residuals(p * scale), start / scale, x_scale="jac", method="lm", xtol=1e-12
     )
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(scale, scale)
-    misfit = 2 * found.cost / max(2 * len(kept) - size, 1)
+    misfit = 2 * found.cost / max(2 * len(mean) - size, 1)
     values = (found.x * scale)[:size]
-    transfer = Transfer(values, covariance[:size, :size], flicker, misfit, kept)
-    light, means = np.split(found.fun[: levels + len(kept)], [levels])
-    return transfer, float(np.sum(light**2) + np.sum(means[lit > 0] ** 2))
+    transfer = Transfer(values, covariance[:size, :size], flicker, misfit, points)
+    light, means = np.split(found.fun[: levels + len(mean)], [levels])
+    return transfer, float(np.sum(light**2) + np.sum(means[lit] ** 2))
 
 
-def start_values(points: Points) -> Floats:
+def start_values(points: TransferPoints) -> Floats:
     """Start values: slope of the variance against the mean over all levels, and rates from the longest exposures."""
-    mean, variance = (by_level(points, name) for name in ("mean_dn", "variance_dn2"))
+    mean = points.mean_dn
+    variance = points.variance_dn2
     darkest = int(np.argmin(mean))
     brightest = int(np.argmax(mean))
     gain = (variance[brightest] - variance[darkest]) / max(
         mean[brightest] - mean[darkest], 1e-9
     )
     black = mean[darkest]
-    rates = [0.0] * (1 + max(one.dark for one in points))
-    for one in points:
-        if not one.lit:
-            rates[one.dark] = max(
-                rates[one.dark], (one.moments.mean_dn - black) / one.exposure_s
-            )
-    light = (mean[brightest] - black) / points[brightest].exposure_s
+    rate = (mean - black) / points.exposure_s
+    rates = np.zeros(1 + points.dark.max())
+    unlit = points.lit == 0
+    np.fmax.at(rates, points.dark[unlit], rate[unlit])  # NaN: 0 DN in 0 s
     return np.array(
-        [gain, 0.0, max(variance[darkest] - ROUNDING_DN2, 0.01), black, light, *rates]
+        [
+            gain,
+            0.0,
+            max(variance[darkest] - ROUNDING_DN2, 0.01),
+            black,
+            rate[brightest],
+            *rates,
+        ]
     )
 
 
-def saturated(points: Points) -> Bools:
+def saturated(points: TransferPoints) -> Bools:
     """(L,) whether each flat is beyond the turnover of the variance, with a variance that has collapsed."""
-    variance = by_level(points, "variance_dn2")
-    brighter = exposures_s(points) > points[int(np.argmax(variance))].exposure_s
+    variance = points.variance_dn2
+    brighter = points.exposure_s > points.exposure_s[np.argmax(variance)]
     return brighter & (variance < COLLAPSED * variance.max())
 
 
-def lamp_flicker(
-    points: Points,
-    difference_dn2: Sequence[float],
-    black_dn: float,
-    pixels: int,
-) -> float:
+def lamp_flicker(points: TransferPoints, black_dn: float, pixels: int) -> float:
     """Relative flicker from frame to frame, from differences between the means of a pair that noise does not explain.
 
     The frames of a pair are independent, so the mean square difference is 2 (flicker signal)^2 + 2 variance / pixels.
     A flicker that is not above its own error by SIGNIFICANT sigmas is set to 0: otherwise half of all steady lamps
     would have one.
     """
-    signal = by_level(points, "mean_dn") - black_dn
-    noise = 2 * by_level(points, "variance_dn2") / pixels
-    excess = (np.array(difference_dn2) - noise) / (2 * signal**2)
-    chance = math.sqrt(2 / len(points)) * math.sqrt(np.mean((noise / (2 * signal**2)) ** 2))
+    signal = points.mean_dn - black_dn
+    noise = 2 * points.variance_dn2 / pixels
+    excess = (points.difference_dn2 - noise) / (2 * signal**2)
+    chance = math.sqrt(2 / len(signal)) * math.sqrt(np.mean((noise / (2 * signal**2)) ** 2))
     mean = float(np.mean(excess))
     return math.sqrt(mean) if mean > SIGNIFICANT * chance else 0.0

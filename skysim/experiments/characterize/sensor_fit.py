@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, joined
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -19,8 +19,7 @@ from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
     Transfer,
-    TransferPoint,
-    by_level,
+    TransferPoints,
     exposures_s,
     median_and_spread,
     propagate,
@@ -55,7 +54,7 @@ class MeasuredSensor(NamedTuple):
     transfer: Transfer
     dark: fixed_pattern.DarkCurrent | None
     dark_temperature_c: float | None
-    flats: list[TransferPoint]
+    flats: TransferPoints
     linearity_error: float
     saturation_dn: float
 
@@ -71,9 +70,7 @@ def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
         key=lambda one: -math.inf if one is None else one,
     )
     own = nearest_index(temperatures, flats[0].temperature_c)
-    flat_points = [
-        TransferPoint(one.exposure_s, 1, own, one.moments(usable)) for one in flats
-    ]
+    flat_points = joined([one.point(usable, 1, own) for one in flats])
     transfer, fitted = fitted_transfer(darks, flats, temperatures, flat_points, usable)
     estimates = {"gain_e_dn": transfer.gain_e_dn, "read_noise_e": transfer.read_noise_e}
     found = MeasuredSensor(
@@ -84,7 +81,7 @@ def characterize(darks: Levels, flats: Levels) -> MeasuredSensor:
         temperatures[own],
         flat_points,
         linearity_error(flat_points, transfer),
-        float(by_level(flat_points, "mean_dn").max()),
+        float(flat_points.mean_dn.max()),
     )
     full_well(found)
     chosen = best_temperature(temperatures, darks, transfer, own)
@@ -114,24 +111,20 @@ def fitted_transfer(
     darks: Levels,
     flats: Levels,
     temperatures: Temperatures,
-    flat_points: Sequence[TransferPoint],
+    flat_points: TransferPoints,
     usable: Bools,
 ) -> tuple[Transfer, list[Level]]:
     """The photon transfer of all darks and of the flats below saturation, and these flats."""
-    dark_points = [
-        TransferPoint(
-            one.exposure_s, 0, temperatures.index(one.temperature_c), one.moments(usable)
-        )
-        for one in darks
-    ]
-    black_dn = min(point.moments.mean_dn for point in dark_points)
-    signal = by_level(flat_points, "mean_dn") - black_dn
+    dark_points = joined(
+        [one.point(usable, 0, temperatures.index(one.temperature_c)) for one in darks]
+    )
+    black_dn = float(dark_points.mean_dn.min())
+    signal = flat_points.mean_dn - black_dn
     below = signal <= photon_transfer.FIT_RANGE * signal.max()
     fitted = list(compress(flats, below))
-    lit = list(compress(flat_points, below))
-    changes = [one.difference_dn2 for one in fitted]
-    flicker = photon_transfer.lamp_flicker(lit, changes, black_dn, int(usable.sum()))
-    return photon_transfer.fit([*dark_points, *lit], flicker), fitted
+    lit = flat_points.take(below)
+    flicker = photon_transfer.lamp_flicker(lit, black_dn, int(usable.sum()))
+    return photon_transfer.fit(joined([dark_points, lit]), flicker), fitted
 
 
 def usable_pixels(darks: Levels) -> Bools:
@@ -139,7 +132,7 @@ def usable_pixels(darks: Levels) -> Bools:
 
     Hot pixels are more than HOT_SIGMAS robust standard deviations above the median.
     """
-    usable = np.ones(darks[0].first_dn.shape, bool)
+    usable = np.ones(darks[0].mean_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
         median, spread = median_and_spread(mean)
@@ -154,7 +147,7 @@ def steady_pixels(one: Level, variance_dn2: float | Floats) -> Bools:
 
     Each half is the mean of count / 2 frames, so their difference has the variance 4 variance_dn2 / count.
     """
-    return np.abs(one.first_dn - one.second_dn) <= HIT_SIGMAS * np.sqrt(
+    return np.ptp(one.halves_dn, axis=0) <= HIT_SIGMAS * np.sqrt(
         4 * np.maximum(variance_dn2, 0.2) / one.count
     )
 
@@ -194,22 +187,17 @@ def full_well(found: MeasuredSensor) -> None:
     signal there, c x of the fit.
     """
     transfer = found.transfer
-    full = list(compress(found.flats, photon_transfer.saturated(found.flats)))
-    brightest = max(found.flats, key=lambda one: one.moments.mean_dn)
-    if full:
-        level_dn = float(by_level(full, "mean_dn").mean())
-        sigma_dn = math.sqrt(np.mean([one.moments.mean_sigma_dn**2 for one in full]))
-    else:
-        level_dn = brightest.moments.mean_dn
-        sigma_dn = brightest.moments.mean_sigma_dn
+    full = found.flats.take(photon_transfer.saturated(found.flats))
+    if not full.mean_dn.size:
+        full = found.flats.take(np.argsort(-found.flats.mean_dn, kind="stable")[:1])
         found.remarks.append(
-            f"full well: the flats end at {level_dn:.0f} DN, before the variance turns; allowed: flats to twice the"
-            f" longest exposure, {brightest.exposure_s:.3g} s"
+            f"full well: the flats end at {full.mean_dn[0]:.0f} DN, before the variance turns; allowed: flats to twice"
+            f" the longest exposure, {full.exposure_s[0]:.3g} s"
         )
-    values = np.append(transfer.values, level_dn)
+    values = np.append(transfer.values, full.mean_dn.mean())
     covariance = np.zeros((len(values), len(values)))
     covariance[:-1, :-1] = transfer.covariance
-    covariance[-1, -1] = sigma_dn**2
+    covariance[-1, -1] = np.mean(full.mean_sigma_dn**2)
 
     def signal(p: Floats) -> float:
         return float(photon_transfer.linear_dn(np.array(p[-1] - p[BLACK]), p[CURVATURE]))
@@ -239,11 +227,13 @@ def dark_parameters(
     _, pixel_rates, weights = planes
     gain = transfer.values[GAIN]
     read = transfer.values[READ] + ROUNDING_DN2
-    steady = np.ones(pixel_rates[0].shape, bool)
-    for one in darks:
-        steady &= steady_pixels(
-            one, read + gain * np.maximum(one.mean_dn - transfer.values[BLACK], 0.0)
-        )
+    black = transfer.values[BLACK]
+    steady = np.logical_and.reduce(
+        [
+            steady_pixels(one, read + gain * np.maximum(one.mean_dn - black, 0.0))
+            for one in darks
+        ]
+    )
     rates = pixel_rates.mean(axis=0)[steady]
     counts = np.array([one.count for one in darks])
     times = exposures_s(darks)
@@ -253,7 +243,7 @@ def dark_parameters(
     )
     top_dn = max(one.greatest_dn for one in darks)
     full_dn = np.array(0.98 * top_dn)
-    greatest = float(transfer.linear_dn(full_dn - transfer.values[BLACK]) / times.max())
+    greatest = float(transfer.linear_dn(full_dn - black) / times.max())
     # A pixel that saturates in the longest dark has a greater rate than the line through its darks.
     longest = max(darks, key=lambda one: one.exposure_s)
     rates[longest.mean_dn[steady] >= full_dn] = greatest
@@ -334,17 +324,16 @@ def doubling(found: MeasuredSensor, temperatures: Temperatures) -> None:
     found.estimates["dark_doubling_c"] = Estimate.normal(value, sigma)
 
 
-def linearity_error(flats: Sequence[TransferPoint], transfer: Transfer) -> float:
+def linearity_error(flats: TransferPoints, transfer: Transfer) -> float:
     """Mean relative deviation of the signal from a line through the levels at 5 to 95 % of the saturation.
 
     The line is fitted with relative weights (EMVA 1288, release 4.0 Linear: the linearity error LE).
     """
-    signal = by_level(flats, "mean_dn") - transfer.values[BLACK]
-    time_s = exposures_s(flats)
+    signal = flats.mean_dn - transfer.values[BLACK]
     inside = (signal > 0.05 * signal.max()) & (signal < 0.95 * signal.max())
     if inside.sum() < 3:
         return math.nan
-    x = time_s[inside]
+    x = flats.exposure_s[inside]
     y = signal[inside]
     slope, intercept = np.polyfit(x, y, 1, w=1 / y)
     line = intercept + slope * x

@@ -112,14 +112,6 @@ Cells = Iterator[DatasheetCell]
 CellRows = list[int]  # numbers of cells
 
 
-class Draw(NamedTuple):
-    """Numbers of the unit, the thermal state and the attitude in the field. Every cell has other noise."""
-
-    unit: int = 0
-    state: int = 0
-    attitude: int = 0
-
-
 def check_scene(scene: Scene) -> None:
     """Raise InputError for a scene whose tracker gives no attitude for a single frame."""
     if scene.light.kind == "collimated_display":
@@ -199,35 +191,33 @@ class Designer:
         self.pixel_deg = math.degrees(1 / scene.camera.focal_px)
         self.under_stars = scene.stars is not None
         self.noise = 0
+        # Equal units are one, as is a scene without thermal states.
+        self.units = size.units if self.seeds else 1
+        self.states = max(len(self.temperatures_c), 1)
 
-    @property
-    def units(self) -> int:
-        """Number of units; 1 if all units of the scene are equal."""
-        return self.size.units if self.seeds else 1
+    def settings(
+        self, unit: int = 0, state: int = 0, attitude: int = 0, turn_deg: float = 0.0
+    ) -> Settings:
+        """Settings of a unit, a thermal state and an attitude in the field by their numbers, with new noise.
 
-    @property
-    def states(self) -> int:
-        """Number of thermal states."""
-        return max(len(self.temperatures_c), 1)
-
-    def settings(self, draw: Draw, turn_deg: float = 0.0) -> Settings:
-        """Settings of a draw, with new noise; `turn_deg` is added to the rotation of the draw's attitude."""
+        `turn_deg` is added to the rotation of the attitude.
+        """
         self.noise += 1
-        chosen: Settings = {key: 1000 + draw.unit for key in self.seeds}
+        chosen: Settings = {key: 1000 + unit for key in self.seeds}
         if self.temperatures_c:
-            temperature_c = self.temperatures_c[draw.state % self.states]
+            temperature_c = self.temperatures_c[state % self.states]
             chosen["thermal.temperature"] = {"kind": "steady", "temperature_c": temperature_c}
-        turn_deg += draw.attitude * SCAN_PX * self.pixel_deg
+        turn_deg += attitude * SCAN_PX * self.pixel_deg
         return chosen | {"trial.noise_seed": self.noise, "trial.turn_deg": turn_deg}
 
-    def in_turn(self, number: int) -> Draw:
-        """The draw of a number: another attitude each, with the units and thermal states of the terms in turn.
+    def in_turn(self, number: int) -> Settings:
+        """The settings of a number: another attitude each, with the units and thermal states of the terms in turn.
 
         The units must be those of the terms: the mean bias of a few other units would be another. The first `states`
         draws have all thermal states, and the first `states` times `units` all combinations.
         """
         turns, state = divmod(number, self.states)
-        return Draw((turns + state) % self.units, state, 10 + number)
+        return self.settings((turns + state) % self.units, state, 10 + number)
 
     def cells(self) -> Cells:
         """All cells, in the order in which they are run."""
@@ -237,7 +227,7 @@ class Designer:
             "total", math.ceil(self.size.draws / combinations) * combinations
         )
         for number in range(self.size.sky):
-            settings = self.settings(Draw(100 + number, number))
+            settings = self.settings(100 + number, number)
             settings["trial.attitude_seed"] = 1 + number
             yield DatasheetCell("sky", {"draw": number}, settings)
         yield from self.rates()
@@ -261,16 +251,14 @@ class Designer:
         counts = (self.units, self.states, self.size.attitudes, self.size.frames)
         for numbers in itertools.product(*map(range, counts)):
             levels = dict(zip(("unit", "state", "attitude", "frame"), numbers, strict=True))
-            yield DatasheetCell("terms", levels, self.settings(Draw(*numbers[:3])))
+            yield DatasheetCell("terms", levels, self.settings(*numbers[:3]))
 
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: Any
     ) -> Cells:
         """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
         for number in range(count):
-            settings = self.settings(self.in_turn(number)) | {
-                "trial.noise_seed": 10_000 + number
-            }
+            settings = self.in_turn(number) | {"trial.noise_seed": 10_000 + number}
             settings |= change or {}
             if settings.get("trial.kind") == "centroids":
                 del settings["trial.turn_deg"]
@@ -290,10 +278,19 @@ class Designer:
         """Accelerations that bend a path by these lengths in a time, to two digits."""
         return [float(f"{bend * self.pixel_deg / time_s**2:.2g}") for bend in bends_px]
 
-    def pair(self, experiment: str, name: str, level: float, change: Settings) -> Cells:
-        """Two frames of each attitude with a change, which differ only in their noise."""
+    def pair(
+        self, experiment: str, key: str, level: float, change: Settings | None = None
+    ) -> Cells:
+        """Two frames of each attitude at a level of a key, which differ only in their noise.
+
+        Parameters
+        ----------
+        change
+            Further settings
+        """
+        name = key.rpartition(".")[2]
         for frame in range(2):
-            settings = self.settings(Draw()) | change
+            settings = self.settings() | {key: level} | (change or {})
             yield DatasheetCell(experiment, {name: level, "frame": frame}, settings)
 
     def rates(self) -> Cells:
@@ -305,8 +302,7 @@ class Designer:
 
     def at_rate(self, experiment: str, rate_deg_s: float) -> Cells:
         """A pair of frames at a rate, of one of RATES."""
-        change = {"trial.rate_deg_s": rate_deg_s} | RATES[experiment]
-        return self.pair(experiment, "rate_deg_s", rate_deg_s, change)
+        return self.pair(experiment, "trial.rate_deg_s", rate_deg_s, RATES[experiment])
 
     def add_faster(self, cells: list[DatasheetCell], experiments: Iterable[str]) -> None:
         """Add a pair at twice the greatest rate of each experiment, one of RATES."""
@@ -318,15 +314,14 @@ class Designer:
         """Frames of one unit at the scene's frame rate, at rest and at constant rates."""
         for rate in (0.0, *self.rates_deg_s(STREAKS_PX[:SEQUENCE_RATES])):
             for step in SEQUENCE:
-                settings = self.settings(Draw(), rate * step / self.scene.exposure.rate_hz)
-                settings["trial.rate_deg_s"] = rate
+                turn_deg = rate * step / self.scene.exposure.rate_hz
+                settings = self.settings(turn_deg=turn_deg) | {"trial.rate_deg_s": rate}
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
     def accelerations(self) -> Cells:
         """Pairs of frames at accelerations, with a rate of zero at mid-exposure."""
-        key = "acceleration_deg_s2"
         for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
-            yield from self.pair("acceleration", key, bend, {f"trial.{key}": bend})
+            yield from self.pair("acceleration", "trial.acceleration_deg_s2", bend)
 
     def tracked(self) -> Cells:
         """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
@@ -343,8 +338,8 @@ class Designer:
         }
         for key, values in motions.items():
             for value in values:
-                change = {f"trial.{key}": value, "trial.tracked": TRACKED}
-                yield from self.pair(f"tracked {key}", key, value, change)
+                change = {"trial.tracked": TRACKED}
+                yield from self.pair(f"tracked {key}", f"trial.{key}", value, change)
 
     def magnitudes(self) -> Cells:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""
@@ -354,8 +349,7 @@ class Designer:
             limit = self.scene.tracker.limit_mag + step
             if step > 0 and limit > scene_changes.catalog_end_mag(self.scene):
                 continue
-            change: Settings = {"tracker.limit_mag": limit}
-            yield from self.pair("magnitude", "limit_mag", limit, change)
+            yield from self.pair("magnitude", "tracker.limit_mag", limit)
 
 
 # Run the experiments of a datasheet: write them as a study, run its missing trials, and read their results as arrays.
@@ -402,10 +396,6 @@ class MeasuredFrames(NamedTuple):
         return list(
             dict.fromkeys(self.cells[row].levels[name] for row in self.rows(experiment))
         )
-
-    def column(self, name: str, rows: CellRows) -> NDArray[Any]:
-        """(cells, fields) values of a column in some cells."""
-        return self.columns[name][rows]
 
     def right(self, rows: CellRows) -> Bools:
         """(cells, fields) whether a frame was solved and is not false."""

@@ -87,13 +87,13 @@ def draw_sky(statement: Statement, fig: Any) -> None:
     rows = sheet.rows("sky")
     if sheet.designer.under_stars:
         axes = fig.add_subplot(projection="mollweide")
-        longitude = np.radians((sheet.column("boresight_ra_deg", rows) + 180) % 360 - 180)
-        place = -longitude, np.radians(sheet.column("boresight_dec_deg", rows))
+        longitude = np.radians((sheet.columns["boresight_ra_deg"][rows] + 180) % 360 - 180)
+        place = -longitude, np.radians(sheet.columns["boresight_dec_deg"][rows])
     else:
         axes = fig.add_subplot(projection="polar")
         place = (
-            np.radians(sheet.column("body_azimuth_deg", rows)),
-            sheet.column("body_tilt_deg", rows),
+            np.radians(sheet.columns["body_azimuth_deg"][rows]),
+            sheet.columns["body_tilt_deg"][rows],
         )
     right = sheet.right(rows)
     false = sheet.false(rows)

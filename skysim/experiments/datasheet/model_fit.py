@@ -74,11 +74,8 @@ def unit_mean(sheet: MeasuredFrames) -> Floats:
 def unit_scatter(errors: Floats) -> Floats:
     """(3,) standard deviation among units of the (3, fields, units, states, attitudes, frames) errors' means."""
     means = errors.mean(axis=(3, 4, 5))
-    units = means.shape[2]
-    if units == 1:
-        return np.zeros(3)
     apart = means - means.mean(axis=2, keepdims=True)
-    return rms_of_term(common_square(apart).sum(axis=2) / (units - 1))
+    return rms_of_term(common_square(apart).sum(axis=2) / max(means.shape[2] - 1, 1))
 
 
 def log_scale(first: Floats, second: Floats) -> float:
@@ -153,7 +150,7 @@ def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
     row = rate_rows(sheet, rate_deg_s)[0]
     setup = setups.prepared_setup(sheet.spec, sheet.cells[row].settings)
-    seeds = sheet.column("seed", [row])[0].tolist()
+    seeds = sheet.columns["seed"][[row]][0].tolist()
     rngs = (trials.streams(setup, seed)[0] for seed in seeds)
     x, y, _ = np.transpose([trials.attitude_and_axis(setup, rng)[1] for rng in rngs])
     return np.arctan2(y, x)
@@ -278,7 +275,11 @@ def agreement(
     """The agreement with the frames at one rate."""
     steps, errors = sequences(sheet, rate_deg_s)
     first = errors[:, 0][:, np.isfinite(errors[:, 0]).all(axis=0)]
-    drawn = turning(model, max(rate_deg_s, SLOW_DEG_S))
+    # Each in another field and about another axis.
+    rng = random_stream(1)
+    axis_rad = rng.uniform(0, 2 * np.pi, DRAWN)
+    rates = np.full(DRAWN, max(rate_deg_s, SLOW_DEG_S))
+    drawn = model.draw(rates, APART_STEP_S, rng, axis_rad=axis_rad)
     p_values = [
         float(stats.ks_2samp(measured, modeled).pvalue)
         for measured, modeled in zip(first, drawn.T, strict=True)
@@ -300,13 +301,6 @@ def agreement(
         float(np.mean(found)),
         float(np.mean(expected)),
     )
-
-
-def turning(model: ErrorModel, rate_deg_s: float) -> Floats:
-    """(DRAWN, 3) errors at a rate, each in another field and about another axis."""
-    rng = random_stream(1)
-    axis_rad = rng.uniform(0, 2 * np.pi, DRAWN)
-    return model.draw(np.full(DRAWN, rate_deg_s), APART_STEP_S, rng, axis_rad=axis_rad)
 
 
 # Write the model: a Python module that needs NumPy alone, its constants as JSON, a co-simulation unit.

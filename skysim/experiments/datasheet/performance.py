@@ -104,7 +104,7 @@ def consistency(sheet: MeasuredFrames) -> Record:
     """
     rows = sheet.rows("sky")
     right = sheet.right(rows)
-    nees = sheet.column("nees", rows)[right]
+    nees = sheet.columns["nees"][rows][right]
     within = []
     for level in LEVELS:
         hits = int(np.sum(nees <= chdtri(3, 1 - level)))
@@ -147,7 +147,7 @@ def root_interval(squares: Floats) -> list[float]:
 
 def mean_nees(sheet: MeasuredFrames, rows: CellRows) -> Bounded:
     """The mean normalized error squared of right attitudes: 3 if their covariances are right."""
-    nees = np.where(sheet.right(rows), sheet.column("nees", rows), np.nan)
+    nees = np.where(sheet.right(rows), sheet.columns["nees"][rows], np.nan)
     solved = np.isfinite(nees).sum(axis=0)
     return Bounded(*metrics.mean_nees({"nees": mean_known(nees, 0), "solved": solved})[:3])
 
@@ -172,7 +172,7 @@ def by_rate(sheet: MeasuredFrames, experiment: str) -> Rows:
     found = [{"rate_deg_s": 0.0, "streak_px": 0.0, **pair_row(sheet, rest)}]
     for rate in sheet.levels(experiment, "rate_deg_s"):
         rows = sheet.rows(experiment, rate_deg_s=rate)
-        streak_px = float(mean_known(sheet.column("streak_px", rows)))
+        streak_px = float(mean_known(sheet.columns["streak_px"][rows]))
         found.append({"rate_deg_s": rate, "streak_px": streak_px, **pair_row(sheet, rows)})
     return found
 

@@ -23,9 +23,7 @@ from skysim.experiments.characterize.fixed_pattern import RateNoise
 from skysim.experiments.characterize.photon_transfer import (
     Estimate,
     Level,
-    LevelBuilder,
-    Moments,
-    TransferPoint,
+    TransferPoints,
     propagate,
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
@@ -68,10 +66,10 @@ def camera(side_px: int, seed: int = 0, **changes: Any) -> CameraConfig:
 
 def level(exposure_s: float, temperature_c: float | None, frames: Iterable[NDArray]) -> Level:
     """The level of two frames or more."""
-    builder = LevelBuilder()
+    found = Level(exposure_s, temperature_c)
     for frame in frames:
-        builder.add(frame)
-    return builder.level(exposure_s, temperature_c)
+        found.add(frame)
+    return found
 
 
 def measured(
@@ -117,14 +115,14 @@ def test_half_the_variance_of_a_pair_s_difference_is_the_noise_without_pattern_a
     ]
     shifted = [frame.astype(np.uint16) + np.uint16(n) for n, frame in enumerate(frames)]
     found = level(0.1, 20.0, shifted)
-    moments = found.moments(np.ones(pattern.shape, bool))
+    moments = found.point(np.ones(pattern.shape, bool))
     assert found.count == 4
     assert abs(moments.variance_dn2 - sigma**2 - 1 / 12) < 4 * moments.variance_sigma_dn2
     assert moments.variance_sigma_dn2 == pytest.approx(
         sigma**2 * np.sqrt(2 / 2 / pattern.size), rel=0.02
     )
     assert abs(moments.mean_dn - pattern.mean() - 1.5) < 4 * sigma / np.sqrt(4 * pattern.size)
-    assert found.difference_dn2 == pytest.approx(1.0, rel=0.2)
+    assert moments.difference_dn2 == pytest.approx(1.0, rel=0.2)
 
 
 def test_an_odd_last_frame_is_left_out() -> None:
@@ -138,7 +136,7 @@ def test_an_odd_last_frame_is_left_out() -> None:
 
 def exact_points(
     gain_dn_e: float, curvature: float, read_dn: float, black_dn: float
-) -> list[TransferPoint]:
+) -> TransferPoints:
     """Points of the law, from 10^7 numbers drawn for none: by the moments of a Poisson variable up to the fourth."""
     points = []
     for lit, rate_e_s, times in (
@@ -157,11 +155,9 @@ def exact_points(
             mean = float((w * y).sum())
             variance = float((w * (y - mean) ** 2).sum()) + 1 / 12
             points.append(
-                TransferPoint(
-                    t_s, lit, 0, Moments(black_dn + mean, 1e-3, variance, 1e-3 * variance)
-                )
+                (t_s, lit, 0, black_dn + mean, 1e-3, variance, 1e-3 * variance, 0.0)
             )
-    return points
+    return TransferPoints(*map(np.array, zip(*points, strict=True)))
 
 
 def test_the_fit_returns_the_law_of_its_points() -> None:
@@ -194,12 +190,11 @@ def test_the_lamp_s_flicker_is_the_variance_beyond_noise() -> None:
     pixels = 4000
     flicker = 0.004
     points = []
-    changes = []
     for mean in np.linspace(500, 3000, 400):
-        points.append(TransferPoint(1.0, 1, 0, Moments(100 + mean, 0.0, mean, 0.0)))
         change = rng.normal(0, np.sqrt(2 * (flicker * mean) ** 2 + 2 * mean / pixels))
-        changes.append(change**2)
-    assert photon_transfer.lamp_flicker(points, changes, 100.0, pixels) == pytest.approx(
+        points.append((1.0, 1, 0, 100 + mean, 0.0, mean, 0.0, change**2))
+    levels = TransferPoints(*map(np.array, zip(*points, strict=True)))
+    assert photon_transfer.lamp_flicker(levels, 100.0, pixels) == pytest.approx(
         flicker, rel=0.1
     )
 
@@ -436,8 +431,8 @@ def test_tracks_of_particles_are_neither_noise_nor_hot_pixels() -> None:
     hit = level(10.0, None, frames)
     usable = sensor_fit.usable_pixels([hit])
     assert 70 <= (~usable).sum() <= 76
-    assert hit.moments(usable).variance_dn2 == pytest.approx(9 + 20 + 1 / 12, rel=0.04)
-    assert hit.moments(np.ones(shape, bool)).variance_dn2 > 2 * 29
+    assert hit.point(usable).variance_dn2 == pytest.approx(9 + 20 + 1 / 12, rel=0.04)
+    assert hit.point(np.ones(shape, bool)).variance_dn2 > 2 * 29
 
 
 def test_the_scatter_of_equal_pixels_in_whole_numbers_is_that_of_their_noise() -> None:
