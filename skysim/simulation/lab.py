@@ -23,10 +23,12 @@ from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
+from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.types import Mount, Sources
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.controllers import CONTROLLERS
+from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
@@ -270,6 +272,17 @@ class Lab:
     def duration_s(self) -> float:
         """Duration of the motion: until the longest exposure of the last frame ends, of all cameras."""
         return max(timing.duration_s(camera.scene) for camera in self.cameras)
+
+    @property
+    def reference(self) -> guidance.Reference:
+        """The attitude that the scene's maneuvers command."""
+        return guidance.plan(self.scene.motion, self.start, self.profiles)
+
+    @property
+    def vibration(self) -> Vibration:
+        """The vibration of the run, with that of its maneuvers."""
+        rng = random_stream(self.scene.seed, JITTER, 0)
+        return Vibration.draw(self.scene.motion, rng, self.reference)
 
     def in_run(self, seed: int) -> "Lab":
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""

@@ -23,20 +23,18 @@ from scipy.spatial.transform import Rotation
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
-from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
+from skysim.core.random_streams import AIR_CURRENT, IMU, random_stream
 from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import NO_COMMANDS, Commands, FlightComputer, usage
 from skysim.dynamics.guidance import Reference
-from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
 from skysim.dynamics.multibody.actuator_kind import ActuatorDrive, ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators, build_drives
 from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.dynamics.multibody.thrusters import propellant_kg
-from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation import timing
@@ -49,24 +47,20 @@ TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 ROUNDING = 1e-6  # relative excess over a limit that counts as rounding
 
 
-def check_reference(
-    reference: guidance.Reference,
-    scene: Scene,
-    model: multibody.VehicleModel,
-    duration_s: float,
-) -> None:
+def check_reference(lab: Lab, reference: Reference, duration_s: float) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
     The controller would push against the stop, or fall behind. The torque of a rate w and an acceleration a is
     J a + w x J w. A prescribed motion needs no torque.
     """
+    scene = lab.scene
     motion = scene.motion
     vehicle = scene.vehicle
     # Without a controller the vehicle may reach the stop later.
     check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    actuators = build_actuators(scene.vehicle, model.model)
+    actuators = build_actuators(vehicle, lab.vehicle.model)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -84,7 +78,7 @@ def check_reference(
                     f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
                 )
         if not motion.is_prescribed:
-            inertia = model.inertia_kg_m2
+            inertia = lab.vehicle.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
             used = usage(actuators[motion.control.actuators], torque_nm)
             k = int(used.argmax())
@@ -97,9 +91,7 @@ def check_reference(
                 )
 
 
-def check_tilt(
-    reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float
-) -> None:
+def check_tilt(reference: Reference, vehicle: VehicleConfig, duration_s: float) -> None:
     """Raise InputError for a tilt beyond the stop of the air bearing, up to the end of the motion.
 
     An endless motion is checked up to the end of the maneuvers.
@@ -187,7 +179,7 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
     # The torque is given, so the control law does not matter.
     pid = control.model_copy(update={"law": "pid"})
     motion = scene.motion.model_copy(update={"control": pid})
-    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+    reference = lab.reference
     period_s = max(FORECAST_S, lab.duration_s / FORECAST_PERIODS)
     vehicle = lab.vehicle
     start = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), period_s)
@@ -468,8 +460,8 @@ class Motion:
         scene = lab.scene
         vehicle = lab.vehicle
         self.lab = lab
-        self.reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-        check_reference(self.reference, scene, vehicle, duration_s)
+        self.reference = lab.reference
+        check_reference(lab, self.reference, duration_s)
         if scene.motion.is_prescribed:
             self.simulation: Simulation = multibody.PrescribedMotion(
                 vehicle, lambda t_s: self.reference.state_at(t_s)[:2], duration_s, kept_s
@@ -479,9 +471,7 @@ class Motion:
             self.simulation = multibody.Simulation(
                 vehicle, lab.start, rate, duration_s, kept_s
             )
-        self.vibration = Vibration.draw(
-            scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
-        )
+        self.vibration = lab.vibration
         if kept_s is None:
             # This raises InputError for too many samples before any long work.
             self.vibration.subdivisions(

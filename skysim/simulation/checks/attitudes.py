@@ -11,10 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.types import Floats, Mount
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.jitter import Vibration
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab
 
@@ -62,7 +60,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
         rates = guidance.body_rate_rad_s(scene, lab.start)
         lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rates))
     else:
-        reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+        reference = lab.reference
         states = [reference.state_at(float(t)) for t in t_s]
         wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
         lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
@@ -84,9 +82,7 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
 
     The rest is the rotation relative to one at the mean rate, K samples of zero mean, in body axes.
     """
-    scene = lab.scene
-    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-    vibration = Vibration.draw(scene.motion, random_stream(scene.seed, JITTER, 0), reference)
+    vibration = lab.vibration
     if not vibration.components:
         return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 1, 3))
     after_s = exposure_s * np.linspace(-0.5, 0.5, SAMPLES)

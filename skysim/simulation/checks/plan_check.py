@@ -17,7 +17,6 @@ import numpy as np
 from skysim.camera import wcs
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
-from skysim.dynamics import guidance
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import context_of
@@ -90,12 +89,7 @@ def check(
     if outside:
         return Check([], [outside])
     # 1. Attitudes.
-    check_reference(
-        guidance.plan(scene.motion, lab.start, lab.profiles),
-        scene,
-        lab.vehicle,
-        lab.duration_s,
-    )
+    check_reference(lab, lab.reference, lab.duration_s)
     frames = attitudes.of_frames(lab)
     if rate_body_rad_s is not None:
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
