@@ -110,8 +110,8 @@ class Schedule:
 
     Attributes
     ----------
-    camera, scene, rows, number
-        Star camera, its scene, its number of rows, and its number in the lab
+    camera, scene, number
+        Star camera, its scene, and its number in the lab
     frames
         Number of frames; infinite in an endless flight
     exposure_control
@@ -133,7 +133,6 @@ class Schedule:
         self.number = number
         self.frames = frames
         self.scene = scene = camera.scene
-        self.rows = scene.camera.height_px
         self.exposure_control = ExposureController(scene)
         self.latency_s = scene.filter.latency_s if scene.filter else 0.0
         self.index = 0
@@ -154,7 +153,7 @@ class Schedule:
         open_s = now_s
         if waiting:
             last = self.window_from(max(waiting.values()))
-            open_s = max(now_s, last.close_s(self.rows))
+            open_s = max(now_s, last.close_s)
         self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
     def resume(self, now_s: float) -> None:
@@ -171,7 +170,7 @@ class Schedule:
     def window_to(self, close_s: float) -> Window:
         """Window of an exposure whose last row ends at this time."""
         window = self.window_from(0.0)
-        return window._replace(open_s=close_s - window.close_s(self.rows))
+        return window._replace(open_s=close_s - window.close_s)
 
     @property
     def window(self) -> Window:
@@ -185,9 +184,8 @@ class Schedule:
     def due_s(self) -> float:
         """Time at which the next frame is due: it is exposed, its solution is ready, and its time tag has passed."""
         window = self.window
-        error_s = timing.time_tag_error_s(self.scene, self.index)
-        tagged_s = window.middle_s(self.rows) + error_s
-        return max(window.close_s(self.rows) + self.latency_s, tagged_s)
+        tagged_s = window.middle_s + timing.time_tag_error_s(self.scene, self.index)
+        return max(window.close_s + self.latency_s, tagged_s)
 
 
 class Flight:
@@ -489,19 +487,14 @@ class Flight:
         while due := [
             one
             for one in schedules
-            if not one.is_over
-            and (one.window.close_s(one.rows) if late else one.due_s) <= self.now_s
+            if not one.is_over and (one.window.close_s if late else one.due_s) <= self.now_s
         ]:
             # Of several that are due at once, the first camera's.
             schedule = min(due, key=lambda one: one.due_s)
             index = schedule.index
             window = schedule.window
             schedule.index += 1
-            if (
-                selects
-                and schedule.number == 0
-                and not selects(index, window.close_s(schedule.rows))
-            ):
+            if selects and schedule.number == 0 and not selects(index, window.close_s):
                 continue
             if math.isfinite(schedule.frames):
                 schedule.exposures_s[index] = window.exposure_s
@@ -587,9 +580,7 @@ class Flight:
         samples = self.imu_samples(window.open_s) if scene.tracker.gyro else None
         if config is None or samples is None:
             return None
-        return navigation.rate_of_frame(
-            samples, window, scene.camera.height_px, config, camera.mount
-        )
+        return navigation.rate_of_frame(samples, window, config, camera.mount)
 
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule again from the motion so far; the frame equals that of `shots`.
@@ -616,7 +607,7 @@ class Flight:
                 "after it came from shots",
             )
         window = timing.exposure_window(scene, index, exposure_s)
-        if not (0 <= index < schedule.frames and window.close_s(schedule.rows) <= self.now_s):
+        if not (0 <= index < schedule.frames and window.close_s <= self.now_s):
             raise InputError(
                 "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"
             )

@@ -30,7 +30,7 @@ from skysim.scene.sections.vehicle import ImuConfig
 
 
 def rate_of_frame(
-    samples: Increments, window: Window, rows: int, config: ImuConfig, mount: Mount
+    samples: Increments, window: Window, config: ImuConfig, mount: Mount
 ) -> RateEstimate | None:
     """Mean rate of the camera in its own axes over an exposure, with the covariance by the gyros' data sheet.
 
@@ -40,16 +40,15 @@ def rate_of_frame(
     ----------
     samples
         Samples of the IMU
-    window, rows
-        Exposure window and number of rows: the exposure ends with that of the last row
+    window
+        Exposure window
     config
         The scene's `vehicle.imu`
     mount
         Mount of the camera
     """
-    begin_s = window.open_s
-    end_s = window.close_s(rows)
-    during = (samples.t_s > begin_s) & (samples.t_s - samples.step_s < end_s)
+    begins_s = samples.t_s - samples.step_s
+    during = (samples.t_s > window.open_s) & (begins_s < window.close_s)
     if not during.any() or samples.saturated[during].any():
         return None
     rate = samples.angle_rad[during].mean(axis=0) / samples.step_s

@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.air import weather_of
 from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
@@ -230,14 +230,13 @@ def assumed_camera(scene: Scene) -> Camera:
 
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
-    shutter = camera.shutter
     return Camera(
         camera.width_px,
         camera.height_px,
         camera.focal_px,
         camera.center_px,
         camera.distortion,
-        row_time_s=shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0,
+        row_time_s=camera.row_delay_s,
     )
 
 

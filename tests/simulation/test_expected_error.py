@@ -357,7 +357,7 @@ def render_moving(
     lab: Lab, lab_from_body: Rotation, rate_body_rad_s: Floats
 ) -> tuple[Frame, Truth]:
     """Frame 0 of a vehicle that rotates at a constant rate, at that attitude at mid-exposure."""
-    middle_s = exposure_window(lab.scene, 0).middle_s(lab.scene.camera.height_px)
+    middle_s = exposure_window(lab.scene, 0).middle_s
     return render_at(lab, lab_from_body, rate_body_rad_s, middle_s)
 
 

@@ -56,7 +56,6 @@ from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
-from skysim.scene.sections.camera import RollingShutterConfig
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
@@ -207,13 +206,11 @@ def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Floats 
 def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Motion of the images during the difference of true and assumed delay of their rows from the middle row."""
     camera = context.camera.optics.camera
-    if not isinstance(camera.shutter, RollingShutterConfig):
-        return None
+    true_s = camera.row_delay_s
     assumed_s = context.scene.tracker.assumed_row_time_s
-    error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
-    if not error_s:
+    if not true_s or assumed_s is None or assumed_s == true_s:
         return None
-    delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
+    delay_s = (true_s - assumed_s) * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
     velocity_px_s = view.streak_px / context.scene.exposure.time_s
     return (velocity_px_s * delay_s[:, None])[:, :, None]
 
