@@ -538,7 +538,7 @@ def normalized_errors(
 def random_attitude(lab: Lab, frames: CheckedAttitudes, rng: np.random.Generator) -> Rotation:
     if lab.scene.light.kind == "stars":
         return Rotation.random(rng=rng)
-    cosine = np.cos(attitudes.greatest_tilt_rad(lab.scene, frames))
+    cosine = np.cos(attitudes.greatest_tilt_rad(frames))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
     return Rotation.from_euler("ZYZ", [azimuth, np.arccos(rng.uniform(cosine, 1)), yaw])
 
@@ -547,7 +547,10 @@ def expected_at(
     context: Context, lab_from_body: Rotation, rate_rad_s: Floats
 ) -> tuple[float, float]:
     at = CheckedAttitudes(
-        Rotation.concatenate([lab_from_body]), rate_rad_s[None], np.zeros(1)
+        context.lab,
+        Rotation.concatenate([lab_from_body]),
+        rate_rad_s[None],
+        np.zeros(1),
     )
     return tuple(
         value * ARCSEC_RAD for value in sampling.sampled(at, context).error.rms_arcsec()
@@ -644,7 +647,7 @@ def test_long_streaks_break_in_the_forecast_as_in_frames(
     context = detection.context_of(lab)
     rate_rad_s = np.radians([rate_deg_s, 0.0, 0.0])
     turned = Rotation.random(16, random_state=1)
-    at = CheckedAttitudes(turned, np.tile(rate_rad_s, (16, 1)), np.zeros(16))
+    at = CheckedAttitudes(lab, turned, np.tile(rate_rad_s, (16, 1)), np.zeros(16))
     expected = sampling.sampled(at, context)
     tracker = build_tracker(lab.camera)
     matched = np.zeros(16)

@@ -19,7 +19,7 @@ from skysim.core.types import Floats, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
-from skysim.simulation.checks import attitudes, vehicle_facts
+from skysim.simulation.checks import vehicle_facts
 from skysim.simulation.checks.detection import (
     Context,
     detected_area_px,
@@ -182,7 +182,7 @@ def few_lights(plan: Plan) -> str:
     else:
         return ""
     on_chip = np.array([len(view) for view in sampled.seen])
-    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), plan.lab)
+    where = sampled.attitudes.describe(int(counts.argmin()))
     text = (
         f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
         f" {'frames' if sampled is plan.frames else 'directions in reach'}, least {counts.min()} at {where}"
@@ -216,7 +216,7 @@ def hidden_lights(plan: Plan) -> str:
     what = f"all behind {name}" if behind == expected else f"{behind} of them behind {name}"
     what += "".join(f", {count} behind {other}" for other, count in others)
     return (
-        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, plan.lab)},"
+        f"motion.start: {expected} lights expected at {frames.attitudes.describe(n)},"
         f" {what}; so at {100 * few.mean():.0f} % of the frames; point elsewhere, or change the time"
     )
 

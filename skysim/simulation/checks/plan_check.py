@@ -147,7 +147,7 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
 def plan_of(lab: Lab, frames: CheckedAttitudes, tilt_deg: float | None = None) -> Plan:
     """The context with the views of the camera at the frames and at the attitudes in reach."""
     context = context_of(lab)
-    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames, tilt_deg)
+    reach = attitudes.within_reach(frames, tilt_deg)
     return Plan(
         **vars(context), frames=sampled(frames, context), reach=sampled(reach, context)
     )

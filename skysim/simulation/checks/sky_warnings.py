@@ -10,7 +10,6 @@ from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
     STILL_PX,
@@ -54,7 +53,7 @@ def refraction(plan: Plan) -> str:
     atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
-    boresight = attitudes.boresights(at.lab_from_body, lab)
+    boresight = at.boresights
     zenith = np.array(
         [atmosphere.air.at(exposure.time).zenith for exposure in plan.frames.exposures]
     )
@@ -73,7 +72,7 @@ def refraction(plan: Plan) -> str:
         MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec
     ):
         return ""
-    where = attitudes.describe(at, n, lab)
+    where = at.describe(n)
     text = (
         f"the air raises stars by {short(middle)}″ at {where}, {math.degrees(altitude_rad[n]):.1f}° above the horizon,"
         f" and shortens the field by {short(low - high, 2)}″, which the tracker does not know"
@@ -108,7 +107,7 @@ def bodies_near(plan: Plan) -> Iterator[str]:
     # 2. Warnings.
     for name, (off_rad, n, body) in closest.items():
         seen = body.truth()
-        where = attitudes.describe(at, n, lab)
+        where = at.describe(n)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
         if in_field(
@@ -195,7 +194,7 @@ def fact(plan: Plan) -> Fact | None:
     if math.isnan(nees):
         return None
     floor_px = plan.settings.searched_sigma_px
-    rates = attitudes.rates_text(plan.reach.attitudes)
+    rates = plan.reach.attitudes.rates_text
     text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
@@ -249,7 +248,7 @@ def stray_light(plan: Plan) -> Iterator[str]:
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
         f" {source}, of {plan.full_e:.0f} at saturation,"
-        f" at {attitudes.describe(at, n, lab)}; the faintest star is {loss_mag:.1f} mag"
+        f" at {at.describe(n)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
 
@@ -263,7 +262,7 @@ def exclusion(plan: Plan) -> Iterator[str]:
         return
     # Angles from the Sun's center, the Earth's limb and the Moon's center.
     rows = []
-    boresights = attitudes.boresights(at.lab_from_body, lab)
+    boresights = at.boresights
     for t_s, boresight in zip(at.t_s.tolist(), boresights, strict=True):
         here = lab.camera.viewpoint.observer_at(t_s)
         sun, moon = (
@@ -280,7 +279,7 @@ def exclusion(plan: Plan) -> Iterator[str]:
             what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
             yield (
                 f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
-                f" {attitudes.describe(at, n, lab)}, within {limit_deg:g}°; point farther away"
+                f" {at.describe(n)}, within {limit_deg:g}°; point farther away"
             )
 
 
