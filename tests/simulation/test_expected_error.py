@@ -71,6 +71,7 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
         streak,
         nothing,
         behind,
+        Rotation.identity(),
     )
 
 
@@ -205,10 +206,7 @@ def test_a_fitted_focal_length_has_no_error_in_the_attitude() -> None:
             samples.error.rad2["cross"]["focal length"].max(),
             error.mean(),
         )
-        cam_from_body = lab.camera.mount.cam_from_body
-        mismatch = expected_error.mismatch(
-            samples.used[0], samples.attitudes.lab_from_body[0] * cam_from_body.inv(), context
-        )
+        mismatch = expected_error.mismatch(samples.used[0], context)
         assert (mismatch is None) == (
             (identifier, focal_length) == ("non_dimensional", 33.25)
         )
@@ -241,6 +239,7 @@ def images(
         streak,
         zero,
         row,
+        Rotation.identity(),
     )
 
 
@@ -586,7 +585,7 @@ def test_the_expected_error_is_nan_with_two_lights(stars: Lab) -> None:
     context = detection.context_of(stars)
     at = attitudes.of_frames(stars)
     few = [one.take(np.arange(2)) for one in sampling.sampled(at, context).used]
-    assert np.isnan(expected_error.expected(few, at, context).rms_arcsec()).all()
+    assert np.isnan(expected_error.expected(few, context).rms_arcsec()).all()
 
 
 def test_requirements_are_forecast_by_the_laws_of_normal_errors() -> None:

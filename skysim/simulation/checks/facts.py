@@ -274,7 +274,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     Infinite if a ray passes below the rim. The circle has the radius radius_px about the boresight. The tilt is tried
     to SIDES azimuths.
     """
-    mount = context.lab.camera.mount
+    mount = context.camera.mount
     surface = context.surface
     azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None

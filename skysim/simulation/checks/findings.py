@@ -289,14 +289,7 @@ def not_where_expected(plan: Plan) -> str:
     """Warn if errors that are unknown to the tracker displace images beyond its matching radius."""
     frames = plan.frames
     scene = plan.scene
-    cam_from_body = plan.lab.camera.mount.cam_from_body
-    found = [
-        one
-        for view, lab_from_body in zip(
-            frames.used, frames.attitudes.lab_from_body, strict=True
-        )
-        if (one := mismatch(view, lab_from_body * cam_from_body.inv(), plan)) is not None
-    ]
+    found = [one for view in frames.used if (one := mismatch(view, plan)) is not None]
     if not found:
         return ""
     residual_px = np.concatenate([one.residual_px for one in found])
@@ -512,7 +505,7 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
         return np.full(3, np.nan)
     gain = gains(view, believed_px2(view, context))
     lights = context.beliefs.lights.take(view.row)
-    mount = context.lab.camera.mount
+    mount = context.camera.mount
     optics = context.camera.optics
     surveyed_px = image_px(lights, mount, optics, lab_from_body)
     moved = thermal_motion.camera_at(config, mount, optics, t_s)

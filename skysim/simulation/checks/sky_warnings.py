@@ -157,12 +157,9 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     found = []
     settings = replace(context.settings, centroid_sigma_px=floor_px)
     claiming = replace(context, settings=settings)
-    cam_from_body = context.lab.camera.mount.cam_from_body
     if not sampled.predicted():
         return math.nan
-    for view, lab_from_body in zip(
-        sampled.used, sampled.attitudes.lab_from_body, strict=True
-    ):
+    for view in sampled.used:
         believed = believed_px2(view, claiming, prnu=0.0)
         try:
             gain = gains(view, believed) if len(view) > 2 else None
@@ -171,7 +168,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         if gain is None:
             continue
         # C, then M.
-        places = star_places(view, lab_from_body * cam_from_body.inv(), context)
+        places = star_places(view, context)
         errors = of_independent(gain, centroid_variance(view, context))
         errors = errors if places is None else errors + of_common(gain, places)
         weighted = np.linalg.solve(believed, view.jacobian)

@@ -16,18 +16,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
+from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Floats, Ints, Sources
+from skysim.core.types import Floats, Ints, Mount, Sources
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
-VISIBLE = -1  # number in place of an occluder's for a light that is not hidden
+VISIBLE = ""  # name in place of an occluder's for a light that is not hidden
 
 
 class View(NamedTuple):
@@ -58,7 +59,9 @@ class View(NamedTuple):
     peak_e
         (n,) mean electrons in the brightest pixel, background included
     behind
-        (n,) numbers of the occluders that hide the lights; VISIBLE for none
+        (n,) names of the occluders that hide the lights; VISIBLE for none
+    lab_from_cam
+        Attitude of the camera, with its assumed mount
     """
 
     row: Ints
@@ -73,7 +76,8 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
-    behind: Ints
+    behind: NDArray
+    lab_from_cam: Rotation
 
     def __len__(self) -> int:
         return len(self.row)
@@ -98,7 +102,7 @@ class View(NamedTuple):
 
     def take(self, which: NDArray) -> "View":
         """The lights selected by a mask or by indices."""
-        return View(*(column[which] for column in self))
+        return View(*(column[which] for column in self[:-1]), self.lab_from_cam)
 
 
 class CameraModel(NamedTuple):
@@ -106,8 +110,8 @@ class CameraModel(NamedTuple):
 
     Attributes
     ----------
-    optics
-        Geometry of lens and detector
+    optics, mount
+        Geometry of lens and detector, and the assumed mount
     lens_px
         Standard deviation of the Gaussian that has the peak of the lens's image, pixel included
     background_e
@@ -123,6 +127,7 @@ class CameraModel(NamedTuple):
     """
 
     optics: Optics
+    mount: Mount
     lens_px: float
     background_e: float
     glow_e: dict[str, float]
@@ -159,7 +164,15 @@ class CameraModel(NamedTuple):
         )
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
-        return cls(lab.camera.optics, lens_px, background_e, glow_e, noise_e, exposure_s)
+        return cls(
+            lab.camera.optics,
+            lab.camera.mount,
+            lens_px,
+            background_e,
+            glow_e,
+            noise_e,
+            exposure_s,
+        )
 
 
 def view(
@@ -178,7 +191,7 @@ def view(
     Parameters
     ----------
     occluders
-        Occluders of the points; their numbers are in `behind`
+        Occluders of the points; their names are in `behind`
     """
     # 1. Points on the detector.
     assert lit.points is not None
@@ -214,6 +227,7 @@ def view(
         streak_px,
         electrons * share + camera.background_e,
         hiding(occluders, chosen.place),
+        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
     )
 
 
@@ -248,11 +262,11 @@ def lens_blur(
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 
-def hiding(occluders: Sequence[Occluder], place: Floats) -> Ints:
-    """(N,) number of the last occluder that hides each of N places; VISIBLE for none."""
-    found = np.full(len(place), VISIBLE)
-    for number, occluder in enumerate(occluders):
-        found[occluder.hides(place)] = number
+def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray:
+    """(N,) name of the last occluder that hides each of N places; VISIBLE for none."""
+    found = np.full(len(place), VISIBLE, object)
+    for occluder in occluders:
+        found[occluder.hides(place)] = occluder.name
     return found
 
 
