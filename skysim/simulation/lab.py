@@ -344,11 +344,8 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
     plan = LightPlan(scene, band, vehicle, viewpoint, shown)
-    main = camera_of(MAIN, plan, mount, orbit, scene.seed)
-    heads = [
-        build_head(scene, n, vehicle, main, shown, parts.programs)
-        for n in range(len(scene.heads))
-    ]
+    main = camera_of(MAIN, plan, mount, scene.seed)
+    heads = [build_head(n, plan, main, parts.programs) for n in range(len(scene.heads))]
     start = lab_from_body_start(scene, mount, profiles)
     return Lab(scene, vehicle, (main, *heads), start, profiles)
 
@@ -357,7 +354,6 @@ def camera_of(
     name: str,
     plan: LightPlan,
     mount: Mount,
-    orbit: CameraOrbit | None,
     run_seed: int,
     mount_error: Rotation | None = None,
 ) -> StarCamera:
@@ -383,7 +379,7 @@ def camera_of(
         np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
         tuple(channels),
-        orbit,
+        plan.viewpoint.orbit,
         run_seed,
         mount_error,
     )
@@ -403,30 +399,23 @@ def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:
     )  # checks the file of the PSF
 
 
-def build_head(
-    main_scene: Scene,
-    n: int,
-    vehicle: multibody.VehicleModel,
-    main: StarCamera,
-    shown: catalog.Catalog | None,
-    programs: Programs,
-) -> StarCamera:
-    """Head n of the scene: a further camera on the same vehicle under the same lights.
+def build_head(n: int, plan: LightPlan, main: StarCamera, programs: Programs) -> StarCamera:
+    """Head n of the scene: a further camera on the same vehicle under the same lights, from the plan of the main one.
 
     The strengths of the lights are those in the band of the head. A head without a camera of its own has the main
     camera's band and light.
     """
-    head = main_scene.heads[n]
-    scene = main_scene.of_head(n)
+    head = plan.scene.heads[n]
+    scene = plan.scene.of_head(n)
     main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
     mount = Mount(np.array(head.position_m), main_from_head.inv() * main.mount.cam_from_body)
     try:
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
-        plan = LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
+        plan = replace(plan, scene=scene, band=band, known=known, mount=mount)
         turned = Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD)
-        return camera_of(head.name, plan, mount, main.orbit, main.run_seed, turned)
+        return camera_of(head.name, plan, mount, main.run_seed, turned)
     except InputError as error:
         raise error.under(f"heads.{n}") from None
 
