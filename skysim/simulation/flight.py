@@ -35,7 +35,7 @@ from skysim.simulation.lab import (
     build_tracker,
     with_parts,
 )
-from skysim.simulation.motion import Motion, history_s, readings_of
+from skysim.simulation.motion import Motion, history_s
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
@@ -270,7 +270,7 @@ class Flight:
             simulation.rate_body_rad_s.copy(),
             simulation.speeds_rad_s[vehicle.wheels.dof],
             simulation.angles_rad[vehicle.gimbals.qpos],
-            readings_of(self.motion.drives),
+            self.motion.readings,
         )
 
     def step(
@@ -362,7 +362,7 @@ class Flight:
         if motion.is_free:
             due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
             left_s = min(due_s, self.duration_s) - self.now_s
-            if motion.recorder is None:
+            if not motion.keeps_history:
                 # No more than there is room for.
                 left_s = min(left_s, history_s(self.lab))
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
@@ -392,15 +392,13 @@ class Flight:
         InputError
             In a flight without history, and before the first step.
         """
-        recorder = self.motion.recorder
-        if recorder is None:
+        if not self.motion.keeps_history:
             raise InputError(
                 "telemetry", "this flight keeps no history", "keeps_history=True"
             )
         if not self.now_s:
             raise InputError("telemetry", "the motion has not begun", "after a step")
-        reference = self.motion.reference if self.lab.scene.motion.control else None
-        return recorder.telemetry(reference, self.lab.cameras)
+        return self.motion.telemetry()
 
     def imu_samples(self, since_s: float = -math.inf) -> imu.Increments | None:
         """Samples of the IMU from about the time since_s on, as far as they are kept; None without an IMU."""
