@@ -9,6 +9,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -194,11 +195,12 @@ class Navigation:
         first = len(self.measured) - 1
         while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
             first -= 1
-        t_s, angle, velocity, saturated, overloaded = (
-            np.concatenate([getattr(one, name) for one in self.measured[first:]])
+        kept = self.measured[first:]
+        columns = {
+            name: np.concatenate([getattr(one, name) for one in kept])
             for name in ("t_s", "angle_rad", "velocity_m_s", "saturated", "overloaded")
-        )
-        return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
+        }
+        return replace(kept[0], **columns)
 
     def apparent_bias_rad_s(
         self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats
