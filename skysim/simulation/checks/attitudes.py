@@ -43,9 +43,9 @@ class CheckedAttitudes(NamedTuple):
     t_s: Floats
 
     @property
-    def speed_rad_s(self) -> Floats:
+    def speed_deg_s(self) -> Floats:
         """(N,) lengths of the rates."""
-        return np.linalg.norm(self.rate_body_rad_s, axis=1)
+        return np.degrees(np.linalg.norm(self.rate_body_rad_s, axis=1))
 
     @property
     def tilts_rad(self) -> Floats:
@@ -61,7 +61,7 @@ class CheckedAttitudes(NamedTuple):
     @property
     def rates_text(self) -> str:
         """The least and the greatest rate, to 0.001 deg/s."""
-        rates_deg_s = np.degrees(self.speed_rad_s).round(3)
+        rates_deg_s = self.speed_deg_s.round(3)
         low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
         return f"at {low} deg/s" if low == high else f"at {low} to {high} deg/s"
 
@@ -103,7 +103,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     every = CheckedAttitudes(lab, lab_from_body, rates + jitter, t_s)
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
-    chosen.add(int(every.speed_rad_s.argmax()))
+    chosen.add(int(every.speed_deg_s.argmax()))
     chosen.add(int(every.tilts_rad.argmax()))
     rows = np.array(sorted(chosen))
     # 3. Without a controller the vehicle may reach the stop; the frames before are checked.

@@ -165,7 +165,7 @@ def peak(plan: Plan) -> Fact:
 def smear(plan: Plan) -> Fact:
     """Path of the images during an exposure at the mean rates of the frames, their jitter included."""
     frames = plan.frames
-    rate_deg_s = np.degrees(frames.attitudes.speed_rad_s)
+    rate_deg_s = frames.attitudes.speed_deg_s
     length_px = np.array(
         [np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known]
     )

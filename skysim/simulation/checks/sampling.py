@@ -16,7 +16,7 @@ from skysim.core.types import Bools, Floats
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, broken, usable
 from skysim.simulation.checks.expected_error import Expected, expected, within_gate
-from skysim.simulation.checks.views import VISIBLE, View, view
+from skysim.simulation.checks.views import View, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import Beam, Exposure, beam_of
 
@@ -66,7 +66,7 @@ class Sampled(NamedTuple):
     @property
     def hidden(self) -> list[Counter[str]]:
         """Numbers of hidden lights that the tracker knows by the name of the occluder, at each attitude."""
-        return [Counter(view.behind[view.behind != VISIBLE]) for view in self.known]
+        return [Counter(view.behind[~view.visible]) for view in self.known]
 
     def hidden_counts(self) -> Floats:
         """(A,) number of hidden lights that the tracker knows."""
@@ -97,17 +97,11 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
     ]
     # 2. Known and other lights on the detector.
-    known = []
-    seen = []
-    whole = []
-    others = []
-    for exposure, beam in zip(exposures, beams, strict=True):
-        found, breaks = known_lights(beam, exposure, context)
-        visible = found.behind == VISIBLE
-        known.append(found)
-        seen.append(found.take(visible))
-        whole.append(found.take(visible & ~breaks))
-        others.append(other_lights(beam, exposure, context))
+    found = [known_lights(*pair, context) for pair in zip(beams, exposures, strict=True)]
+    others = [other_lights(*pair, context) for pair in zip(beams, exposures, strict=True)]
+    known = [view for view, _ in found]
+    seen = [view.take(view.visible) for view in known]
+    whole = [view.take(view.visible & ~breaks) for view, breaks in found]
     # 3. Detected lights, and the expected errors of a solution with them.
     detected = [usable(view, context) for view in whole]
     used = [within_gate(view, context) for view in detected]
@@ -139,5 +133,5 @@ def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, 
     for lit in beam.lits:
         if lit.points is not None and not lit.known:
             seen = view(lit, exposure, context.camera, beam.before(lit))
-            found[lit.name] = usable(seen.take(seen.behind == VISIBLE), context)
+            found[lit.name] = usable(seen.take(seen.visible), context)
     return {name: seen for name, seen in found.items() if len(seen)}

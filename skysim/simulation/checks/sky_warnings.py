@@ -296,7 +296,7 @@ def faintest_star(plan: Plan) -> Fact | None:
     believed = plan.beliefs
     if not scene.stars:
         return None
-    rate_deg_s = float(np.degrees(plan.frames.attitudes.speed_rad_s).min())
+    rate_deg_s = float(plan.frames.attitudes.speed_deg_s.min())
     limit_mag = detection_limit_mag(plan)
     snr_mag = snr_limit_mag(plan)
     sky = plan.lab.camera.sources.magnitude

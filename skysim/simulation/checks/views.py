@@ -22,7 +22,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Floats, Ints, Mount, Sources
+from skysim.core.types import Bools, Floats, Ints, Mount, Sources
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
@@ -81,6 +81,11 @@ class View(NamedTuple):
 
     def __len__(self) -> int:
         return len(self.row)
+
+    @property
+    def visible(self) -> Bools:
+        """(n,) whether nothing hides the lights."""
+        return self.behind == VISIBLE
 
     @property
     def jacobian(self) -> Floats:
