@@ -188,9 +188,8 @@ def expected_exposure(
     middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s
     window = window_from(camera.scene, middle_s - config.time_s / 2)
     after_s = np.linspace(-1, 1, KNOTS) * (window.close_s - window.open_s + MARGIN_S)
-    attitudes = lab_from_body * Rotation.from_rotvec(np.outer(after_s, rate_body_rad_s))
-    trajectory = Trajectory(
-        window.middle_s + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1))
+    trajectory = Trajectory.at_rate(
+        lab_from_body, rate_body_rad_s, window.middle_s, window.middle_s + after_s
     )
     return exposure_of(camera, trajectory, 0, window, None)
 

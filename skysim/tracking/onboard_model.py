@@ -93,9 +93,14 @@ def zero_point_mag(scene: Scene) -> float | None:
     """
     if scene.tracker.magnitude_sigma is None:
         return None
-    light_e = star_flux_e_s_m2(0.0, *SUN, Band.from_camera(scene.camera))
-    light_e = light_e * Optics.from_camera(scene.camera).collecting_m2 * scene.exposure.time_s
-    return float(2.5 * np.log10(light_e / scene.camera.detector.gain_e_dn))
+    return float(2.5 * np.log10(bright_star_e(scene) / scene.camera.detector.gain_e_dn))
+
+
+def bright_star_e(scene: Scene) -> float:
+    """Electrons of a star of V = 0 and the Sun's color in an exposure."""
+    light_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, Band.from_camera(scene.camera)))
+    collecting_m2 = Optics.from_camera(scene.camera).collecting_m2
+    return light_e_s_m2 * collecting_m2 * scene.exposure.time_s
 
 
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:

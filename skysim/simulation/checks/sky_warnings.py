@@ -34,7 +34,7 @@ from skysim.simulation.lights.light import find_light
 from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad
 from skysim.sources.ephemeris import place
-from skysim.sources.photometry import SUN, star_flux_e_s_m2
+from skysim.tracking.onboard_model import bright_star_e
 from skysim.tracking.tracker_interface import OWN
 
 # Refraction.
@@ -388,7 +388,7 @@ def detection_limit_mag(plan: Plan) -> float:
     peak_e = threshold_e(plan, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
     none = np.zeros(1)
     share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
-    return 2.5 * math.log10(bright_star_e(plan) * share / peak_e)
+    return 2.5 * math.log10(bright_star_e(plan.scene) * share / peak_e)
 
 
 def snr_limit_mag(plan: Plan) -> float:
@@ -405,14 +405,7 @@ def snr_limit_mag(plan: Plan) -> float:
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
     area_px = width_px * math.hypot(width_px, *least_streak_px(plan))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
-    return 2.5 * math.log10(bright_star_e(plan) / signal_e)
-
-
-def bright_star_e(context: Context) -> float:
-    """Electrons of a star of V = 0 and the Sun's color in an exposure."""
-    camera = context.camera
-    light_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
-    return light_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
+    return 2.5 * math.log10(bright_star_e(plan.scene) / signal_e)
 
 
 def least_streak_px(plan: Plan) -> Floats:
