@@ -35,7 +35,7 @@ from skysim.simulation.lab import (
     build_tracker,
     with_parts,
 )
-from skysim.simulation.motion import Motion, history_s
+from skysim.simulation.motion import Motion
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
@@ -226,7 +226,7 @@ class Flight:
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
         self.motion = Motion(
-            lab, parts.programs, self.duration_s, None if keeps_history else history_s(lab)
+            lab, parts.programs, self.duration_s, None if keeps_history else lab.history_s
         )
         self.schedules = [
             Schedule(camera, number, math.inf if endless else camera.scene.exposure.frames)
@@ -364,7 +364,7 @@ class Flight:
             left_s = min(due_s, self.duration_s) - self.now_s
             if not motion.keeps_history:
                 # No more than there is room for.
-                left_s = min(left_s, history_s(self.lab))
+                left_s = min(left_s, self.lab.history_s)
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
         motion.advance(periods * motion.period_steps)
 

@@ -274,6 +274,11 @@ class Lab:
         return max(timing.duration_s(camera.scene) for camera in self.cameras)
 
     @property
+    def history_s(self) -> float:
+        """Duration of past states that a frame of any camera needs when it is due."""
+        return max(timing.history_s(camera.scene) for camera in self.cameras)
+
+    @property
     def reference(self) -> guidance.Reference:
         """The attitude that the scene's maneuvers command."""
         return guidance.plan(self.scene.motion, self.start, self.profiles)
@@ -421,7 +426,7 @@ def build_head(n: int, plan: LightPlan, main: StarCamera, programs: Programs) ->
 
 
 def lab_from_body_start(
-    scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()
+    scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline]
 ) -> Rotation:
     """lab_from_body at t = 0. In a star scene the lab frame is the ICRS."""
     start = scene.motion.start

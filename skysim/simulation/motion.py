@@ -37,7 +37,6 @@ from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.dynamics.multibody.thrusters import propellant_kg
 from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
-from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.tracking.navigation import Navigation
 
@@ -562,11 +561,6 @@ class Motion:
             trajectory.lab_from_body.as_quat(scalar_first=True),
             trajectory.rate_body_rad_s,
         )
-
-
-def history_s(lab: Lab) -> float:
-    """Duration of past states that a frame of any camera needs when it is due."""
-    return max(timing.history_s(camera.scene) for camera in lab.cameras)
 
 
 def build_disturbances(

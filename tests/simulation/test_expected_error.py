@@ -537,7 +537,7 @@ def normalized_errors(
 def random_attitude(lab: Lab, frames: CheckedAttitudes, rng: np.random.Generator) -> Rotation:
     if lab.scene.light.kind == "stars":
         return Rotation.random(rng=rng)
-    cosine = np.cos(attitudes.greatest_tilt_rad(frames))
+    cosine = np.cos(np.radians(attitudes.greatest_tilt_deg(frames)))
     azimuth, yaw = rng.uniform(0, 2 * np.pi, 2)
     return Rotation.from_euler("ZYZ", [azimuth, np.arccos(rng.uniform(cosine, 1)), yaw])
 

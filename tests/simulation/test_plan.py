@@ -110,7 +110,7 @@ def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky()
 def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
     lab = lab_of("afit_simsat", motion__control="none", motion__maneuver="[]")
     frames = attitudes.of_frames(lab)
-    assert math.degrees(attitudes.greatest_tilt_rad(frames)) == pytest.approx(30)
+    assert attitudes.greatest_tilt_deg(frames) == pytest.approx(30)
 
 
 @pytest.mark.parametrize(

@@ -48,9 +48,9 @@ class CheckedAttitudes(NamedTuple):
         return np.degrees(np.linalg.norm(self.rate_body_rad_s, axis=1))
 
     @property
-    def tilts_rad(self) -> Floats:
+    def tilts_deg(self) -> Floats:
         """(N,) angles between the z axes of body and lab."""
-        return np.radians(multibody.tilt_deg(self.lab_from_body))
+        return multibody.tilt_deg(self.lab_from_body)
 
     @property
     def boresights(self) -> Floats:
@@ -77,7 +77,7 @@ class CheckedAttitudes(NamedTuple):
             lab_from_body = self.lab_from_body[n]
             # Adding 0 turns -0 into 0.
             yaw, pitch, roll = np.round(lab_from_body.as_euler("ZYX", degrees=True), 1) + 0.0
-            tilt_deg = float(multibody.tilt_deg(lab_from_body))
+            tilt_deg = self.tilts_deg[n]
             where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
         return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"
 
@@ -104,11 +104,11 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
     chosen.add(int(every.speed_deg_s.argmax()))
-    chosen.add(int(every.tilts_rad.argmax()))
+    chosen.add(int(every.tilts_deg.argmax()))
     rows = np.array(sorted(chosen))
     # 3. Without a controller the vehicle may reach the stop; the frames before are checked.
     if scene.vehicle.mount == "air_bearing":
-        free = every.tilts_rad[rows] <= math.radians(scene.vehicle.tilt_stop_deg)
+        free = every.tilts_deg[rows] <= scene.vehicle.tilt_stop_deg
         rows = rows[free] if free.any() else rows[:1]
     return CheckedAttitudes(
         lab, every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows]
@@ -132,12 +132,12 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
     return rate, rest - rest.mean(axis=1, keepdims=True)
 
 
-def greatest_tilt_rad(frames: CheckedAttitudes) -> float:
+def greatest_tilt_deg(frames: CheckedAttitudes) -> float:
     """The greatest tilt at the frames; without a controller on a bearing, the tilt stop."""
     scene = frames.lab.scene
     if scene.motion.control is None and scene.vehicle.mount == "air_bearing":
-        return math.radians(scene.vehicle.tilt_stop_deg)
-    return float(frames.tilts_rad.max())
+        return scene.vehicle.tilt_stop_deg
+    return float(frames.tilts_deg.max())
 
 
 def within_reach(frames: CheckedAttitudes, tilt_deg: float | None = None) -> CheckedAttitudes:
@@ -151,7 +151,7 @@ def within_reach(frames: CheckedAttitudes, tilt_deg: float | None = None) -> Che
     frames
         Attitudes of the frames, with their rates; their greatest tilt is the default
     tilt_deg
-        Greatest tilt, for example that of a study's trials; None for `greatest_tilt_rad`
+        Greatest tilt, for example that of a study's trials; None for `greatest_tilt_deg`
     """
     lab = frames.lab
     n = np.arange(DIRECTIONS)
@@ -163,10 +163,9 @@ def within_reach(frames: CheckedAttitudes, tilt_deg: float | None = None) -> Che
         )
         lab_from_body = lab_from_cam * lab.camera.mount.cam_from_body
     else:
-        greatest_rad = (
-            greatest_tilt_rad(frames) if tilt_deg is None else math.radians(tilt_deg)
-        )
-        cosine = math.cos(greatest_rad)
+        if tilt_deg is None:
+            tilt_deg = greatest_tilt_deg(frames)
+        cosine = math.cos(math.radians(tilt_deg))
         # Equal steps of the cosine are equal areas; the last attitude has the greatest tilt.
         tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))
         azimuth_rad = n * GOLDEN_ANGLE_RAD

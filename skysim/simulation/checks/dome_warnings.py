@@ -170,7 +170,7 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     place_m = plan.beliefs.lights.place[:, :3]
     most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
-    tilt_rad = float(plan.reach.attitudes.tilts_rad.max())
+    tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))
     # 3. Comparison, with circular fields of the detector's area.

@@ -51,7 +51,7 @@ def lights_in_field(plan: Plan) -> Fact:
     lab = plan.lab
     lines = []
     values = {}
-    tilt_deg = math.degrees(plan.reach.attitudes.tilts_rad.max())
+    tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
     reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
     if lab.scene.stars:
         reach = "in the whole sky"
@@ -262,7 +262,7 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     listed = points.kind == "listed"
     cap_deg = max_tilt_deg(plan.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
     if tilt_deg is None:
-        tilt_deg = math.degrees(plan.reach.attitudes.tilts_rad.max())
+        tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
     edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)
     corner = field_reach_deg(plan, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)

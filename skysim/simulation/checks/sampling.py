@@ -97,8 +97,9 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
     ]
     # 2. Known and other lights on the detector.
-    found = [known_lights(*pair, context) for pair in zip(beams, exposures, strict=True)]
-    others = [other_lights(*pair, context) for pair in zip(beams, exposures, strict=True)]
+    pairs = list(zip(beams, exposures, strict=True))
+    found = [known_lights(*pair, context) for pair in pairs]
+    others = [other_lights(*pair, context) for pair in pairs]
     known = [view for view, _ in found]
     seen = [view.take(view.visible) for view in known]
     whole = [view.take(view.visible & ~breaks) for view, breaks in found]
