@@ -20,7 +20,7 @@ from estimator.filter.mekf import AttitudeFilter
 from skysim.camera.render import Window
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, HOUR_S, PPM
-from skysim.core.types import Floats, Mount
+from skysim.core.types import Floats, Mount, Record
 from skysim.dynamics import imu
 from skysim.dynamics.imu import Increments
 from skysim.scene.scene import Scene
@@ -196,7 +196,7 @@ class Navigation:
         while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
             first -= 1
         kept = self.measured[first:]
-        columns = {
+        columns: Record = {
             name: np.concatenate([getattr(one, name) for one in kept])
             for name in ("t_s", "angle_rad", "velocity_m_s", "saturated", "overloaded")
         }

@@ -61,6 +61,7 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
     depth_m = offset_m[:, 2]
     behind = np.full(count, VISIBLE)
     return View(
+        Rotation.identity(),
         row,
         xy_px,
         offset_m,
@@ -71,7 +72,6 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
         streak,
         nothing,
         behind,
-        Rotation.identity(),
     )
 
 
@@ -226,6 +226,7 @@ def images(
     gradient = np.zeros((1, 2, 3))
     row = np.zeros(1, int)
     return View(
+        Rotation.identity(),
         row,
         zero[:, None] + np.zeros(2),
         places,
@@ -239,7 +240,6 @@ def images(
         streak,
         zero,
         row,
-        Rotation.identity(),
     )
 
 

@@ -125,7 +125,9 @@ def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View
     found = view(lit, exposure, context.camera, beam.before(lit))
     row = context.rows_of(lit.points.id[found.row])
     known = row >= 0
-    return View(row, *found[1:]).take(known), broken(found, context)[known]
+    return View(found.lab_from_cam, row, *found[2:]).take(known), broken(found, context)[
+        known
+    ]
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:

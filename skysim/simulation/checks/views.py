@@ -36,6 +36,8 @@ class View(NamedTuple):
 
     Attributes
     ----------
+    lab_from_cam
+        Attitude of the camera, with its assumed mount
     row
         (n,) rows among the sources
     xy_px
@@ -60,10 +62,9 @@ class View(NamedTuple):
         (n,) mean electrons in the brightest pixel, background included
     behind
         (n,) names of the occluders that hide the lights; VISIBLE for none
-    lab_from_cam
-        Attitude of the camera, with its assumed mount
     """
 
+    lab_from_cam: Rotation
     row: Ints
     xy_px: Floats
     offset_m: Floats
@@ -77,7 +78,6 @@ class View(NamedTuple):
     streak_px: Floats
     peak_e: Floats
     behind: NDArray
-    lab_from_cam: Rotation
 
     def __len__(self) -> int:
         return len(self.row)
@@ -107,7 +107,7 @@ class View(NamedTuple):
 
     def take(self, which: NDArray) -> "View":
         """The lights selected by a mask or by indices."""
-        return View(*(column[which] for column in self[:-1]), self.lab_from_cam)
+        return View(self.lab_from_cam, *(column[which] for column in self[1:]))
 
 
 class CameraModel(NamedTuple):
@@ -219,6 +219,7 @@ def view(
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
+        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
         row,
         xy_px,
         offset_m,
@@ -232,7 +233,6 @@ def view(
         streak_px,
         electrons * share + camera.background_e,
         hiding(occluders, chosen.place),
-        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
     )
 
 
