@@ -117,10 +117,8 @@ def bodies_near(plan: Plan) -> Iterator[str]:
             camera = plan.camera
             lit = (1 + math.cos(body.place.phase_rad)) / 2
             radius = math.tan(body.radius_rad) * math.sqrt(lit)
-            radius_px = np.array([camera.optics.camera.focal_px * radius])
-            lens2_px2 = np.array([camera.lens_px**2])
-            none = np.zeros(1)
-            share = float(peak_share(lens2_px2, radius_px, none, none)[0])
+            radius_px = camera.optics.camera.focal_px * radius
+            share = float(peak_share(camera.lens_px**2, radius_px))
             light_e = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
             fill = light_e * share / plan.full_e
             yield f"{what} is in the field, {far}: {short(fill, 2)} times saturation"
@@ -386,8 +384,7 @@ def detection_limit_mag(plan: Plan) -> float:
     half_px = length_px / math.pi
     radius_px = math.sqrt(half_px**2 + plan.settings.min_area_px / math.pi) - half_px
     peak_e = threshold_e(plan, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
-    none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
+    share = float(peak_share(blur2_px2, streak_px=length_px))
     return 2.5 * math.log10(bright_star_e(plan.scene) * share / peak_e)
 
 

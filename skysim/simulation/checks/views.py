@@ -184,14 +184,15 @@ def view(
     lit: Lit,
     exposure: Exposure,
     camera: CameraModel,
-    occluders: Sequence[Occluder] = (),
+    occluders: Sequence[Occluder],
 ) -> View:
     """The points of a light on the detector in an exposure, hidden ones included.
 
     1. Select the points on the detector.
     2. Electrons, from rate and on-time.
     3. Vectors to the lights, derivatives of the images, paths.
-    4. Sizes of lens image, LED disk and defocus disk.
+    4. Occluders.
+    5. Sizes of lens image, LED disk and defocus disk.
 
     Parameters
     ----------
@@ -212,7 +213,11 @@ def view(
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
     streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, arm_m, gradient)
-    # 4. Sizes.
+    # 4. What hides them: of several occluders, the last.
+    behind = np.full(len(row), VISIBLE, object)
+    for occluder in occluders:
+        behind[occluder.hides(chosen.place)] = occluder.name
+    # 5. Sizes.
     depth_m = np.where(chosen.place[:, 3] > 0, offset_m[:, 2], np.inf)
     disk_px = optics.camera.focal_px * chosen.radius_m / distance_m  # a star has no radius
     lens2_px2, defocus_px = lens_blur(camera, chosen, xy_px, depth_m)
@@ -232,7 +237,7 @@ def view(
         sigma_px,
         streak_px,
         electrons * share + camera.background_e,
-        hiding(occluders, chosen.place),
+        behind,
     )
 
 
@@ -267,14 +272,6 @@ def lens_blur(
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 
-def hiding(occluders: Sequence[Occluder], place: Floats) -> NDArray:
-    """(N,) name of the last occluder that hides each of N places; VISIBLE for none."""
-    found = np.full(len(place), VISIBLE, object)
-    for occluder in occluders:
-        found[occluder.hides(place)] = occluder.name
-    return found
-
-
 def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
@@ -283,9 +280,12 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
 
 
 def peak_share(
-    lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats
+    lens2_px2: Floats | float,
+    disk_px: Floats | float = 0.0,
+    defocus_px: Floats | float = 0.0,
+    streak_px: Floats | float = 0.0,
 ) -> Floats:
-    """(n,) share of the light in the brightest pixel.
+    """(n,) share of the light in the brightest pixel; arguments that are numbers hold for all.
 
     The image is a disk of radius R, the larger of LED and defocus disk, blurred by a Gaussian of variance
     s^2 = lens^2 + r^2 / 4 with the smaller radius r:
