@@ -173,10 +173,13 @@ def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together, from the facts of each camera."""
     errors = [errors_arcsec(own) for own in facts]
-    names = [head.name for head in lab.scene.heads]
+    values = [
+        {"name": head.name, "cross_arcsec": cross, "roll_arcsec": roll}
+        for head, (cross, roll) in zip(lab.scene.heads, errors[1:], strict=True)
+    ]
     lines = [
-        f"{name}: {errors_text(*error)}"
-        for name, error in zip(names, errors[1:], strict=True)
+        f"{one['name']}: {errors_text(one['cross_arcsec'], one['roll_arcsec'])}"
+        for one in values
     ]
     # Of all cameras about the boresight of the main one. The information of solutions with independent errors adds up:
     # P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation from the axes of camera n to those of the main one. A camera
@@ -195,10 +198,6 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     lines.append(
         f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts"
     )
-    values = [
-        {"name": name, "cross_arcsec": cross, "roll_arcsec": roll}
-        for name, (cross, roll) in zip(names, errors[1:], strict=True)
-    ]
     together = {"cross_arcsec": combined[0], "roll_arcsec": combined[1]}
     return Fact("heads", lines, {"heads": values, "together": together})
 

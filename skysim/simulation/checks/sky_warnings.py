@@ -218,7 +218,8 @@ def floor_too_small(plan: Plan) -> str:
 # Stray light past the baffle, and exclusion angles.
 
 MAX_LOSS_MAG = 0.5  # loss of limiting magnitude that gives no warning
-STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
+# Bodies with an exclusion angle, and what it is measured from.
+EXCLUDED = {"sun": "the Sun", "earth": "the Earth's limb", "moon": "the Moon"}
 
 
 def stray_light(plan: Plan) -> Iterator[str]:
@@ -257,8 +258,7 @@ def exclusion(plan: Plan) -> Iterator[str]:
         return
     # Angles from the Sun's center, the Earth's limb and the Moon's center.
     rows = []
-    boresights = at.boresights
-    for t_s, boresight in zip(at.t_s.tolist(), boresights, strict=True):
+    for t_s, boresight in zip(at.t_s.tolist(), at.boresights, strict=True):
         here = lab.camera.viewpoint.observer_at(t_s)
         sun, moon = (
             float(angular_separation_deg(boresight, place(name, here).direction))
@@ -266,14 +266,14 @@ def exclusion(plan: Plan) -> Iterator[str]:
         )
         limb_rad = limb_elevation_rad(here.from_earth.position_m, boresight)
         rows.append([sun, math.degrees(float(limb_rad)), moon])
-    angles_deg = np.array(rows)
-    limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
-    for column, (name, limit_deg) in enumerate(limits_deg.items()):
-        n = int(angles_deg[:, column].argmin())
-        if angles_deg[n, column] < limit_deg:
-            what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
+    limits_deg = (limits.sun_deg, limits.earth_deg, limits.moon_deg)
+    for (name, what), limit_deg, angle_deg in zip(
+        EXCLUDED.items(), limits_deg, np.array(rows).T, strict=True
+    ):
+        n = int(angle_deg.argmin())
+        if angle_deg[n] < limit_deg:
             yield (
-                f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
+                f"orbit.exclusion.{name}_deg: {what} is {angle_deg[n]:.1f}° from the boresight at"
                 f" {at.describe(n)}, within {limit_deg:g}°; point farther away"
             )
 
