@@ -440,9 +440,8 @@ def expected_error(plan: Plan) -> Fact:
             "roll_arcsec": roll,
             "without_solution": failing,
             "centroid_px": centroid_px(plan, sampled),
-        }
-        values[key] |= {
-            f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
+            "cross_causes_arcsec": causes(sampled, "cross"),
+            "roll_causes_arcsec": causes(sampled, "roll"),
         }
     chosen = plan.frames if np.isfinite(values["frames"]["roll_arcsec"]) else plan.reach
     # The causes with their size and their share of the variance.

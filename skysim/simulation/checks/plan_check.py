@@ -97,17 +97,16 @@ def check(
     # 2. Views.
     plan = plan_of(lab, frames, tilt_deg)
     # 3. Facts and warnings.
-    built = [build(plan) for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)]
-    facts = [fact for fact in built if fact is not None]
+    builds = (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
+    facts = list(filter(None, (build(plan) for build in builds)))
     findings = warnings_of(plan, drawn)
     alike = dome_warnings.of(plan)
     if alike is not None and scene.dome:
         facts.insert(2, dome_warnings.fact(alike))
-        warning = dome_warnings.finding(alike, scene.dome)
-        findings += [warning] if warning else []
+        findings += filter(None, [dome_warnings.finding(alike, scene.dome)])
     forecast = forecast_torque(lab)
     fuel, warning = vehicle_facts.propellant(plan, forecast)
-    facts += [fuel] if fuel else []
+    facts += filter(None, [fuel])
     findings += filter(None, [*broken_assumptions(lab), shortfall(lab, forecast), warning])
     # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
@@ -121,12 +120,12 @@ def check(
 
 def warnings_of(plan: Plan, drawn: bool) -> list[str]:
     """The warnings of the views; those about the directions of the frames only if these are not drawn."""
-    found = [
+    found = (
         find(plan)
         for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
         if not drawn or find not in POINTED_FINDINGS
-    ]
-    findings = [line for line in found if line]
+    )
+    findings = list(filter(None, found))
     for finder in () if drawn else POINTED:
         findings += finder(plan)
     return findings
