@@ -172,7 +172,7 @@ def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together, from the facts of each camera."""
     errors = [errors_arcsec(own) for own in facts]
-    values = [
+    values: list[Record] = [
         {"name": head.name, "cross_arcsec": cross, "roll_arcsec": roll}
         for head, (cross, roll) in zip(lab.scene.heads, errors[1:], strict=True)
     ]
