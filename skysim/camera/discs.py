@@ -58,8 +58,8 @@ class Exposed(NamedTuple):
 
     def few_poses(self) -> Poses:
         """FEW poses over the exposure, to find sources near the field."""
-        end_s = self.window.close_s(self.optics.camera.height_px)
-        return poses(self.trajectory, self.mount, np.linspace(self.window.open_s, end_s, FEW))
+        t_s = np.linspace(self.window.open_s, self.window.close_s, FEW)
+        return poses(self.trajectory, self.mount, t_s)
 
 
 class DiscOnChip(NamedTuple):
@@ -83,10 +83,8 @@ Hidden = Callable[[Floats], Bools]  # which of (M, 2) points of a disc are hidde
 
 def disc_on_chip(body: BodyLight, exposed: Exposed) -> DiscOnChip:
     """Project the disc's center and two points near it. Center and scale are NaN behind the camera."""
-    window = exposed.window
-    rows = exposed.optics.camera.height_px
     xy = SMALL * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    middle = poses(exposed.trajectory, exposed.mount, np.array([window.middle_s(rows)]))
+    middle = poses(exposed.trajectory, exposed.mount, np.array([exposed.window.middle_s]))
     # Columns of the matrix by difference quotients.
     center, x, y = project(points_of(body, xy), exposed.optics, middle)[0][0]
     return DiscOnChip(center, np.column_stack([x - center, y - center]) / SMALL)
@@ -135,8 +133,8 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     3. Draw each on a patch of its own; all patches have the size that the longest reach needs.
     """
     optics = exposed.optics
-    close_s = exposed.window.close_s(optics.camera.height_px)
-    t_s = sample_times(exposed.window.open_s, close_s, exposed.trajectory)
+    window = exposed.window
+    t_s = sample_times(window.open_s, window.close_s, exposed.trajectory)
     all_poses = poses(exposed.trajectory, exposed.mount, t_s)
     center = points_of(body, np.zeros((1, 2)))
     star = source_kernels(center, optics, disc.center_px[None], *np.ones((2, 1)))
@@ -161,9 +159,7 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
         xy_px - low + width * np.column_stack([np.arange(len(points)), np.zeros(len(points))])
     )
     # The strip's first row is the chip's row low[1], which a rolling shutter exposes later.
-    window = exposed.window._replace(
-        open_s=exposed.window.open_s + low[1] * exposed.window.row_time_s
-    )
+    window = window._replace(open_s=window.open_s + low[1] * window.row_time_s)
     drawn = draw(
         strip, tracks._replace(xy_px=moved), kernels, STEP * kernels.sharp_px, window
     )

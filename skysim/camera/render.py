@@ -68,19 +68,22 @@ OcclusionTest = Callable[[Floats], Bools]
 
 
 class Window(NamedTuple):
-    """Exposure interval: the first row from open_s for exposure_s, each next row row_time_s later."""
+    """Exposure interval: the first of some rows from open_s for exposure_s, each next row row_time_s later."""
 
     open_s: float
     exposure_s: float
     row_time_s: float = 0.0
+    rows: int = 1
 
-    def close_s(self, rows: int) -> float:
-        """End of the last row's exposure on a chip of `rows` rows."""
-        return self.open_s + self.exposure_s + self.row_time_s * (rows - 1)
+    @property
+    def close_s(self) -> float:
+        """End of the last row's exposure."""
+        return self.open_s + self.exposure_s + self.row_time_s * (self.rows - 1)
 
-    def middle_s(self, rows: int) -> float:
+    @property
+    def middle_s(self) -> float:
         """Mid-exposure of the middle row, the time of the frame's truth."""
-        return (self.open_s + self.close_s(rows)) / 2
+        return (self.open_s + self.close_s) / 2
 
 
 def render(
@@ -103,9 +106,8 @@ def render(
     profile converges with the fourth power of the piece. In a rolling shutter every row has its own exposure.
     The numbers in the code are those of the module's steps.
     """
-    rows = image.shape[0]
     # Times from the first row's opening to the last row's end.
-    t_s = sample_times(window.open_s, window.close_s(rows), trajectory)
+    t_s = sample_times(window.open_s, window.close_s, trajectory)
     all_poses = poses(trajectory, mount, t_s)
     # 1. Coarse selection with a few poses, before the sources are projected at all of them.
     # It knows no motion of sources, so moving sources are all kept.
@@ -131,12 +133,10 @@ def render(
     )
     # 4. and 5. Integrate and add to the frame.
     table = draw(image, tracks, kernels, STEP * kernels.sharp_px, window)
-    return truth_on_chip(candidates.id, tracks, table, window, rows)
+    return truth_on_chip(candidates.id, tracks, table, window)
 
 
-def truth_on_chip(
-    ids: Ints, tracks: Tracks, table: Floats, window: Window, rows: int
-) -> SourceTruth:
+def truth_on_chip(ids: Ints, tracks: Tracks, table: Floats, window: Window) -> SourceTruth:
     """The truth of the sources that gave light to the chip, from the table of `draw`."""
     mid_px = tracks.xy_px[len(tracks.xy_px) // 2]
     on_chip = table[:, 0] > 0
@@ -153,14 +153,14 @@ def truth_on_chip(
         peak_xy=table[on_chip, 6:8].astype(np.int64),
         saturated=np.zeros(len(electrons), bool),  # set by the detector, as is the SNR
         snr=np.full(len(electrons), np.nan),
-        streak_xy_px=streak_vectors_px(tracks, mid_px, window, rows)[on_chip],
+        streak_xy_px=streak_vectors_px(tracks, mid_px, window)[on_chip],
     )
 
 
-def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window, rows: int) -> Floats:
+def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window) -> Floats:
     """(N, 2) displacement of each image over the exposure of the row that it is on at mid-exposure."""
     # A row's exposure begins row_time_s after that of the row above it.
-    row = np.clip(np.nan_to_num(mid_px[:, 1]), 0, rows - 1)
+    row = np.clip(np.nan_to_num(mid_px[:, 1]), 0, window.rows - 1)
     begin_s = window.open_s + window.row_time_s * row
     return _displacement(tracks, begin_s, begin_s + window.exposure_s)
 

@@ -121,11 +121,10 @@ def render_at(
             "camera", f"{camera} is none of the lab's", f"0 to {len(lab.cameras) - 1}"
         )
     own = lab.cameras[camera]
-    rows = own.scene.camera.height_px
     window = timing.window_from(own.scene, 0.0)
-    window = window._replace(open_s=t_s - window.middle_s(rows))
+    window = window._replace(open_s=t_s - window.middle_s)
     times_s = np.linspace(
-        window.open_s - timing.MARGIN_S, window.close_s(rows) + timing.MARGIN_S, KNOTS
+        window.open_s - timing.MARGIN_S, window.close_s + timing.MARGIN_S, KNOTS
     )
     rate = np.asarray(rate_body_rad_s, dtype=np.float64)
     return render_frame(

@@ -89,8 +89,7 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
     assumed = assumed_camera(camera.scene)
     when = exposure_window(camera.scene, 0)
     place = camera.sources.place[np.argsort(camera.sources.magnitude, kind="stable")]
-    toward = place[:, :3] - place[:, 3:] * lab_from_body.apply(camera.mount.camera_body_m)
-    vectors_cam = (camera.mount.cam_from_body * lab_from_body.inv()).apply(toward)
+    vectors_cam = camera.mount.toward(place, lab_from_body)
     xy_px = assumed.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[assumed.contains(xy_px)][:MAX_SPOTS]
     # 2. Background with noise, and the spots.

@@ -149,7 +149,7 @@ def exposure_of(
     mount = camera.mount
     optics = camera.optics
     scene = camera.scene
-    middle_s = window.middle_s(scene.camera.height_px)
+    middle_s = window.middle_s
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
@@ -187,11 +187,9 @@ def expected_exposure(
     config = camera.scene.exposure
     middle_s = config.first_s + config.time_s / 2 if math.isnan(t_s) else t_s
     window = window_from(camera.scene, middle_s - config.time_s / 2)
-    rows = camera.scene.camera.height_px
-    after_s = np.linspace(-1, 1, KNOTS) * (window.close_s(rows) - window.open_s + MARGIN_S)
-    attitudes = lab_from_body * Rotation.from_rotvec(np.outer(after_s, rate_body_rad_s))
-    trajectory = Trajectory(
-        window.middle_s(rows) + after_s, attitudes, np.tile(rate_body_rad_s, (KNOTS, 1))
+    after_s = np.linspace(-1, 1, KNOTS) * (window.close_s - window.open_s + MARGIN_S)
+    trajectory = Trajectory.at_rate(
+        lab_from_body, rate_body_rad_s, window.middle_s, window.middle_s + after_s
     )
     return exposure_of(camera, trajectory, 0, window, None)
 

@@ -35,7 +35,7 @@ from skysim.simulation.lab import (
     build_tracker,
     with_parts,
 )
-from skysim.simulation.motion import Motion, history_s, readings_of
+from skysim.simulation.motion import Motion
 from skysim.tracking import factory, navigation
 from skysim.tracking.factory import ExposureController
 
@@ -110,8 +110,8 @@ class Schedule:
 
     Attributes
     ----------
-    camera, scene, rows, number
-        Star camera, its scene, its number of rows, and its number in the lab
+    camera, scene, number
+        Star camera, its scene, and its number in the lab
     frames
         Number of frames; infinite in an endless flight
     exposure_control
@@ -133,7 +133,6 @@ class Schedule:
         self.number = number
         self.frames = frames
         self.scene = scene = camera.scene
-        self.rows = scene.camera.height_px
         self.exposure_control = ExposureController(scene)
         self.latency_s = scene.filter.latency_s if scene.filter else 0.0
         self.index = 0
@@ -154,7 +153,7 @@ class Schedule:
         open_s = now_s
         if waiting:
             last = self.window_from(max(waiting.values()))
-            open_s = max(now_s, last.close_s(self.rows))
+            open_s = max(now_s, last.close_s)
         self.triggers_s = waiting | {self.index + len(waiting): open_s}
 
     def resume(self, now_s: float) -> None:
@@ -171,7 +170,7 @@ class Schedule:
     def window_to(self, close_s: float) -> Window:
         """Window of an exposure whose last row ends at this time."""
         window = self.window_from(0.0)
-        return window._replace(open_s=close_s - window.close_s(self.rows))
+        return window._replace(open_s=close_s - window.close_s)
 
     @property
     def window(self) -> Window:
@@ -185,9 +184,8 @@ class Schedule:
     def due_s(self) -> float:
         """Time at which the next frame is due: it is exposed, its solution is ready, and its time tag has passed."""
         window = self.window
-        error_s = timing.time_tag_error_s(self.scene, self.index)
-        tagged_s = window.middle_s(self.rows) + error_s
-        return max(window.close_s(self.rows) + self.latency_s, tagged_s)
+        tagged_s = window.middle_s + timing.time_tag_error_s(self.scene, self.index)
+        return max(window.close_s + self.latency_s, tagged_s)
 
 
 class Flight:
@@ -228,7 +226,7 @@ class Flight:
         self.parts = parts
         self.duration_s = math.inf if endless else lab.duration_s
         self.motion = Motion(
-            lab, parts.programs, self.duration_s, None if keeps_history else history_s(lab)
+            lab, parts.programs, self.duration_s, None if keeps_history else lab.history_s
         )
         self.schedules = [
             Schedule(camera, number, math.inf if endless else camera.scene.exposure.frames)
@@ -272,7 +270,7 @@ class Flight:
             simulation.rate_body_rad_s.copy(),
             simulation.speeds_rad_s[vehicle.wheels.dof],
             simulation.angles_rad[vehicle.gimbals.qpos],
-            readings_of(self.motion.drives),
+            self.motion.readings,
         )
 
     def step(
@@ -364,9 +362,9 @@ class Flight:
         if motion.is_free:
             due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
             left_s = min(due_s, self.duration_s) - self.now_s
-            if motion.recorder is None:
+            if not motion.keeps_history:
                 # No more than there is room for.
-                left_s = min(left_s, history_s(self.lab))
+                left_s = min(left_s, self.lab.history_s)
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
         motion.advance(periods * motion.period_steps)
 
@@ -394,15 +392,13 @@ class Flight:
         InputError
             In a flight without history, and before the first step.
         """
-        recorder = self.motion.recorder
-        if recorder is None:
+        if not self.motion.keeps_history:
             raise InputError(
                 "telemetry", "this flight keeps no history", "keeps_history=True"
             )
         if not self.now_s:
             raise InputError("telemetry", "the motion has not begun", "after a step")
-        reference = self.motion.reference if self.lab.scene.motion.control else None
-        return recorder.telemetry(reference, self.lab.cameras)
+        return self.motion.telemetry()
 
     def imu_samples(self, since_s: float = -math.inf) -> imu.Increments | None:
         """Samples of the IMU from about the time since_s on, as far as they are kept; None without an IMU."""
@@ -489,19 +485,14 @@ class Flight:
         while due := [
             one
             for one in schedules
-            if not one.is_over
-            and (one.window.close_s(one.rows) if late else one.due_s) <= self.now_s
+            if not one.is_over and (one.window.close_s if late else one.due_s) <= self.now_s
         ]:
             # Of several that are due at once, the first camera's.
             schedule = min(due, key=lambda one: one.due_s)
             index = schedule.index
             window = schedule.window
             schedule.index += 1
-            if (
-                selects
-                and schedule.number == 0
-                and not selects(index, window.close_s(schedule.rows))
-            ):
+            if selects and schedule.number == 0 and not selects(index, window.close_s):
                 continue
             if math.isfinite(schedule.frames):
                 schedule.exposures_s[index] = window.exposure_s
@@ -587,9 +578,7 @@ class Flight:
         samples = self.imu_samples(window.open_s) if scene.tracker.gyro else None
         if config is None or samples is None:
             return None
-        return navigation.rate_of_frame(
-            samples, window, scene.camera.height_px, config, camera.mount
-        )
+        return navigation.rate_of_frame(samples, window, config, camera.mount)
 
     def render(self, index: int, camera: int = 0) -> tuple[Frame, Truth]:
         """Render an exposure of the schedule again from the motion so far; the frame equals that of `shots`.
@@ -616,7 +605,7 @@ class Flight:
                 "after it came from shots",
             )
         window = timing.exposure_window(scene, index, exposure_s)
-        if not (0 <= index < schedule.frames and window.close_s(schedule.rows) <= self.now_s):
+        if not (0 <= index < schedule.frames and window.close_s <= self.now_s):
             raise InputError(
                 "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"
             )

@@ -23,10 +23,12 @@ from skysim.camera.psf.otf import EXTENT
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
+from skysim.core.random_streams import JITTER, random_stream
 from skysim.core.types import Mount, Sources
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.controllers import CONTROLLERS
+from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import mjcf_export
 from skysim.dynamics.profiles import load_profiles
 from skysim.dynamics.reference_curves import AttitudeSpline
@@ -271,6 +273,22 @@ class Lab:
         """Duration of the motion: until the longest exposure of the last frame ends, of all cameras."""
         return max(timing.duration_s(camera.scene) for camera in self.cameras)
 
+    @property
+    def history_s(self) -> float:
+        """Duration of past states that a frame of any camera needs when it is due."""
+        return max(timing.history_s(camera.scene) for camera in self.cameras)
+
+    @property
+    def reference(self) -> guidance.Reference:
+        """The attitude that the scene's maneuvers command."""
+        return guidance.plan(self.scene.motion, self.start, self.profiles)
+
+    @property
+    def vibration(self) -> Vibration:
+        """The vibration of the run, with that of its maneuvers."""
+        rng = random_stream(self.scene.seed, JITTER, 0)
+        return Vibration(self.scene.motion, rng, self.reference)
+
     def in_run(self, seed: int) -> "Lab":
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""
         lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
@@ -331,11 +349,8 @@ def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:
     orbit = build_orbit(scene.orbit, scene.start_time)
     viewpoint = Viewpoint(scene.start_time, scene.site, orbit)
     plan = LightPlan(scene, band, vehicle, viewpoint, shown)
-    main = camera_of(MAIN, plan, mount, orbit, scene.seed)
-    heads = [
-        build_head(scene, n, vehicle, main, shown, parts.programs)
-        for n in range(len(scene.heads))
-    ]
+    main = camera_of(MAIN, plan, mount, scene.seed)
+    heads = [build_head(n, plan, main, parts.programs) for n in range(len(scene.heads))]
     start = lab_from_body_start(scene, mount, profiles)
     return Lab(scene, vehicle, (main, *heads), start, profiles)
 
@@ -344,7 +359,6 @@ def camera_of(
     name: str,
     plan: LightPlan,
     mount: Mount,
-    orbit: CameraOrbit | None,
     run_seed: int,
     mount_error: Rotation | None = None,
 ) -> StarCamera:
@@ -370,7 +384,7 @@ def camera_of(
         np.empty((camera.height_px, camera.width_px), dtype),
         build_lights(plan),
         tuple(channels),
-        orbit,
+        plan.viewpoint.orbit,
         run_seed,
         mount_error,
     )
@@ -390,36 +404,29 @@ def check_hardware(scene: Scene, programs: Programs, has_tracker: bool) -> None:
     )  # checks the file of the PSF
 
 
-def build_head(
-    main_scene: Scene,
-    n: int,
-    vehicle: multibody.VehicleModel,
-    main: StarCamera,
-    shown: catalog.Catalog | None,
-    programs: Programs,
-) -> StarCamera:
-    """Head n of the scene: a further camera on the same vehicle under the same lights.
+def build_head(n: int, plan: LightPlan, main: StarCamera, programs: Programs) -> StarCamera:
+    """Head n of the scene: a further camera on the same vehicle under the same lights, from the plan of the main one.
 
     The strengths of the lights are those in the band of the head. A head without a camera of its own has the main
     camera's band and light.
     """
-    head = main_scene.heads[n]
-    scene = main_scene.of_head(n)
+    head = plan.scene.heads[n]
+    scene = plan.scene.of_head(n)
     main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
     mount = Mount(np.array(head.position_m), main_from_head.inv() * main.mount.cam_from_body)
     try:
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
-        plan = LightPlan(scene, band, vehicle, main.viewpoint, shown, known, mount)
+        plan = replace(plan, scene=scene, band=band, known=known, mount=mount)
         turned = Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD)
-        return camera_of(head.name, plan, mount, main.orbit, main.run_seed, turned)
+        return camera_of(head.name, plan, mount, main.run_seed, turned)
     except InputError as error:
         raise error.under(f"heads.{n}") from None
 
 
 def lab_from_body_start(
-    scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline] = ()
+    scene: Scene, mount: Mount, profiles: Sequence[AttitudeSpline]
 ) -> Rotation:
     """lab_from_body at t = 0. In a star scene the lab frame is the ICRS."""
     start = scene.motion.start

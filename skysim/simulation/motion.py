@@ -6,7 +6,7 @@ give, and `shortfall` tells what they cannot. `Motion.advance` simulates a contr
 1. The controller reads the attitude and the rate, true or estimated.
 2. The flight computer sets the actuators.
 3. Disturbance torques are added.
-4. `TelemetryRecorder` records the state, before it changes.
+4. `Motion.record` records the state, before it changes.
 5. Valves and the like turn the controls into those of every step, else the controls are held; MuJoCo integrates the
    equations of motion.
 6. The IMU samples the motion with its vibration, and the navigation takes the samples.
@@ -14,8 +14,8 @@ give, and `shortfall` tells what they cannot. `Motion.advance` simulates a contr
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,23 +23,20 @@ from scipy.spatial.transform import Rotation
 from skysim.camera import thermal_motion
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
-from skysim.core.random_streams import AIR_CURRENT, IMU, JITTER, random_stream
-from skysim.core.types import Bools, Floats, Mounting, Telemetry, Trajectory
+from skysim.core.random_streams import AIR_CURRENT, IMU, random_stream
+from skysim.core.types import Bools, Floats, Mounting, Record, Telemetry, Trajectory
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
 from skysim.dynamics.flight_computer import NO_COMMANDS, Commands, FlightComputer, usage
 from skysim.dynamics.guidance import Reference
-from skysim.dynamics.jitter import Vibration
 from skysim.dynamics.multibody import Simulation
-from skysim.dynamics.multibody.actuator_kind import ActuatorDrive, ControlInput
+from skysim.dynamics.multibody.actuator_kind import ControlInput
 from skysim.dynamics.multibody.actuators import build_actuators, build_drives
 from skysim.dynamics.multibody.cmgs import CmgActuator
 from skysim.dynamics.multibody.thrusters import propellant_kg
-from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig
-from skysim.simulation import timing
 from skysim.simulation.lab import Lab, StarCamera
 from skysim.tracking.navigation import Navigation
 
@@ -49,24 +46,20 @@ TILT_CHECK_S = 0.05  # sampling interval of a maneuver when its tilt is checked
 ROUNDING = 1e-6  # relative excess over a limit that counts as rounding
 
 
-def check_reference(
-    reference: guidance.Reference,
-    scene: Scene,
-    model: multibody.VehicleModel,
-    duration_s: float,
-) -> None:
+def check_reference(lab: Lab, reference: Reference, duration_s: float) -> None:
     """Raise InputError for a maneuver beyond the tilt stop, the gyros' range or the actuators' torque.
 
     The controller would push against the stop, or fall behind. The torque of a rate w and an acceleration a is
     J a + w x J w. A prescribed motion needs no torque.
     """
+    scene = lab.scene
     motion = scene.motion
     vehicle = scene.vehicle
     # Without a controller the vehicle may reach the stop later.
     check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    actuators = build_actuators(scene.vehicle, model)
+    actuators = build_actuators(vehicle, lab.vehicle)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -84,7 +77,7 @@ def check_reference(
                     f"up to vehicle.imu.gyro.rate_limit_deg_s {limit_deg_s:g}",
                 )
         if not motion.is_prescribed:
-            inertia = model.inertia_kg_m2
+            inertia = lab.vehicle.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
             used = usage(actuators[motion.control.actuators], torque_nm)
             k = int(used.argmax())
@@ -97,9 +90,7 @@ def check_reference(
                 )
 
 
-def check_tilt(
-    reference: guidance.Reference, vehicle: VehicleConfig, duration_s: float
-) -> None:
+def check_tilt(reference: Reference, vehicle: VehicleConfig, duration_s: float) -> None:
     """Raise InputError for a tilt beyond the stop of the air bearing, up to the end of the motion.
 
     An endless motion is checked up to the end of the maneuvers.
@@ -187,7 +178,7 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
     # The torque is given, so the control law does not matter.
     pid = control.model_copy(update={"law": "pid"})
     motion = scene.motion.model_copy(update={"control": pid})
-    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+    reference = lab.reference
     period_s = max(FORECAST_S, lab.duration_s / FORECAST_PERIODS)
     vehicle = lab.vehicle
     start = multibody.Simulation(vehicle, Rotation.identity(), np.zeros(3), period_s)
@@ -264,10 +255,9 @@ def flown_saturation(lab: Lab) -> str:
     }
     lab = replace(lab, scene=scene.model_copy(update=sections))
     motion = Motion(lab, NO_PROGRAMS, min(lab.duration_s, FLOWN_S))
-    assert motion.recorder is not None
     while motion.simulation.steps_left:
         motion.advance(motion.period_steps)
-    log = motion.recorder.telemetry(None, lab.cameras)
+    log = motion.telemetry()
     return saturation_text(log.t_s, log.loads)
 
 
@@ -287,110 +277,7 @@ def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
     return "; ".join(parts)
 
 
-# Records of true and estimated states.
-
-
-@dataclass
-class TelemetryRecorder:
-    """One row per control period of what the simulation does not keep; `telemetry` returns the rows as Telemetry.
-
-    Attributes
-    ----------
-    simulation, flight_computer, navigation, drives, period_steps
-        Those of the `Motion`
-    rows
-        Arrays of all rows by name, made at the first
-    """
-
-    simulation: Simulation
-    flight_computer: FlightComputer
-    navigation: Navigation | None
-    drives: Sequence[ActuatorDrive]
-    period_steps: int
-    rows: dict[str, Any] = field(default_factory=dict)
-
-    def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
-        """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
-        row: dict[str, Any] = {
-            "recorded": True,
-            "torque_nm": self.flight_computer.control_torque_nm,
-            "disturbance_nm": disturbance_nm,
-            "momentum_nms": momentum_nms,
-            "loads": self.flight_computer.loads,
-            **readings_of(self.drives),
-        }
-        navigation = self.navigation
-        if navigation:
-            simulation = self.simulation
-            row["lab_from_imu"] = navigation.attitude_wxyz("imu")
-            row["saturated"] = navigation.saturated
-            row["bias_rad_s"] = navigation.apparent_bias_rad_s(
-                simulation.lab_from_body_wxyz, simulation.rate_body_rad_s
-            )
-            if navigation.filter:
-                state = navigation.filter.state
-                row["lab_from_filter"] = navigation.attitude_wxyz("filter")
-                row["sigma_attitude_rad"] = state.sigma_attitude_rad
-                row["assumed_bias_rad_s"] = state.bias_rad_s
-                row["sigma_bias_rad_s"] = state.sigma_bias_rad_s
-                # The mounting states of the filter, that of the main camera first.
-                row["mountings"] = [
-                    (estimate, state.sigma(name))
-                    for name, estimate in state.others.items()
-                    if name.startswith("mounting")
-                ]
-        count = math.ceil(self.simulation.last_step / self.period_steps)
-        for name, value in row.items():
-            one = np.asarray(value)
-            if name not in self.rows:
-                self.rows[name] = np.zeros((count, *one.shape), one.dtype)
-            self.rows[name][self.simulation.step // self.period_steps] = one
-
-    def telemetry(
-        self, reference: Reference | None, cameras: Sequence[StarCamera]
-    ) -> Telemetry:
-        """The rows so far as Telemetry; reference is the commanded attitude, None without a controller."""
-        simulation = self.simulation
-        vehicle = simulation.vehicle
-        steps = np.arange(0, simulation.step, self.period_steps)
-        states = simulation.states[steps]
-        rows = {name: row[: len(steps)] for name, row in self.rows.items()}
-        nq = simulation.model.nq
-        readings = {name: rows.pop(name) for name in readings_of(self.drives)}
-        # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
-        for k in np.flatnonzero(~rows.pop("recorded")):
-            rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
-                states[k, 1 : 1 + nq], states[k, 1 + nq :]
-            )
-            # Actuators without commands keep their readings.
-            for values in readings.values():
-                values[k] = values[k - 1]
-        cmgs = self.flight_computer.actuator_sets.get("cmgs")
-        gimbals = states[:, 1 + vehicle.gimbals.qpos]
-        rotors = states[:, 1 + nq + vehicle.rotors.dof]
-        t_s = steps * np.float64(simulation.step_s)
-        rows["loads"] = dict(zip(self.flight_computer.names, rows["loads"].T, strict=True))
-        rows["mountings"] = mountings_by_camera(rows.get("mountings"), t_s, cameras)
-        for name in rows:
-            if name.startswith("lab_from"):
-                rows[name] = Rotation.from_quat(rows[name], scalar_first=True)
-        return Telemetry(
-            t_s,
-            self.flight_computer.period_s,
-            Rotation.from_quat(states[:, 1:5], scalar_first=True),
-            states[:, 1 + nq : 4 + nq].copy(),
-            wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
-            gimbal_rad=gimbals,
-            joints=states[:, 1 : 1 + nq].copy(),
-            manipulability=cmgs.manipulability(gimbals, rotors)
-            if isinstance(cmgs, CmgActuator)
-            else None,
-            lab_from_ref=reference.attitudes(t_s) if reference else None,
-            wheel_names=vehicle.wheels.names,
-            gimbal_names=vehicle.gimbals.names,
-            readings=readings,
-            **rows,
-        )
+# The mounting states of the filter.
 
 
 def mountings_by_camera(
@@ -408,11 +295,6 @@ def mountings_by_camera(
         camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], true_rad[n])
         for n, camera in enumerate(cameras)
     }
-
-
-def readings_of(drives: Sequence[ActuatorDrive]) -> dict[str, Floats]:
-    """The present readings of the actuators' hardware, by name."""
-    return {name: values for drive in drives for name, values in drive.readings.items()}
 
 
 def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
@@ -451,6 +333,10 @@ class Motion:
     ----------
     period_steps
         Integration steps in a control period
+    keeps_history
+        Whether all control periods are recorded
+    rows
+        Arrays of what the simulation does not keep, one row per control period, by name; made at the first one
 
     Raises
     ------
@@ -468,8 +354,8 @@ class Motion:
         scene = lab.scene
         vehicle = lab.vehicle
         self.lab = lab
-        self.reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-        check_reference(self.reference, scene, vehicle, duration_s)
+        self.reference = lab.reference
+        check_reference(lab, self.reference, duration_s)
         if scene.motion.is_prescribed:
             self.simulation: Simulation = multibody.PrescribedMotion(
                 vehicle, lambda t_s: self.reference.state_at(t_s)[:2], duration_s, kept_s
@@ -479,9 +365,7 @@ class Motion:
             self.simulation = multibody.Simulation(
                 vehicle, lab.start, rate, duration_s, kept_s
             )
-        self.vibration = Vibration(
-            scene.motion, random_stream(scene.seed, JITTER, 0), self.reference
-        )
+        self.vibration = lab.vibration
         if kept_s is None:
             # This raises InputError for too many samples before any long work.
             self.vibration.subdivisions(
@@ -503,15 +387,8 @@ class Motion:
             )
         impulses = guidance.impulses(scene.motion, self.reference)
         self.disturbances = build_disturbances(lab, impulses, self.flight_computer.period_s)
-        self.recorder = None
-        if kept_s is None:
-            self.recorder = TelemetryRecorder(
-                self.simulation,
-                self.flight_computer,
-                self.navigation,
-                self.drives,
-                self.period_steps,
-            )
+        self.keeps_history = kept_s is None
+        self.rows = Record()
 
     def close(self) -> None:
         """End the process of an external controller."""
@@ -523,6 +400,13 @@ class Motion:
         return self.disturbances.inactive and not (
             self.lab.scene.motion.control or self.navigation
         )
+
+    @property
+    def readings(self) -> dict[str, Floats]:
+        """The present readings of the actuators' hardware, by name."""
+        return {
+            name: values for drive in self.drives for name, values in drive.readings.items()
+        }
 
     def advance(self, steps: int, commands: Commands = NO_COMMANDS) -> None:
         """Simulate some steps with controls that are held over them, by the steps of the module's docstring.
@@ -563,8 +447,8 @@ class Motion:
             control[:, simulation.vehicle.torques] += disturbance
             mean_nm = disturbance.sum(axis=0) / len(control)
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
-        if self.recorder:
-            self.recorder.record(momentum, mean_nm)
+        if self.keeps_history:
+            self.record(momentum, mean_nm)
         # 5. Integration.
         for drive in self.drives:
             drive.apply(control, angles)
@@ -572,6 +456,93 @@ class Motion:
         # 6. IMU.
         if navigation:
             navigation.sample_imu(simulation.now_s, *self.last_knots(len(control)))
+
+    def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
+        """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
+        row = Record(
+            recorded=True,
+            torque_nm=self.flight_computer.control_torque_nm,
+            disturbance_nm=disturbance_nm,
+            momentum_nms=momentum_nms,
+            loads=self.flight_computer.loads,
+            **self.readings,
+        )
+        simulation = self.simulation
+        navigation = self.navigation
+        if navigation:
+            row.update(
+                lab_from_imu=navigation.attitude_wxyz("imu"),
+                saturated=navigation.saturated,
+                bias_rad_s=navigation.apparent_bias_rad_s(
+                    simulation.lab_from_body_wxyz, simulation.rate_body_rad_s
+                ),
+            )
+            if navigation.filter:
+                state = navigation.filter.state
+                row.update(
+                    lab_from_filter=navigation.attitude_wxyz("filter"),
+                    sigma_attitude_rad=state.sigma_attitude_rad,
+                    assumed_bias_rad_s=state.bias_rad_s,
+                    sigma_bias_rad_s=state.sigma_bias_rad_s,
+                    # The mounting states of the filter, that of the main camera first.
+                    mountings=[
+                        (estimate, state.sigma(name))
+                        for name, estimate in state.others.items()
+                        if name.startswith("mounting")
+                    ],
+                )
+        count = math.ceil(simulation.last_step / self.period_steps)
+        for name, value in row.items():
+            one = np.asarray(value)
+            if name not in self.rows:
+                self.rows[name] = np.zeros((count, *one.shape), one.dtype)
+            self.rows[name][simulation.step // self.period_steps] = one
+
+    def telemetry(self) -> Telemetry:
+        """The rows so far as Telemetry; there is no commanded attitude without a controller."""
+        simulation = self.simulation
+        vehicle = simulation.vehicle
+        steps = np.arange(0, simulation.step, self.period_steps)
+        states = simulation.states[steps]
+        rows = {name: row[: len(steps)] for name, row in self.rows.items()}
+        nq = simulation.model.nq
+        readings = {name: rows.pop(name) for name in self.readings}
+        # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
+        for k in np.flatnonzero(~rows.pop("recorded")):
+            rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
+                states[k, 1 : 1 + nq], states[k, 1 + nq :]
+            )
+            # Actuators without commands keep their readings.
+            for values in readings.values():
+                values[k] = values[k - 1]
+        cmgs = self.flight_computer.actuator_sets.get("cmgs")
+        gimbals = states[:, 1 + vehicle.gimbals.qpos]
+        rotors = states[:, 1 + nq + vehicle.rotors.dof]
+        t_s = steps * np.float64(simulation.step_s)
+        rows["loads"] = dict(zip(self.flight_computer.names, rows["loads"].T, strict=True))
+        rows["mountings"] = mountings_by_camera(rows.get("mountings"), t_s, self.lab.cameras)
+        for name in rows:
+            if name.startswith("lab_from"):
+                rows[name] = Rotation.from_quat(rows[name], scalar_first=True)
+        return Telemetry(
+            t_s,
+            self.flight_computer.period_s,
+            Rotation.from_quat(states[:, 1:5], scalar_first=True),
+            states[:, 1 + nq : 4 + nq].copy(),
+            wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
+            gimbal_rad=gimbals,
+            joints=states[:, 1 : 1 + nq].copy(),
+            manipulability=cmgs.manipulability(gimbals, rotors)
+            if isinstance(cmgs, CmgActuator)
+            else None,
+            lab_from_ref=self.reference.attitudes(t_s)
+            if self.lab.scene.motion.control
+            else None,
+            wheel_names=vehicle.wheels.names,
+            gimbal_names=vehicle.gimbals.names,
+            readings=readings,
+            **rows,
+        )
 
     def trajectory(self, begin_s: float = 0.0) -> Trajectory:
         """The motion from shortly before a time until now, with the vibration."""
@@ -590,11 +561,6 @@ class Motion:
             trajectory.lab_from_body.as_quat(scalar_first=True),
             trajectory.rate_body_rad_s,
         )
-
-
-def history_s(lab: Lab) -> float:
-    """Duration of past states that a frame of any camera needs when it is due."""
-    return max(timing.history_s(camera.scene) for camera in lab.cameras)
 
 
 def build_disturbances(

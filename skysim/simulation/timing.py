@@ -9,7 +9,6 @@ from skysim.camera.render import Window
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
 from skysim.core.tolerance import scaled_errors
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import RollingShutterConfig
 
 MARGIN_S = 2e-3  # time that is simulated after the last exposure
 # Longest exposure that a client may set where the scene has none as long.
@@ -27,11 +26,10 @@ def exposure_window(scene: Scene, index: int, exposure_s: float | None = None) -
 
 def window_from(scene: Scene, begin_s: float, exposure_s: float | None = None) -> Window:
     """The window of an exposure that begins at begin_s, with the row time of the camera's shutter."""
-    shutter = scene.camera.shutter
-    row_time_s = shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
-    return Window(
-        begin_s, scene.exposure.time_s if exposure_s is None else exposure_s, row_time_s
-    )
+    if exposure_s is None:
+        exposure_s = scene.exposure.time_s
+    camera = scene.camera
+    return Window(begin_s, exposure_s, camera.row_delay_s, camera.height_px)
 
 
 def time_tag_error_s(scene: Scene, index: int) -> float:
@@ -69,7 +67,7 @@ def longest_live_s(scene: Scene) -> float:
 
 def frame_end_s(scene: Scene, index: int) -> float:
     """Time until which a motion must last for a frame."""
-    return exposure_window(scene, index).close_s(scene.camera.height_px) + MARGIN_S
+    return exposure_window(scene, index).close_s + MARGIN_S
 
 
 def duration_s(scene: Scene) -> float:
@@ -78,20 +76,14 @@ def duration_s(scene: Scene) -> float:
     Telemetry has a row at the beginning of each control period, so it covers mid-exposure and time tag of all frames.
     """
     last = scene.exposure.frames - 1
-    rows = scene.camera.height_px
     window = exposure_window(scene, last, longest_exposure_s(scene))
-    latest_s = window.middle_s(rows) + max(time_tag_error_s(scene, last), 0.0)
+    latest_s = window.middle_s + max(time_tag_error_s(scene, last), 0.0)
     covered_s = math.ceil(latest_s * scene.control_rate_hz) / scene.control_rate_hz
-    return max(window.close_s(rows), covered_s) + MARGIN_S
+    return max(window.close_s, covered_s) + MARGIN_S
 
 
 def history_s(scene: Scene) -> float:
     """Duration of past states that a frame needs when it is due: longest exposure, latency, two control periods."""
     latency_s = scene.filter.latency_s if scene.filter else 0.0
     window = window_from(scene, 0.0, longest_live_s(scene))
-    return (
-        window.close_s(scene.camera.height_px)
-        + latency_s
-        + 2 / scene.control_rate_hz
-        + HISTORY_MARGIN_S
-    )
+    return window.close_s + latency_s + 2 / scene.control_rate_hz + HISTORY_MARGIN_S

@@ -8,7 +8,7 @@ import inspect
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,16 +19,17 @@ from skysim.core import errors
 from skysim.core.errors import InputError
 from skysim.core.plugins import ProgramError, describe_error, host_command
 from skysim.core.types import Frame
-from skysim.scene import scene as scenes
+from skysim.scene.scene import Scene
 from skysim.scene.sections.tracker import OWN
-from skysim.tracking import tracker_interface
 from skysim.tracking.tracker_interface import (
     FAILED,
     TRACKERS,
     Answer,
     Picture,
     Setup,
+    TrackerProgram,
     check_answer,
+    split_command,
 )
 
 
@@ -48,39 +49,29 @@ class FrameTracker:
         raise InputError("tracker.name", f"{self.name} solves frames, not centroids", OWN)
 
 
-class ExternalTracker(FrameTracker):
+class ExternalTracker(FrameTracker, TrackerProgram):
     """A tracker in its own process."""
 
-    def __init__(self, program: tracker_interface.TrackerProgram) -> None:
-        self.program = program
-        self.name = program.name
-
     @classmethod
-    def start(
-        cls, scene: scenes.Scene, setup: Setup, commands: Mapping[str, str]
-    ) -> "ExternalTracker":
+    def of_scene(cls, scene: Scene, setup: Setup, commands: Mapping[str, str]) -> Self:
         """Start the tracker that the scene names. Raises InputError if it is unknown or refuses the set-up."""
         name = scene.tracker.name
         TRACKERS.check_name(name, commands)
         image_format = None
         environment = None
         if name in commands:
-            arguments, image_format = tracker_interface.split_command(name, commands[name])
+            arguments, image_format = split_command(name, commands[name])
         else:
             arguments, environment = host_command("skysim.tracking.tracker_host", name)
         limit_s = scene.tracker.time_limit_s
-        return cls(
-            tracker_interface.TrackerProgram(
-                name, arguments, image_format, setup, limit_s, environment
-            )
-        )
+        return cls(name, arguments, image_format, setup, limit_s, environment)
 
     def solve_frame(
         self, frame: Frame, streak_px: tuple[float, float] | None = None
     ) -> Report:
         """The tracker's report on a frame; streak_px is as in `Picture`."""
         try:
-            return to_report(self.program.solve(picture_of(frame, streak_px)))
+            return to_report(self.solve(picture_of(frame, streak_px)))
         except ProgramError as error:
             return Report(Attitude(f"{FAILED}{error}"), Centroids.empty())
 

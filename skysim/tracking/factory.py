@@ -202,7 +202,7 @@ def build_tracker(
             return tracker.set_up(setup_of(scene, mount, sources))
         return tracker
     if name != OWN:
-        return ExternalTracker.start(scene, setup_of(scene, mount, sources), programs)
+        return ExternalTracker.of_scene(scene, setup_of(scene, mount, sources), programs)
     settings = assumed_settings(scene)
     dome = scene.dome
     if dome is None:

@@ -9,6 +9,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +20,7 @@ from estimator.filter.mekf import AttitudeFilter
 from skysim.camera.render import Window
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD, DEG_H_RAD_S, EARTH_RATE_RAD_S, HOUR_S, PPM
-from skysim.core.types import Floats, Mount
+from skysim.core.types import Floats, Mount, Record
 from skysim.dynamics import imu
 from skysim.dynamics.imu import Increments
 from skysim.scene.scene import Scene
@@ -30,7 +31,7 @@ from skysim.scene.sections.vehicle import ImuConfig
 
 
 def rate_of_frame(
-    samples: Increments, window: Window, rows: int, config: ImuConfig, mount: Mount
+    samples: Increments, window: Window, config: ImuConfig, mount: Mount
 ) -> RateEstimate | None:
     """Mean rate of the camera in its own axes over an exposure, with the covariance by the gyros' data sheet.
 
@@ -40,16 +41,15 @@ def rate_of_frame(
     ----------
     samples
         Samples of the IMU
-    window, rows
-        Exposure window and number of rows: the exposure ends with that of the last row
+    window
+        Exposure window
     config
         The scene's `vehicle.imu`
     mount
         Mount of the camera
     """
-    begin_s = window.open_s
-    end_s = window.close_s(rows)
-    during = (samples.t_s > begin_s) & (samples.t_s - samples.step_s < end_s)
+    begins_s = samples.t_s - samples.step_s
+    during = (samples.t_s > window.open_s) & (begins_s < window.close_s)
     if not during.any() or samples.saturated[during].any():
         return None
     rate = samples.angle_rad[during].mean(axis=0) / samples.step_s
@@ -195,11 +195,12 @@ class Navigation:
         first = len(self.measured) - 1
         while first > 0 and self.measured[first - 1].t_s[-1] >= since_s:
             first -= 1
-        t_s, angle, velocity, saturated, overloaded = (
-            np.concatenate([getattr(one, name) for one in self.measured[first:]])
+        kept = self.measured[first:]
+        columns: Record = {
+            name: np.concatenate([getattr(one, name) for one in kept])
             for name in ("t_s", "angle_rad", "velocity_m_s", "saturated", "overloaded")
-        )
-        return imu.Increments(t_s, self.step_s, angle, velocity, saturated, overloaded)
+        }
+        return replace(kept[0], **columns)
 
     def apparent_bias_rad_s(
         self, lab_from_body_wxyz: Floats, rate_body_rad_s: Floats

@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import CameraConfig, RollingShutterConfig
+from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.sources.air import weather_of
 from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
@@ -93,9 +93,14 @@ def zero_point_mag(scene: Scene) -> float | None:
     """
     if scene.tracker.magnitude_sigma is None:
         return None
-    light_e = star_flux_e_s_m2(0.0, *SUN, Band.from_camera(scene.camera))
-    light_e = light_e * Optics.from_camera(scene.camera).collecting_m2 * scene.exposure.time_s
-    return float(2.5 * np.log10(light_e / scene.camera.detector.gain_e_dn))
+    return float(2.5 * np.log10(bright_star_e(scene) / scene.camera.detector.gain_e_dn))
+
+
+def bright_star_e(scene: Scene) -> float:
+    """Electrons of a star of V = 0 and the Sun's color in an exposure."""
+    light_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, Band.from_camera(scene.camera)))
+    collecting_m2 = Optics.from_camera(scene.camera).collecting_m2
+    return light_e_s_m2 * collecting_m2 * scene.exposure.time_s
 
 
 def assumed_code(light: DomeConfig, sources: Sources, leds: LedMap) -> LedCode:
@@ -230,14 +235,13 @@ def assumed_camera(scene: Scene) -> Camera:
 
 def calibration(camera: CameraConfig) -> Camera:
     """The exact calibration of a camera, as the estimator's Camera."""
-    shutter = camera.shutter
     return Camera(
         camera.width_px,
         camera.height_px,
         camera.focal_px,
         camera.center_px,
         camera.distortion,
-        row_time_s=shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0,
+        row_time_s=camera.row_delay_s,
     )
 
 

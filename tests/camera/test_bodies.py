@@ -62,7 +62,10 @@ def exposed_at(
     turn = Rotation.from_rotvec(rate * (t_s - 0.5)[:, None])
     motion = Trajectory(t_s, attitude * turn, np.tile(rate, (len(t_s), 1)))
     return Exposed(
-        optics, motion, Mount(np.zeros(3), Rotation.identity()), Window(0.48, 0.04, row_s)
+        optics,
+        motion,
+        Mount(np.zeros(3), Rotation.identity()),
+        Window(0.48, 0.04, row_s, optics.camera.height_px),
     )
 
 

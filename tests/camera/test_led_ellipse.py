@@ -256,7 +256,7 @@ def test_a_moving_ellipse_is_the_mean_of_still_ones() -> None:
         render(stills, source, lens, still, AT_CENTER, Window(0.0, 1.0))
     assert np.abs(image - stills / 64).max() < 1e-3 * image.max()
     rolled = np.zeros((480, 640))
-    render(rolled, source, lens, STILL, AT_CENTER, Window(0.2, 0.5, 1e-5))
+    render(rolled, source, lens, STILL, AT_CENTER, Window(0.2, 0.5, 1e-5, 480))
     np.testing.assert_allclose(
         rolled.sum(), drawn(lens, source)[0].sum() / 2, rtol=1e-5, atol=0
     )

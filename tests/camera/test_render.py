@@ -557,7 +557,7 @@ def test_a_moving_led_draws_a_dashed_streak() -> None:
 
 
 def test_a_rolling_shutter_images_static_light_like_a_global_one() -> None:
-    rolling, seen = draw(star_at(30.3, 20.8), Window(0.1, 0.5, 1e-3))
+    rolling, seen = draw(star_at(30.3, 20.8), Window(0.1, 0.5, 1e-3, 48))
     still, other = draw(star_at(30.3, 20.8), Window(0.1, 0.5))
     np.testing.assert_allclose(rolling, still, rtol=0, atol=1e-12)
     np.testing.assert_allclose(
@@ -571,7 +571,7 @@ def test_a_rolling_shutter_shears_what_moves() -> None:
     row_time_s = 2e-3
     image, seen = draw(
         star_at(31.5, 23.5),
-        Window(0.45, 1e-3, row_time_s),
+        Window(0.45, 1e-3, row_time_s, 48),
         turning([0, speed_px_s / 2500, 0]),
     )
     rows = np.arange(21, 27)
@@ -589,7 +589,7 @@ def test_a_rolling_shutter_shears_what_moves() -> None:
 
 def test_a_rolling_shutter_bands_a_pulsed_led() -> None:
     """A row's light is the time that its own exposure overlaps the pulses, counted here moment by moment."""
-    window = Window(0.2, 1.5e-3, 83e-6)
+    window = Window(0.2, 1.5e-3, 83e-6, 48)
     emitter = led_at(0, 0, 0.4, 2e-3, period_s=[1e-3], on_s=[4e-4], start_s=[2.5e-4])
     pulsed, _ = draw(emitter, window)
     steady, _ = draw(led_at(0, 0, 0.4, 2e-3), window)

@@ -93,14 +93,14 @@ def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky()
     dome = lab_of("afit_simsat")
     sky = lab_of("shefex2")
     frames = attitudes.of_frames(dome)
-    reach = attitudes.within_reach(dome.scene, dome.camera.mount, frames)
+    reach = attitudes.within_reach(frames)
     tilt_deg = multibody.tilt_deg(reach.lab_from_body)
     assert tilt_deg.max() == pytest.approx(
         multibody.tilt_deg(frames.lab_from_body).max(), abs=1e-4
     )
     height = 1 - np.cos(np.radians(tilt_deg))
     assert np.median(height) == pytest.approx(height.max() / 2, rel=0.1)
-    everywhere = attitudes.within_reach(sky.scene, sky.camera.mount, frames).lab_from_body
+    everywhere = attitudes.within_reach(attitudes.of_frames(sky)).lab_from_body
     boresight = (everywhere * sky.camera.mount.cam_from_body.inv()).apply([0, 0, 1])
     assert np.linalg.norm(boresight.mean(axis=0)) < 0.05
     nearest_deg = np.degrees(cKDTree(boresight).query(boresight, k=2)[0][:, 1])
@@ -110,7 +110,7 @@ def test_checked_attitudes_are_uniform_up_to_the_largest_tilt_and_over_the_sky()
 def test_without_a_controller_the_bearing_may_tilt_to_its_stop() -> None:
     lab = lab_of("afit_simsat", motion__control="none", motion__maneuver="[]")
     frames = attitudes.of_frames(lab)
-    assert math.degrees(attitudes.greatest_tilt_rad(lab.scene, frames)) == pytest.approx(30)
+    assert attitudes.greatest_tilt_deg(frames) == pytest.approx(30)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +167,7 @@ def test_the_fewest_lights_are_at_the_stated_attitude() -> None:
         float(re.search(rf"{name} (\S+)°", text)[1]) for name in ("roll", "pitch", "yaw")
     )  # type: ignore[index]
     there = attitudes.CheckedAttitudes(
+        lab,
         Rotation.from_euler("ZYX", [[yaw, pitch, roll]], degrees=True),
         np.zeros((1, 3)),
         np.full(1, np.nan),
@@ -672,7 +673,7 @@ def test_similar_fields_are_those_that_the_tracker_refuses_as_ambiguous(layout: 
     }
     lab = lab_of("afit_simsat", **changes, motion__maneuver=TILTED)
     frames = attitudes.of_frames(lab)
-    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames).lab_from_body
+    reach = attitudes.within_reach(frames).lab_from_body
     tracker = build_tracker(lab.camera)
     statuses = []
     for n, lab_from_body in enumerate(reach):

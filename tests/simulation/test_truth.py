@@ -31,7 +31,7 @@ def rendered(lab: Lab, angle_rad: Floats, rate_rad_s: Floats, since_s: Floats) -
     window = exposure_window(lab.scene, 0)
     axis = lab.camera.mount.cam_from_body.inv().apply(ABOUT_CAM)
     path = lab.start * Rotation.from_rotvec(np.outer(angle_rad, axis))
-    middle_s = window.middle_s(lab.scene.camera.height_px)
+    middle_s = window.middle_s
     motion = Trajectory(middle_s + since_s, path, np.outer(rate_rad_s, axis))
     return render_frame(lab.camera, motion, 0)[1]
 

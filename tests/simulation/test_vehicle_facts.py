@@ -180,8 +180,7 @@ def test_the_forecast_of_saturation_is_that_of_the_flight() -> None:
     flown = motion.Motion(lab, {}, lab.duration_s)
     while flown.simulation.steps_left:
         flown.advance(flown.period_steps)
-    assert flown.recorder is not None
-    log = flown.recorder.telemetry(flown.reference, lab.cameras)
+    log = flown.telemetry()
     said = motion.saturation_text(log.t_s, log.loads)
     assert "wheel_z saturated" in said
     assert said in forecast

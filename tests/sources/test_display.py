@@ -295,7 +295,7 @@ def test_rows_that_are_not_lit_within_the_exposure_are_dark() -> None:
     assert isinstance(dark.known, LedDome)
     clocks = dark.known.timing(dark.run_seed).clocks
     assert clocks is not None
-    trains = clocks.pulses_at(dark.sources, window.middle_s(dark.scene.camera.height_px))
+    trains = clocks.pulses_at(dark.sources, window.middle_s)
     looks = window.open_s + (np.arange(20_000) + 0.5) / 20_000 * window.exposure_s
     (_, flickering), (_, full) = still_frame(dark_lab), still_frame(steady)
     all_e = dict(zip(full.sources.id.tolist(), full.sources.electrons, strict=True))

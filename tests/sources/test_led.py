@@ -303,7 +303,7 @@ def test_all_light_of_the_leds_falls_while_they_warm_up(
         dark_dn, cold_dn, warm_dn = (
             still(scene, settings, index) for settings in (dark, keys, warm)
         )
-        t_s = exposure_window(loader.load(scene, keys), index).middle_s(len(dark_dn))
+        t_s = exposure_window(loader.load(scene, keys), index).middle_s
         left = 0.8 + 0.2 * math.exp(-t_s / 2)
         np.testing.assert_allclose(
             warm_dn - dark_dn, left * (cold_dn - dark_dn), rtol=0, atol=1e-9 * cold_dn.max()

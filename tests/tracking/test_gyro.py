@@ -51,9 +51,7 @@ def test_the_rate_of_a_frame_does_not_depend_on_the_buffer_of_samples() -> None:
     assert len(shots) == len(forgetful) == 4
     for shot, other in zip(shots, forgetful, strict=True):
         window = exposure_window(scene, shot.frame.index)
-        after = rate_of_frame(
-            samples, window, scene.camera.height_px, scene.vehicle.imu, mount
-        )
+        after = rate_of_frame(samples, window, scene.vehicle.imu, mount)
         rates = [shot.rate, other.rate, after]
         np.testing.assert_allclose(
             np.ptp([rate.rate_rad_s for rate in rates], axis=0), 0, rtol=0, atol=1e-9
@@ -79,14 +77,14 @@ def test_the_rate_has_a_correct_covariance_and_is_absent_if_saturated() -> None:
         assert samples is not None
         _, truth = flight.render(0)
         window = exposure_window(scene, 0)
-        rate = rate_of_frame(samples, window, 493, config, mount)
+        rate = rate_of_frame(samples, window, config, mount)
         assert rate is not None
         error = rate.rate_rad_s - truth.rate_cam_rad_s
         nees.append(error @ np.linalg.solve(rate.covariance_rad2_s2, error))
     assert 1.5 < np.mean(nees) < 4.5
     full = replace(samples, saturated=samples.saturated | (abs(samples.t_s - 0.12) < 0.01))
-    assert rate_of_frame(full, window, 493, config, mount) is None
-    assert rate_of_frame(full, exposure_window(scene, 2), 493, config, mount) is not None
+    assert rate_of_frame(full, window, config, mount) is None
+    assert rate_of_frame(full, exposure_window(scene, 2), config, mount) is not None
     assert rate_of_frame(samples, window._replace(open_s=99.0), 493, config, mount) is None
     assert (
         sigma_rad_s(config, 1.0, 0.05)

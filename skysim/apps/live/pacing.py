@@ -212,9 +212,8 @@ class Live:
     def send_shot(self, shot: Shot) -> None:
         """Send a frame, and its solution."""
         pace = self.pace
-        rows = shot.camera.scene.camera.height_px
         # With a rolling shutter, the end of the last row's exposure.
-        due_s = pace.due_s(shot.window.close_s(rows))
+        due_s = pace.due_s(shot.window.close_s)
         now_s = time.monotonic()
         dropped = shot.frame.index - self.rendered
         self.rendered += 1

@@ -22,7 +22,7 @@ from skysim.experiments.study.plan import (
 )
 from skysim.scene import unused, unused_rules
 from skysim.scene.scene import Scene
-from skysim.scene.sections.camera import DetectorConfig, RollingShutterConfig
+from skysim.scene.sections.camera import DetectorConfig
 from skysim.scene.sections.layouts import CelestialConfig
 from skysim.scene.unused_rules import Rule
 from skysim.tracking import factory
@@ -81,7 +81,7 @@ def tracks(scene: Scene) -> bool:
     return (
         scene.stars is not None
         and not unused_rules.external(scene)
-        and not isinstance(scene.camera.shutter, RollingShutterConfig)
+        and not scene.camera.row_delay_s
     )
 
 

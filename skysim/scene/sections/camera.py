@@ -503,6 +503,12 @@ class CameraConfig(ConfigModel):
         return 1 / (1 / self.focal_length_m - 1 / self.focus_m)
 
     @property
+    def row_delay_s(self) -> float:
+        """Time from the exposure of a row to that of the next one: 0 unless the shutter is a rolling one."""
+        shutter = self.shutter
+        return shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
+
+    @property
     def focal_px(self) -> float:
         """Image distance in pixels, which is the focal length of a star tracker: pixels per unit tangent."""
         return self.image_distance_m / self.pixel_m

@@ -11,11 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Floats, Mount
+from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.jitter import Vibration
-from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab
 
 MAX_FRAMES = 400  # frames among which the fastest and the most tilted one are sought
@@ -30,6 +27,8 @@ class CheckedAttitudes(NamedTuple):
 
     Attributes
     ----------
+    lab
+        Laboratory
     lab_from_body
         N rotations
     rate_body_rad_s
@@ -38,14 +37,49 @@ class CheckedAttitudes(NamedTuple):
         (N,) times of the frames; NaN for an attitude that is not of a frame
     """
 
+    lab: Lab
     lab_from_body: Rotation
     rate_body_rad_s: Floats
     t_s: Floats
 
     @property
-    def speed_rad_s(self) -> Floats:
+    def speed_deg_s(self) -> Floats:
         """(N,) lengths of the rates."""
-        return np.linalg.norm(self.rate_body_rad_s, axis=1)
+        return np.degrees(np.linalg.norm(self.rate_body_rad_s, axis=1))
+
+    @property
+    def tilts_deg(self) -> Floats:
+        """(N,) angles between the z axes of body and lab."""
+        return multibody.tilt_deg(self.lab_from_body)
+
+    @property
+    def boresights(self) -> Floats:
+        """(N, 3) unit vectors of the boresight in lab axes."""
+        cam_from_body = self.lab.camera.mount.cam_from_body
+        return (self.lab_from_body * cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+
+    @property
+    def rates_text(self) -> str:
+        """The least and the greatest rate, to 0.001 deg/s."""
+        rates_deg_s = self.speed_deg_s.round(3)
+        low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
+        return f"at {low} deg/s" if low == high else f"at {low} to {high} deg/s"
+
+    def describe(self, n: int) -> str:
+        """Attitude n in words: RA and Dec of the boresight, or angles and tilt of the vehicle; and the time."""
+        t_s = self.t_s[n]
+        if self.lab.scene.stars:
+            x, y, z = self.boresights[n]
+            ra_deg = math.degrees(math.atan2(y, x)) % 360
+            dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))
+            where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"
+        else:
+            lab_from_body = self.lab_from_body[n]
+            # Adding 0 turns -0 into 0.
+            yaw, pitch, roll = np.round(lab_from_body.as_euler("ZYX", degrees=True), 1) + 0.0
+            tilt_deg = self.tilts_deg[n]
+            where = f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
+        return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"
 
 
 def of_frames(lab: Lab) -> CheckedAttitudes:
@@ -62,21 +96,23 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
         rates = guidance.body_rate_rad_s(scene, lab.start)
         lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rates))
     else:
-        reference = guidance.plan(scene.motion, lab.start, lab.profiles)
+        reference = lab.reference
         states = [reference.state_at(float(t)) for t in t_s]
         wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
         lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
-    every = CheckedAttitudes(lab_from_body, rates + jitter, t_s)
+    every = CheckedAttitudes(lab, lab_from_body, rates + jitter, t_s)
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))
-    chosen.add(int(every.speed_rad_s.argmax()))
-    chosen.add(int(tilts_rad(every).argmax()))
+    chosen.add(int(every.speed_deg_s.argmax()))
+    chosen.add(int(every.tilts_deg.argmax()))
     rows = np.array(sorted(chosen))
     # 3. Without a controller the vehicle may reach the stop; the frames before are checked.
     if scene.vehicle.mount == "air_bearing":
-        free = tilts_rad(every)[rows] <= math.radians(scene.vehicle.tilt_stop_deg)
+        free = every.tilts_deg[rows] <= scene.vehicle.tilt_stop_deg
         rows = rows[free] if free.any() else rows[:1]
-    return CheckedAttitudes(every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows])
+    return CheckedAttitudes(
+        lab, every.lab_from_body[rows], every.rate_body_rad_s[rows], t_s[rows]
+    )
 
 
 def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Floats, Floats]:
@@ -84,9 +120,7 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
 
     The rest is the rotation relative to one at the mean rate, K samples of zero mean, in body axes.
     """
-    scene = lab.scene
-    reference = guidance.plan(scene.motion, lab.start, lab.profiles)
-    vibration = Vibration(scene.motion, random_stream(scene.seed, JITTER, 0), reference)
+    vibration = lab.vibration
     if not vibration.components:
         return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 1, 3))
     after_s = exposure_s * np.linspace(-0.5, 0.5, SAMPLES)
@@ -98,21 +132,15 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
     return rate, rest - rest.mean(axis=1, keepdims=True)
 
 
-def tilts_rad(attitudes: CheckedAttitudes) -> Floats:
-    """(N,) angles between the z axes of body and lab."""
-    return np.radians(multibody.tilt_deg(attitudes.lab_from_body))
-
-
-def greatest_tilt_rad(scene: Scene, frames: CheckedAttitudes) -> float:
+def greatest_tilt_deg(frames: CheckedAttitudes) -> float:
     """The greatest tilt at the frames; without a controller on a bearing, the tilt stop."""
+    scene = frames.lab.scene
     if scene.motion.control is None and scene.vehicle.mount == "air_bearing":
-        return math.radians(scene.vehicle.tilt_stop_deg)
-    return float(tilts_rad(frames).max())
+        return scene.vehicle.tilt_stop_deg
+    return float(frames.tilts_deg.max())
 
 
-def within_reach(
-    scene: Scene, mount: Mount, frames: CheckedAttitudes, tilt_deg: float | None = None
-) -> CheckedAttitudes:
+def within_reach(frames: CheckedAttitudes, tilt_deg: float | None = None) -> CheckedAttitudes:
     """A sample of the attitudes in reach: under the stars all, else any azimuth and yaw up to the greatest tilt.
 
     They have the rates of the frames in turn. Directions are evenly spread on a Fibonacci spiral. The
@@ -120,28 +148,24 @@ def within_reach(
 
     Parameters
     ----------
-    scene
-        The scene
-    mount
-        Mount of the camera
     frames
         Attitudes of the frames, with their rates; their greatest tilt is the default
     tilt_deg
-        Greatest tilt, for example that of a study's trials; None for `greatest_tilt_rad`
+        Greatest tilt, for example that of a study's trials; None for `greatest_tilt_deg`
     """
+    lab = frames.lab
     n = np.arange(DIRECTIONS)
     turn_rad = 2 * np.pi * np.mod(n / GOLDEN_RATIO, 1.0)
-    if scene.stars:
+    if lab.scene.stars:
         zenith_rad = np.arccos(1 - 2 * (n + 0.5) / DIRECTIONS)
         lab_from_cam = Rotation.from_euler(
             "ZYZ", np.column_stack([n * GOLDEN_ANGLE_RAD, zenith_rad, turn_rad])
         )
-        lab_from_body = lab_from_cam * mount.cam_from_body
+        lab_from_body = lab_from_cam * lab.camera.mount.cam_from_body
     else:
-        greatest_rad = (
-            greatest_tilt_rad(scene, frames) if tilt_deg is None else math.radians(tilt_deg)
-        )
-        cosine = math.cos(greatest_rad)
+        if tilt_deg is None:
+            tilt_deg = greatest_tilt_deg(frames)
+        cosine = math.cos(math.radians(tilt_deg))
         # Equal steps of the cosine are equal areas; the last attitude has the greatest tilt.
         tilt_rad = np.arccos(1 - n / (DIRECTIONS - 1) * (1 - cosine))
         azimuth_rad = n * GOLDEN_ANGLE_RAD
@@ -150,35 +174,4 @@ def within_reach(
         lab_from_body = Rotation.from_euler("ZYZ", angles)
     turn = n % len(frames.t_s)
     rate_body_rad_s = frames.rate_body_rad_s[turn]
-    return CheckedAttitudes(lab_from_body, rate_body_rad_s, np.full(DIRECTIONS, np.nan))
-
-
-def rates_text(attitudes: CheckedAttitudes) -> str:
-    """The least and the greatest rate, to 0.001 deg/s."""
-    rates_deg_s = np.degrees(attitudes.speed_rad_s).round(3)
-    low, high = (f"{rate:.3g}" for rate in (rates_deg_s.min(), rates_deg_s.max()))
-    return f"at {high} deg/s" if low == high else f"at {low} to {high} deg/s"
-
-
-def boresights(lab_from_body: Rotation, lab: Lab) -> Floats:
-    """(N, 3) or (3,) unit vectors of the boresight at some attitudes, in lab axes."""
-    return (lab_from_body * lab.camera.mount.cam_from_body.inv()).apply([0.0, 0.0, 1.0])
-
-
-def describe(attitudes: CheckedAttitudes, n: int, lab: Lab) -> str:
-    """Attitude n in words: RA and Dec of the boresight, or roll, pitch, yaw and tilt of the vehicle; and the time."""
-    lab_from_body = attitudes.lab_from_body[n]
-    t_s = attitudes.t_s[n]
-    if lab.scene.stars:
-        x, y, z = boresights(lab_from_body, lab)
-        ra_deg = math.degrees(math.atan2(y, x)) % 360
-        dec_deg = math.degrees(math.asin(min(max(z, -1.0), 1.0)))
-        where = f"RA {ra_deg:.1f}° Dec {dec_deg:+.1f}°"
-    else:
-        # Adding 0 turns -0 into 0.
-        yaw, pitch, roll = np.round(lab_from_body.as_euler("ZYX", degrees=True), 1) + 0.0
-        tilt_deg = float(multibody.tilt_deg(lab_from_body))
-        where = (
-            f"roll {roll:.1f}° pitch {pitch:.1f}° yaw {yaw:.1f}°, a tilt of {tilt_deg:.1f}°"
-        )
-    return where if math.isnan(t_s) else f"{where} (t = {t_s:.1f} s)"
+    return CheckedAttitudes(lab, lab_from_body, rate_body_rad_s, np.full(DIRECTIONS, np.nan))

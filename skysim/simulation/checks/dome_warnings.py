@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
-from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import threshold_e
 from skysim.simulation.checks.expected_error import believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
@@ -171,7 +170,7 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     place_m = plan.beliefs.lights.place[:, :3]
     most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
-    tilt_rad = float(attitudes.tilts_rad(plan.reach.attitudes).max())
+    tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))
     # 3. Comparison, with circular fields of the detector's area.
@@ -238,5 +237,5 @@ def mirror_images(plan: Plan) -> str:
     return (
         f"light.reflection.{key}: the tracker detects up to {len(found[n])} images of LEDs in the wall beside"
         f" {len(frames.used[n])} LEDs, the brightest {short(1 / share, 2)} times above its threshold, at"
-        f" {attitudes.describe(frames.attitudes, n, lab)}; {cure}"
+        f" {frames.attitudes.describe(n)}; {cure}"
     )

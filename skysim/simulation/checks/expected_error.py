@@ -39,7 +39,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import (
     LedMap,
@@ -56,8 +55,6 @@ from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
-from skysim.scene.sections.camera import RollingShutterConfig
-from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.views import View
 from skysim.sources.dome import survey_errors
@@ -91,12 +88,12 @@ def mean_root(variance_rad2: Floats) -> float:
 # they are covariances (n, 2, 2) in px^2.
 
 
-def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def led_survey(view: View, context: Context) -> Floats | None:
     """Errors of the surveyed LED positions, S_i = sigma^2 G_i G_i', or G_i C_i G_i' if an instrument gives C_i."""
     dome = context.beliefs.dome
     if dome and dome[1].covariance_m2 is not None:
         # Derivative of the image by a position in lab axes.
-        gradient_lab = view.gradient @ lab_from_cam.inv().as_matrix()
+        gradient_lab = view.gradient @ view.lab_from_cam.inv().as_matrix()
         own_m2 = dome[1].covariance_m2[view.row]
         return gradient_lab @ own_m2 @ np.swapaxes(gradient_lab, 1, 2)
     sigma_m = context.beliefs.led_sigma_m
@@ -105,7 +102,7 @@ def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats |
     return sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)
 
 
-def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def survey_setup(view: View, context: Context) -> Floats | None:
     """Errors of the set-up of the survey's instrument, common to all LEDs."""
     instrument = context.scene.tracker.survey.instrument
     if instrument is None:
@@ -113,34 +110,34 @@ def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     shifts_m = survey_errors.station_displacements_m(
         instrument, context.beliefs.lights.place[view.row, :3]
     )
-    parts = [displacement(view, shift_m, lab_from_cam) for shift_m in shifts_m]
+    parts = [displacement(view, shift_m) for shift_m in shifts_m]
     return np.concatenate(parts, axis=2) if parts else None
 
 
-def common_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def common_survey(view: View, context: Context) -> Floats | None:
     """Errors that LEDs, lever and lens of a survey by the camera share: E_i = G_i dP_i + the change by the lens."""
     dome = context.beliefs.dome
     if dome is None or not context.beliefs.has_common_camera:
         return None
     camera, leds, lever = dome
-    shift_m = common_shifts_m(leds, view.row, lever, lab_from_cam.inv())
+    shift_m = common_shifts_m(leds, view.row, lever, view.lab_from_cam.inv())
     moved_px = np.einsum("nij,mnj->nim", view.gradient, shift_m)
     by_lens_px = common_images_px(leds, camera, view.offset_m) - camera.pixels(view.offset_m)
     return moved_px + np.moveaxis(by_lens_px, 0, 2)
 
 
-def other_map(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def other_map(view: View, context: Context) -> Floats | None:
     """Images by the map minus the true ones, if the map was made of other hardware than the scene's."""
     dome = context.beliefs.dome
     if dome is None or not context.beliefs.faults:
         return None
     camera, leds, lever = dome
-    body_from_lab = (lab_from_cam * lever.cam_from_body).inv()
+    body_from_lab = (view.lab_from_cam * lever.cam_from_body).inv()
     mapped_px = project(body_from_lab, leds.position_m[view.row], lever, camera)
     return np.nan_to_num(mapped_px - view.xy_px)[:, :, None]
 
 
-def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def lever_survey(view: View, context: Context) -> Floats | None:
     """Error of the surveyed lever (camera's position), E_i = -sigma G_i."""
     sigma_m = context.beliefs.lever_sigma_m
     if not sigma_m or context.beliefs.has_common_camera:
@@ -148,35 +145,35 @@ def lever_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     return -sigma_m * view.gradient
 
 
-def surface_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def surface_survey(view: View, context: Context) -> Floats | None:
     """Error of the surveyed surface along its normal, E_i = sigma G_i R n_i."""
     sigma_m = context.beliefs.surface_sigma_m
     surface = context.surface
     if not sigma_m or surface is None:
         return None
     normal = surface.inward(context.beliefs.lights.place[view.row, :3])
-    return displacement(view, -sigma_m * normal, lab_from_cam)
+    return displacement(view, -sigma_m * normal)
 
 
-def survey_rotation(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def survey_rotation(view: View, context: Context) -> Floats | None:
     """Rotation r of the survey's axes, E_i = G_i R (r x P_i)."""
     rotation_rad = context.beliefs.rotation_rad
     if not rotation_rad.any():
         return None
     shift_m = np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3])
-    return displacement(view, shift_m, lab_from_cam)
+    return displacement(view, shift_m)
 
 
-def assumed_lever(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def assumed_lever(view: View, context: Context) -> Floats | None:
     """Error of the lever that the scene makes the tracker assume, E_i = -G_i error."""
     error_m = context.beliefs.lever_error_m
     if not error_m.any() or context.surface is None:
         return None
-    error_cam_m = context.lab.camera.mount.cam_from_body.apply(error_m)
+    error_cam_m = context.camera.mount.cam_from_body.apply(error_m)
     return -(view.gradient @ error_cam_m)[:, :, None]
 
 
-def focal_length(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def focal_length(view: View, context: Context) -> Floats | None:
     """Relative error of the focal length, E_i = error (x_i - center)."""
     error = math.hypot(context.beliefs.focal_error, context.beliefs.focal_sigma)
     if not error or context.beliefs.has_common_camera:
@@ -189,7 +186,7 @@ def from_center_px(view: View, context: Context) -> Floats:
     return (view.xy_px - np.array(context.camera.optics.camera.center_px))[:, :, None]
 
 
-def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def distortion(view: View, context: Context) -> Floats | None:
     """Difference of the image positions with the believed and the true distortion."""
     believed = context.beliefs.camera
     if believed.distortion == context.camera.optics.camera.distortion:
@@ -198,29 +195,27 @@ def distortion(view: View, lab_from_cam: Rotation, context: Context) -> Floats |
     return np.nan_to_num(shift_px)[:, :, None]
 
 
-def star_places(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def star_places(view: View, context: Context) -> Floats | None:
     """Errors of the stars' believed directions, from the catalog and from neighbors."""
     error = context.beliefs.direction_error[view.row]
-    return displacement(view, error, lab_from_cam) if error.any() else None
+    return displacement(view, error) if error.any() else None
 
 
-def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def rolling_shutter(view: View, context: Context) -> Floats | None:
     """Motion of the images during the difference of true and assumed delay of their rows from the middle row."""
     camera = context.camera.optics.camera
-    if not isinstance(camera.shutter, RollingShutterConfig):
-        return None
+    true_s = camera.row_delay_s
     assumed_s = context.scene.tracker.assumed_row_time_s
-    error_s = 0.0 if assumed_s is None else camera.shutter.row_time_s - assumed_s
-    if not error_s:
+    if not true_s or assumed_s is None or assumed_s == true_s:
         return None
-    delay_s = error_s * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
+    delay_s = (true_s - assumed_s) * (view.xy_px[:, 1] - (camera.height_px - 1) / 2)
     velocity_px_s = view.streak_px / context.scene.exposure.time_s
     return (velocity_px_s * delay_s[:, None])[:, :, None]
 
 
-def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Floats:
+def displacement(view: View, shift_lab: Floats) -> Floats:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
-    shift_cam = lab_from_cam.inv().apply(shift_lab)
+    shift_cam = view.lab_from_cam.inv().apply(shift_lab)
     return np.einsum("nij,nj->ni", view.gradient, shift_cam)[:, :, None]
 
 
@@ -372,7 +367,7 @@ def finds_focal_length(context: Context) -> bool:
     return by_default and abs(context.beliefs.focal_error) < WRONG_FOCAL
 
 
-def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch | None:
+def mismatch(view: View, context: Context) -> Mismatch | None:
     """The mismatch by errors that the tracker's matching radius leaves out; None if there is none, or too few lights.
 
     1. Displacements by each of these causes. A known error displaces every image by its vector; an error that is drawn
@@ -385,7 +380,7 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     # 1. Displacements.
     shifts = {}
     for name in (*UNKNOWN_TO_TRACKER, *OUTSIDE_OF_GATE):
-        shift_px = CAUSES[name](view, lab_from_cam, context)
+        shift_px = CAUSES[name](view, context)
         if shift_px is not None:
             shifts[name] = shift_px
     if context.beliefs.focal_sigma or finds_focal_length(context):
@@ -413,9 +408,9 @@ def mismatch(view: View, lab_from_cam: Rotation, context: Context) -> Mismatch |
     return Mismatch(residual_px, GATE_SIGMA * sigma_px, rms)
 
 
-def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+def solver_error(view: View, context: Context) -> Floats | None:
     """(3,) error of the dome's solver for exact rays, a rotation vector in camera axes; None for an exact solver."""
-    lab = context.lab
+    mount = context.camera.mount
     name = context.settings.solver
     surface = context.surface
     if surface is None or name in EXACT_SOLVERS:
@@ -423,10 +418,10 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     place_m = context.beliefs.lights.place[view.row, :3]
     center_m, semi_axes_m = surface.as_ellipsoid()
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
-    lever = Lever(lab.camera.mount.camera_body_m, lab.camera.mount.cam_from_body, 0.0)
+    cam_from_body = mount.cam_from_body
+    lever = Lever(mount.camera_body_m, cam_from_body, 0.0)
     rays = normalized(view.offset_m)
-    cam_from_body = lab.camera.mount.cam_from_body
-    body_from_lab = cam_from_body.inv() * lab_from_cam.inv()
+    body_from_lab = cam_from_body.inv() * view.lab_from_cam.inv()
     try:
         solved, _ = SOLVERS[name](
             rays, np.full(len(rays), 1e-5), place_m, leds, lever, body_from_lab
@@ -437,20 +432,19 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
     return error.as_rotvec()
 
 
-def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
+def expected(views: list[View], context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
     names = (CENTROIDS, LED_SURVEY, *CAUSES, SOLVER)
     cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
-    cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
-        variances = causes_at(view, attitudes.lab_from_body[a] * cam_from_body.inv(), context)
+        variances = causes_at(view, context)
         for name, variance in variances.items():
             cross[name][a] = variance[:2].sum()
             roll[name][a] = variance[2]
     return Expected({"cross": cross, "roll": roll})
 
 
-def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str, Floats]:
+def causes_at(view: View, context: Context) -> dict[str, Floats]:
     """(3,) variances about the camera's axes at one attitude in rad^2, by cause; NaN with too few lights."""
     # 1. Gains, with the parameters that the tracker fits as well.
     fitted = None
@@ -466,13 +460,13 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. and 3. Covariances by each cause, and the solver's own error squared.
     found = {CENTROIDS: of_independent(gain, centroid_variance(view, context))}
-    survey_px2 = led_survey(view, lab_from_cam, context)
+    survey_px2 = led_survey(view, context)
     if survey_px2 is not None:
         found[LED_SURVEY] = of_independent(gain, survey_px2)
     for name, cause in CAUSES.items():
-        shift_px = cause(view, lab_from_cam, context)
+        shift_px = cause(view, context)
         if shift_px is not None:
             found[name] = of_common(gain, shift_px)
     variances = {name: np.diag(matrix) for name, matrix in found.items()}
-    bias = solver_error(view, lab_from_cam, context)
+    bias = solver_error(view, context)
     return variances if bias is None else variances | {SOLVER: bias**2}

@@ -51,7 +51,7 @@ def lights_in_field(plan: Plan) -> Fact:
     lab = plan.lab
     lines = []
     values = {}
-    tilt_deg = math.degrees(attitudes.tilts_rad(plan.reach.attitudes).max())
+    tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
     reach = f"any azimuth and yaw to {tilt_deg:.1f}° of tilt"
     if lab.scene.stars:
         reach = "in the whole sky"
@@ -68,7 +68,7 @@ def lights_in_field(plan: Plan) -> Fact:
             least_of = min(plan.frames, plan.reach, key=lambda one: one.counts().min())
             of = f"of {len(counts)} attitudes and the frames "
         least = int(least_of.counts().min())
-        where = attitudes.describe(least_of.attitudes, int(least_of.counts().argmin()), lab)
+        where = least_of.attitudes.describe(int(least_of.counts().argmin()))
         limit = plan.settings.max_blobs
         cut = f"; the tracker uses the {limit} brightest" if (counts == limit).any() else ""
         missed = (
@@ -83,7 +83,7 @@ def lights_in_field(plan: Plan) -> Fact:
         behind = "".join(
             f"; {count:.1f} more are behind {name}" for name, count in hidden.items()
         )
-        rates = attitudes.rates_text(sampled.attitudes)
+        rates = sampled.attitudes.rates_text
         lines.append(
             f"{what}, {rates}: mean {counts.mean():.1f}{missed}, least {of}{least} at {where}{behind}"
         )
@@ -165,7 +165,7 @@ def peak(plan: Plan) -> Fact:
 def smear(plan: Plan) -> Fact:
     """Path of the images during an exposure at the mean rates of the frames, their jitter included."""
     frames = plan.frames
-    rate_deg_s = np.degrees(frames.attitudes.speed_rad_s)
+    rate_deg_s = frames.attitudes.speed_deg_s
     length_px = np.array(
         [np.median(view.streak_length_px) if len(view) else 0.0 for view in frames.known]
     )
@@ -262,7 +262,7 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     listed = points.kind == "listed"
     cap_deg = max_tilt_deg(plan.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
     if tilt_deg is None:
-        tilt_deg = math.degrees(attitudes.tilts_rad(plan.reach.attitudes).max())
+        tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
     edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)
     corner = field_reach_deg(plan, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)
@@ -274,7 +274,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     Infinite if a ray passes below the rim. The circle has the radius radius_px about the boresight. The tilt is tried
     to SIDES azimuths.
     """
-    mount = context.lab.camera.mount
+    mount = context.camera.mount
     surface = context.surface
     azimuth = 2 * np.pi * np.arange(SIDES) / SIDES
     assert surface is not None
@@ -428,19 +428,18 @@ def expected_error(plan: Plan) -> Fact:
         worst = ""
         if key == "reach" and known and failing < total:
             n = int(np.nanargmax(sampled.error.total("roll")))
-            where = attitudes.describe(sampled.attitudes, n, plan.lab)
+            where = sampled.attitudes.describe(n)
             worst = f"; worst roll {short(math.sqrt(sampled.error.total('roll')[n]) / ARCSEC_RAD)}{ARCSEC} at {where}"
         errors = errors_text(cross, roll) if known else "unknown"
-        rates = attitudes.rates_text(sampled.attitudes)
+        rates = sampled.attitudes.rates_text
         lines.append(f"{what}, {rates}: {errors}{worst}{few}")
         values[key] = {
             "cross_arcsec": cross,
             "roll_arcsec": roll,
             "without_solution": failing,
             "centroid_px": centroid_px(plan, sampled),
-        }
-        values[key] |= {
-            f"{angle}_causes_arcsec": causes(sampled, angle) for angle in ("cross", "roll")
+            "cross_causes_arcsec": causes(sampled, "cross"),
+            "roll_causes_arcsec": causes(sampled, "roll"),
         }
     chosen = plan.frames if np.isfinite(values["frames"]["roll_arcsec"]) else plan.reach
     # The causes with their size and their share of the variance.

@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera import thermal_motion
 from skysim.camera.detector import saturation_dn
-from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Mount, Sources
+from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
-from skysim.simulation.checks import attitudes, vehicle_facts
+from skysim.simulation.checks import vehicle_facts
 from skysim.simulation.checks.detection import (
     Context,
     detected_area_px,
@@ -182,7 +181,7 @@ def few_lights(plan: Plan) -> str:
     else:
         return ""
     on_chip = np.array([len(view) for view in sampled.seen])
-    where = attitudes.describe(sampled.attitudes, int(counts.argmin()), plan.lab)
+    where = sampled.attitudes.describe(int(counts.argmin()))
     text = (
         f"fewer than {needed} lights that the tracker detects at {100 * few:.0f} % of the"
         f" {'frames' if sampled is plan.frames else 'directions in reach'}, least {counts.min()} at {where}"
@@ -216,7 +215,7 @@ def hidden_lights(plan: Plan) -> str:
     what = f"all behind {name}" if behind == expected else f"{behind} of them behind {name}"
     what += "".join(f", {count} behind {other}" for other, count in others)
     return (
-        f"motion.start: {expected} lights expected at {attitudes.describe(frames.attitudes, n, plan.lab)},"
+        f"motion.start: {expected} lights expected at {frames.attitudes.describe(n)},"
         f" {what}; so at {100 * few.mean():.0f} % of the frames; point elsewhere, or change the time"
     )
 
@@ -289,14 +288,7 @@ def not_where_expected(plan: Plan) -> str:
     """Warn if errors that are unknown to the tracker displace images beyond its matching radius."""
     frames = plan.frames
     scene = plan.scene
-    cam_from_body = plan.lab.camera.mount.cam_from_body
-    found = [
-        one
-        for view, lab_from_body in zip(
-            frames.used, frames.attitudes.lab_from_body, strict=True
-        )
-        if (one := mismatch(view, lab_from_body * cam_from_body.inv(), plan)) is not None
-    ]
+    found = [one for view in frames.used if (one := mismatch(view, plan)) is not None]
     if not found:
         return ""
     residual_px = np.concatenate([one.residual_px for one in found])
@@ -308,7 +300,7 @@ def not_where_expected(plan: Plan) -> str:
         f"{100 * beyond:.0f} % of the images are up to {short(residual_px.max(), 2)} px from where the tracker expects"
         f" them, beyond its matching radius of {short(np.median(gate_px), 2)} px"
     )
-    rate_deg_s = float(np.degrees(frames.attitudes.speed_rad_s).max())
+    rate_deg_s = float(frames.attitudes.speed_deg_s.max())
     cause = max(found[0].by_cause, key=lambda name: max(one.by_cause[name] for one in found))
     text += f", at up to {rate_deg_s:.3g} deg/s" if cause == "rolling shutter" else ""
     excess = float(np.quantile(residual_px / gate_px, 1 - MAX_BEYOND))
@@ -431,7 +423,7 @@ def long_smear(plan: Plan) -> str:
     longest_px = float(length_px.max())
     if longest_px <= limit_px:
         return ""
-    rate_deg_s = float(np.degrees(frames.attitudes.speed_rad_s).max())
+    rate_deg_s = float(frames.attitudes.speed_deg_s.max())
     shorter_ms = 1e3 * scene.exposure.time_s * limit_px / longest_px
     breaking = (
         ", so that most break up or join others: frames fail, or err by more than their noise"
@@ -467,13 +459,13 @@ def unknown_tag_error(plan: Plan) -> str:
     sigma_s = float(scene.exposure.time_tag_jitter_s)
     if scene.filter is None or sigma_s <= MAX_TAG_RATIO * scene.filter.time_tag_sigma_s:
         return ""
-    rate_rad_s = float(plan.frames.attitudes.speed_rad_s.max())
-    turn_arcsec = sigma_s * rate_rad_s / ARCSEC_RAD
+    rate_deg_s = float(plan.frames.attitudes.speed_deg_s.max())
+    turn_arcsec = sigma_s * math.radians(rate_deg_s) / ARCSEC_RAD
     if turn_arcsec <= MAX_TAG_ARCSEC:
         return ""
     return (
         f"filter.time_tag_sigma: frames' times err by {short(1e3 * sigma_s, 2)} ms (exposure.time_tag_jitter), in which"
-        f" the vehicle turns by {short(turn_arcsec, 2)}″ at {math.degrees(rate_rad_s):.3g} deg/s; change it to"
+        f" the vehicle turns by {short(turn_arcsec, 2)}″ at {rate_deg_s:.3g} deg/s; change it to"
         f" {short(1e3 * sigma_s, 2)} ms"
     )
 
@@ -512,21 +504,13 @@ def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context)
         return np.full(3, np.nan)
     gain = gains(view, believed_px2(view, context))
     lights = context.beliefs.lights.take(view.row)
-    mount = context.lab.camera.mount
+    mount = context.camera.mount
     optics = context.camera.optics
-    surveyed_px = image_px(lights, mount, optics, lab_from_body)
-    moved = thermal_motion.camera_at(config, mount, optics, t_s)
-    drifted_px = image_px(thermal_motion.leds_at(config, lights, t_s), *moved, lab_from_body)
+    surveyed_px = optics.project(mount.toward(lights.place, lab_from_body))
+    moved_place = thermal_motion.leds_at(config, lights, t_s).place
+    moved_mount, moved_optics = thermal_motion.camera_at(config, mount, optics, t_s)
+    drifted_px = moved_optics.project(moved_mount.toward(moved_place, lab_from_body))
     return np.einsum("nij,nj->i", gain, drifted_px - surveyed_px)
-
-
-def image_px(
-    lights: Sources, mount: Mount, optics: Optics, lab_from_body: Rotation
-) -> Floats:
-    """(n, 2) image positions of lights at an attitude."""
-    camera_m = lab_from_body.apply(mount.camera_body_m)
-    offset_m = lights.place[:, :3] - lights.place[:, 3:] * camera_m
-    return optics.project((mount.cam_from_body * lab_from_body.inv()).apply(offset_m))
 
 
 FINDINGS = (

@@ -17,7 +17,6 @@ import numpy as np
 from skysim.camera import wcs
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record
-from skysim.dynamics import guidance
 from skysim.simulation.checks import attitudes, dome_warnings, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import context_of
@@ -90,12 +89,7 @@ def check(
     if outside:
         return Check([], [outside])
     # 1. Attitudes.
-    check_reference(
-        guidance.plan(scene.motion, lab.start, lab.profiles),
-        scene,
-        lab.vehicle,
-        lab.duration_s,
-    )
+    check_reference(lab, lab.reference, lab.duration_s)
     frames = attitudes.of_frames(lab)
     if rate_body_rad_s is not None:
         rates = np.tile(rate_body_rad_s, (len(frames.t_s), 1))
@@ -103,17 +97,16 @@ def check(
     # 2. Views.
     plan = plan_of(lab, frames, tilt_deg)
     # 3. Facts and warnings.
-    built = [build(plan) for build in (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)]
-    facts = [fact for fact in built if fact is not None]
+    builds = (*FACTS, sky_warnings.faintest_star, sky_warnings.fact)
+    facts = list(filter(None, (build(plan) for build in builds)))
     findings = warnings_of(plan, drawn)
     alike = dome_warnings.of(plan)
     if alike is not None and scene.dome:
         facts.insert(2, dome_warnings.fact(alike))
-        warning = dome_warnings.finding(alike, scene.dome)
-        findings += [warning] if warning else []
+        findings += filter(None, [dome_warnings.finding(alike, scene.dome)])
     forecast = forecast_torque(lab)
     fuel, warning = vehicle_facts.propellant(plan, forecast)
-    facts += [fuel] if fuel else []
+    facts += filter(None, [fuel])
     findings += filter(None, [*broken_assumptions(lab), shortfall(lab, forecast), warning])
     # 4. Heads.
     heads = [lab.of_camera(number) for number in range(1, len(lab.cameras))]
@@ -127,12 +120,12 @@ def check(
 
 def warnings_of(plan: Plan, drawn: bool) -> list[str]:
     """The warnings of the views; those about the directions of the frames only if these are not drawn."""
-    found = [
+    found = (
         find(plan)
         for find in (*FINDINGS, *SKY_FINDINGS, dome_warnings.mirror_images)
         if not drawn or find not in POINTED_FINDINGS
-    ]
-    findings = [line for line in found if line]
+    )
+    findings = list(filter(None, found))
     for finder in () if drawn else POINTED:
         findings += finder(plan)
     return findings
@@ -153,7 +146,7 @@ def ambiguity_map(lab: Lab) -> tuple[Ambiguity, float]:
 def plan_of(lab: Lab, frames: CheckedAttitudes, tilt_deg: float | None = None) -> Plan:
     """The context with the views of the camera at the frames and at the attitudes in reach."""
     context = context_of(lab)
-    reach = attitudes.within_reach(lab.scene, lab.camera.mount, frames, tilt_deg)
+    reach = attitudes.within_reach(frames, tilt_deg)
     return Plan(
         **vars(context), frames=sampled(frames, context), reach=sampled(reach, context)
     )
@@ -179,10 +172,13 @@ def errors_arcsec(facts: Sequence[Fact]) -> tuple[float, float]:
 def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     """The expected errors of each head at the frames, and of all cameras together, from the facts of each camera."""
     errors = [errors_arcsec(own) for own in facts]
-    names = [head.name for head in lab.scene.heads]
+    values: list[Record] = [
+        {"name": head.name, "cross_arcsec": cross, "roll_arcsec": roll}
+        for head, (cross, roll) in zip(lab.scene.heads, errors[1:], strict=True)
+    ]
     lines = [
-        f"{name}: {errors_text(*error)}"
-        for name, error in zip(names, errors[1:], strict=True)
+        f"{one['name']}: {errors_text(one['cross_arcsec'], one['roll_arcsec'])}"
+        for one in values
     ]
     # Of all cameras about the boresight of the main one. The information of solutions with independent errors adds up:
     # P^-1 = sum R_n P_n^-1 R_n^T, with R_n the rotation from the axes of camera n to those of the main one. A camera
@@ -201,10 +197,6 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     lines.append(
         f"with the main camera: {errors_text(*combined)}, about its axes, without errors of the mounts"
     )
-    values = [
-        {"name": name, "cross_arcsec": cross, "roll_arcsec": roll}
-        for name, (cross, roll) in zip(names, errors[1:], strict=True)
-    ]
     together = {"cross_arcsec": combined[0], "roll_arcsec": combined[1]}
     return Fact("heads", lines, {"heads": values, "together": together})
 

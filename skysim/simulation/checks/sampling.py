@@ -16,7 +16,7 @@ from skysim.core.types import Bools, Floats
 from skysim.simulation.checks.attitudes import CheckedAttitudes
 from skysim.simulation.checks.detection import Context, broken, usable
 from skysim.simulation.checks.expected_error import Expected, expected, within_gate
-from skysim.simulation.checks.views import VISIBLE, View, view
+from skysim.simulation.checks.views import View, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import Beam, Exposure, beam_of
 
@@ -36,8 +36,6 @@ class Sampled(NamedTuple):
         Those of `known` that are not hidden
     used
         Those of `seen` that the tracker detects and uses
-    hidden
-        Number of hidden lights by the name of the occluder
     others
         Lights that the tracker detects and does not know, by name
     error
@@ -50,7 +48,6 @@ class Sampled(NamedTuple):
     known: list[View]
     seen: list[View]
     used: list[View]
-    hidden: list[Counter[str]]
     others: list[dict[str, View]]
     error: Expected
 
@@ -65,6 +62,11 @@ class Sampled(NamedTuple):
     def predicted(self) -> bool:
         """Whether the errors are known at most of the attitudes; those where few streaks break are not typical."""
         return bool(2 * self.broken().sum() <= len(self.used))
+
+    @property
+    def hidden(self) -> list[Counter[str]]:
+        """Numbers of hidden lights that the tracker knows by the name of the occluder, at each attitude."""
+        return [Counter(view.behind[~view.visible]) for view in self.known]
 
     def hidden_counts(self) -> Floats:
         """(A,) number of hidden lights that the tracker knows."""
@@ -95,21 +97,12 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
     ]
     # 2. Known and other lights on the detector.
-    known = []
-    seen = []
-    whole = []
-    hidden = []
-    others = []
-    for exposure, beam in zip(exposures, beams, strict=True):
-        found, breaks, names = known_lights(beam, exposure, context)
-        visible = found.behind == VISIBLE
-        known.append(found)
-        seen.append(found.take(visible))
-        whole.append(found.take(visible & ~breaks))
-        hidden.append(
-            Counter(names[number] for number in found.behind[found.behind != VISIBLE])
-        )
-        others.append(other_lights(beam, exposure, context))
+    pairs = list(zip(beams, exposures, strict=True))
+    found = [known_lights(*pair, context) for pair in pairs]
+    others = [other_lights(*pair, context) for pair in pairs]
+    known = [view for view, _ in found]
+    seen = [view.take(view.visible) for view in known]
+    whole = [view.take(view.visible & ~breaks) for view, breaks in found]
     # 3. Detected lights, and the expected errors of a solution with them.
     detected = [usable(view, context) for view in whole]
     used = [within_gate(view, context) for view in detected]
@@ -118,25 +111,23 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         view.take(view.row < 0) if 2 * len(left) < len(usable(all_, context)) else view
         for view, left, all_ in zip(used, detected, seen, strict=True)
     ]
-    error = expected(fitted, at, context)
-    return Sampled(at, exposures, beams, known, seen, used, hidden, others, error)
+    error = expected(fitted, context)
+    return Sampled(at, exposures, beams, known, seen, used, others, error)
 
 
-def known_lights(
-    beam: Beam, exposure: Exposure, context: Context
-) -> tuple[View, Bools, list[str]]:
-    """The lights on the detector that the tracker knows, hidden ones included, which are `broken`, and the occluders.
+def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View, Bools]:
+    """The lights on the detector that the tracker knows, hidden ones included, and which are `broken`.
 
     `row` of the view is the row in the tracker's beliefs.
     """
     lit = next(lit for lit in beam.lits if lit.known)
     assert lit.points is not None
-    occluders = beam.before(lit)
-    found = view(lit, exposure, context.camera, occluders)
+    found = view(lit, exposure, context.camera, beam.before(lit))
     row = context.rows_of(lit.points.id[found.row])
-    breaks = broken(found, context)[row >= 0]
-    names = [occluder.name for occluder in occluders]
-    return View(row, *found[1:]).take(row >= 0), breaks, names
+    known = row >= 0
+    return View(found.lab_from_cam, row, *found[2:]).take(known), broken(found, context)[
+        known
+    ]
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:
@@ -145,5 +136,5 @@ def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, 
     for lit in beam.lits:
         if lit.points is not None and not lit.known:
             seen = view(lit, exposure, context.camera, beam.before(lit))
-            found[lit.name] = usable(seen.take(seen.behind == VISIBLE), context)
+            found[lit.name] = usable(seen.take(seen.visible), context)
     return {name: seen for name, seen in found.items() if len(seen)}

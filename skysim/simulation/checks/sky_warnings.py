@@ -10,7 +10,6 @@ from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
-from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
     STILL_PX,
@@ -35,7 +34,7 @@ from skysim.simulation.lights.light import find_light
 from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad
 from skysim.sources.ephemeris import place
-from skysim.sources.photometry import SUN, star_flux_e_s_m2
+from skysim.tracking.onboard_model import bright_star_e
 from skysim.tracking.tracker_interface import OWN
 
 # Refraction.
@@ -54,7 +53,7 @@ def refraction(plan: Plan) -> str:
     atmosphere = find_light(lab.camera.lights, AirEffects)
     if atmosphere is None or lab.scene.tracker.refraction:
         return ""
-    boresight = attitudes.boresights(at.lab_from_body, lab)
+    boresight = at.boresights
     zenith = np.array(
         [atmosphere.air.at(exposure.time).zenith for exposure in plan.frames.exposures]
     )
@@ -73,7 +72,7 @@ def refraction(plan: Plan) -> str:
         MIN_RAISED_ARCSEC, 0.0 if math.isnan(expected_arcsec) else expected_arcsec
     ):
         return ""
-    where = attitudes.describe(at, n, lab)
+    where = at.describe(n)
     text = (
         f"the air raises stars by {short(middle)}″ at {where}, {math.degrees(altitude_rad[n]):.1f}° above the horizon,"
         f" and shortens the field by {short(low - high, 2)}″, which the tracker does not know"
@@ -108,7 +107,7 @@ def bodies_near(plan: Plan) -> Iterator[str]:
     # 2. Warnings.
     for name, (off_rad, n, body) in closest.items():
         seen = body.truth()
-        where = attitudes.describe(at, n, lab)
+        where = at.describe(n)
         what = f"light.bodies: {NAMES[body.id]} (V {seen.v_mag:.1f}, {short(seen.diameter_arcsec, 2)}″ wide)"
         far = f"{math.degrees(off_rad):.1f}° from the boresight at {where}"
         if in_field(
@@ -118,10 +117,8 @@ def bodies_near(plan: Plan) -> Iterator[str]:
             camera = plan.camera
             lit = (1 + math.cos(body.place.phase_rad)) / 2
             radius = math.tan(body.radius_rad) * math.sqrt(lit)
-            radius_px = np.array([camera.optics.camera.focal_px * radius])
-            lens2_px2 = np.array([camera.lens_px**2])
-            none = np.zeros(1)
-            share = float(peak_share(lens2_px2, radius_px, none, none)[0])
+            radius_px = camera.optics.camera.focal_px * radius
+            share = float(peak_share(camera.lens_px**2, radius_px))
             light_e = body.flux_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
             fill = light_e * share / plan.full_e
             yield f"{what} is in the field, {far}: {short(fill, 2)} times saturation"
@@ -158,12 +155,9 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     found = []
     settings = replace(context.settings, centroid_sigma_px=floor_px)
     claiming = replace(context, settings=settings)
-    cam_from_body = context.lab.camera.mount.cam_from_body
     if not sampled.predicted():
         return math.nan
-    for view, lab_from_body in zip(
-        sampled.used, sampled.attitudes.lab_from_body, strict=True
-    ):
+    for view in sampled.used:
         believed = believed_px2(view, claiming, prnu=0.0)
         try:
             gain = gains(view, believed) if len(view) > 2 else None
@@ -172,7 +166,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         if gain is None:
             continue
         # C, then M.
-        places = star_places(view, lab_from_body * cam_from_body.inv(), context)
+        places = star_places(view, context)
         errors = of_independent(gain, centroid_variance(view, context))
         errors = errors if places is None else errors + of_common(gain, places)
         weighted = np.linalg.solve(believed, view.jacobian)
@@ -195,7 +189,7 @@ def fact(plan: Plan) -> Fact | None:
     if math.isnan(nees):
         return None
     floor_px = plan.settings.searched_sigma_px
-    rates = attitudes.rates_text(plan.reach.attitudes)
+    rates = plan.reach.attitudes.rates_text
     text = f"NEES {nees:.2g} over the sky {rates} (3 if true), with a least centroid error of {short(floor_px)} px"
     return Fact("claimed errors", [text], {"nees": nees, "centroid_sigma_px": floor_px})
 
@@ -224,7 +218,8 @@ def floor_too_small(plan: Plan) -> str:
 # Stray light past the baffle, and exclusion angles.
 
 MAX_LOSS_MAG = 0.5  # loss of limiting magnitude that gives no warning
-STRAY_NAMES = {"sun": "the Sun", "moon": "the Moon", "earth": "the Earth"}
+# Bodies with an exclusion angle, and what it is measured from.
+EXCLUDED = {"sun": "the Sun", "earth": "the Earth's limb", "moon": "the Moon"}
 
 
 def stray_light(plan: Plan) -> Iterator[str]:
@@ -249,7 +244,7 @@ def stray_light(plan: Plan) -> Iterator[str]:
     yield (
         f"camera.baffle.pst: stray light of {short(stray_e[n])} electrons in a pixel, most of it of"
         f" {source}, of {plan.full_e:.0f} at saturation,"
-        f" at {attitudes.describe(at, n, lab)}; the faintest star is {loss_mag:.1f} mag"
+        f" at {at.describe(n)}; the faintest star is {loss_mag:.1f} mag"
         f" brighter; change it to {short(allowed_e / stray_e[n], 2)} times as much, or point farther away"
     )
 
@@ -263,8 +258,7 @@ def exclusion(plan: Plan) -> Iterator[str]:
         return
     # Angles from the Sun's center, the Earth's limb and the Moon's center.
     rows = []
-    boresights = attitudes.boresights(at.lab_from_body, lab)
-    for t_s, boresight in zip(at.t_s.tolist(), boresights, strict=True):
+    for t_s, boresight in zip(at.t_s.tolist(), at.boresights, strict=True):
         here = lab.camera.viewpoint.observer_at(t_s)
         sun, moon = (
             float(angular_separation_deg(boresight, place(name, here).direction))
@@ -272,15 +266,15 @@ def exclusion(plan: Plan) -> Iterator[str]:
         )
         limb_rad = limb_elevation_rad(here.from_earth.position_m, boresight)
         rows.append([sun, math.degrees(float(limb_rad)), moon])
-    angles_deg = np.array(rows)
-    limits_deg = {"sun": limits.sun_deg, "earth": limits.earth_deg, "moon": limits.moon_deg}
-    for column, (name, limit_deg) in enumerate(limits_deg.items()):
-        n = int(angles_deg[:, column].argmin())
-        if angles_deg[n, column] < limit_deg:
-            what = f"{STRAY_NAMES[name]}'s limb" if name == "earth" else STRAY_NAMES[name]
+    limits_deg = (limits.sun_deg, limits.earth_deg, limits.moon_deg)
+    for (name, what), limit_deg, angle_deg in zip(
+        EXCLUDED.items(), limits_deg, np.array(rows).T, strict=True
+    ):
+        n = int(angle_deg.argmin())
+        if angle_deg[n] < limit_deg:
             yield (
-                f"orbit.exclusion.{name}_deg: {what} is {angles_deg[n, column]:.1f}° from the boresight at"
-                f" {attitudes.describe(at, n, lab)}, within {limit_deg:g}°; point farther away"
+                f"orbit.exclusion.{name}_deg: {what} is {angle_deg[n]:.1f}° from the boresight at"
+                f" {at.describe(n)}, within {limit_deg:g}°; point farther away"
             )
 
 
@@ -300,7 +294,7 @@ def faintest_star(plan: Plan) -> Fact | None:
     believed = plan.beliefs
     if not scene.stars:
         return None
-    rate_deg_s = float(np.degrees(plan.frames.attitudes.speed_rad_s).min())
+    rate_deg_s = float(plan.frames.attitudes.speed_deg_s.min())
     limit_mag = detection_limit_mag(plan)
     snr_mag = snr_limit_mag(plan)
     sky = plan.lab.camera.sources.magnitude
@@ -390,9 +384,8 @@ def detection_limit_mag(plan: Plan) -> float:
     half_px = length_px / math.pi
     radius_px = math.sqrt(half_px**2 + plan.settings.min_area_px / math.pi) - half_px
     peak_e = threshold_e(plan, streak_px) * math.exp(radius_px**2 / (2 * blur2_px2))
-    none = np.zeros(1)
-    share = peak_share(np.array([blur2_px2]), none, none, np.array([length_px]))[0]
-    return 2.5 * math.log10(bright_star_e(plan) * share / peak_e)
+    share = float(peak_share(blur2_px2, streak_px=length_px))
+    return 2.5 * math.log10(bright_star_e(plan.scene) * share / peak_e)
 
 
 def snr_limit_mag(plan: Plan) -> float:
@@ -409,14 +402,7 @@ def snr_limit_mag(plan: Plan) -> float:
     width_px = 2 * math.sqrt(math.pi) * camera.lens_px
     area_px = width_px * math.hypot(width_px, *least_streak_px(plan))
     signal_e = (SNR**2 + math.sqrt(SNR**4 + 4 * SNR**2 * area_px * camera.noise_e**2)) / 2
-    return 2.5 * math.log10(bright_star_e(plan) / signal_e)
-
-
-def bright_star_e(context: Context) -> float:
-    """Electrons of a star of V = 0 and the Sun's color in an exposure."""
-    camera = context.camera
-    light_e_s_m2 = float(star_flux_e_s_m2(0.0, *SUN, context.lab.camera.band))
-    return light_e_s_m2 * camera.optics.collecting_m2 * camera.exposure_s
+    return 2.5 * math.log10(bright_star_e(plan.scene) / signal_e)
 
 
 def least_streak_px(plan: Plan) -> Floats:

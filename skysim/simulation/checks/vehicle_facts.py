@@ -10,7 +10,6 @@ import numpy as np
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats, Record
 from skysim.core.units import significant
-from skysim.dynamics import guidance
 from skysim.dynamics.multibody.actuators import PREFIXES
 from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.motion import TorqueForecast
@@ -116,7 +115,7 @@ def maneuver(plan: Plan) -> Fact | None:
     if not maneuvers:
         return None
     exposure = lab.scene.exposure
-    start_s = guidance.plan(lab.scene.motion, lab.start, lab.profiles).start_s
+    start_s = lab.reference.start_s
     rows = [
         {"kind": element.kind, "begin_s": begin_s, "end_s": end_s}
         for element, begin_s, end_s in zip(maneuvers, start_s, start_s[1:], strict=False)

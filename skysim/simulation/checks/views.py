@@ -16,18 +16,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
+from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Floats, Ints, Sources
+from skysim.core.types import Bools, Floats, Ints, Mount, Sources
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
 
 STEP = 1e-6  # relative displacement of a light, for the numerical derivative of its image
-VISIBLE = -1  # number in place of an occluder's for a light that is not hidden
+VISIBLE = ""  # name in place of an occluder's for a light that is not hidden
 
 
 class View(NamedTuple):
@@ -35,6 +36,8 @@ class View(NamedTuple):
 
     Attributes
     ----------
+    lab_from_cam
+        Attitude of the camera, with its assumed mount
     row
         (n,) rows among the sources
     xy_px
@@ -58,9 +61,10 @@ class View(NamedTuple):
     peak_e
         (n,) mean electrons in the brightest pixel, background included
     behind
-        (n,) numbers of the occluders that hide the lights; VISIBLE for none
+        (n,) names of the occluders that hide the lights; VISIBLE for none
     """
 
+    lab_from_cam: Rotation
     row: Ints
     xy_px: Floats
     offset_m: Floats
@@ -73,10 +77,15 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
-    behind: Ints
+    behind: NDArray
 
     def __len__(self) -> int:
         return len(self.row)
+
+    @property
+    def visible(self) -> Bools:
+        """(n,) whether nothing hides the lights."""
+        return self.behind == VISIBLE
 
     @property
     def jacobian(self) -> Floats:
@@ -98,7 +107,7 @@ class View(NamedTuple):
 
     def take(self, which: NDArray) -> "View":
         """The lights selected by a mask or by indices."""
-        return View(*(column[which] for column in self))
+        return View(self.lab_from_cam, *(column[which] for column in self[1:]))
 
 
 class CameraModel(NamedTuple):
@@ -106,8 +115,8 @@ class CameraModel(NamedTuple):
 
     Attributes
     ----------
-    optics
-        Geometry of lens and detector
+    optics, mount
+        Geometry of lens and detector, and the assumed mount
     lens_px
         Standard deviation of the Gaussian that has the peak of the lens's image, pixel included
     background_e
@@ -123,6 +132,7 @@ class CameraModel(NamedTuple):
     """
 
     optics: Optics
+    mount: Mount
     lens_px: float
     background_e: float
     glow_e: dict[str, float]
@@ -159,26 +169,35 @@ class CameraModel(NamedTuple):
         )
         lens_px = float(1 / np.sqrt(2 * np.pi * build_kernel(camera.psf, camera).peak))
         noise_e = float(np.sqrt(background_e + read_e2))
-        return cls(lab.camera.optics, lens_px, background_e, glow_e, noise_e, exposure_s)
+        return cls(
+            lab.camera.optics,
+            lab.camera.mount,
+            lens_px,
+            background_e,
+            glow_e,
+            noise_e,
+            exposure_s,
+        )
 
 
 def view(
     lit: Lit,
     exposure: Exposure,
     camera: CameraModel,
-    occluders: Sequence[Occluder] = (),
+    occluders: Sequence[Occluder],
 ) -> View:
     """The points of a light on the detector in an exposure, hidden ones included.
 
     1. Select the points on the detector.
     2. Electrons, from rate and on-time.
     3. Vectors to the lights, derivatives of the images, paths.
-    4. Sizes of lens image, LED disk and defocus disk.
+    4. Occluders.
+    5. Sizes of lens image, LED disk and defocus disk.
 
     Parameters
     ----------
     occluders
-        Occluders of the points; their numbers are in `behind`
+        Occluders of the points; their names are in `behind`
     """
     # 1. Points on the detector.
     assert lit.points is not None
@@ -194,13 +213,18 @@ def view(
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
     streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, arm_m, gradient)
-    # 4. Sizes.
+    # 4. What hides them: of several occluders, the last.
+    behind = np.full(len(row), VISIBLE, object)
+    for occluder in occluders:
+        behind[occluder.hides(chosen.place)] = occluder.name
+    # 5. Sizes.
     depth_m = np.where(chosen.place[:, 3] > 0, offset_m[:, 2], np.inf)
     disk_px = optics.camera.focal_px * chosen.radius_m / distance_m  # a star has no radius
     lens2_px2, defocus_px = lens_blur(camera, chosen, xy_px, depth_m)
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
+        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
         row,
         xy_px,
         offset_m,
@@ -213,7 +237,7 @@ def view(
         sigma_px,
         streak_px,
         electrons * share + camera.background_e,
-        hiding(occluders, chosen.place),
+        behind,
     )
 
 
@@ -248,14 +272,6 @@ def lens_blur(
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 
-def hiding(occluders: Sequence[Occluder], place: Floats) -> Ints:
-    """(N,) number of the last occluder that hides each of N places; VISIBLE for none."""
-    found = np.full(len(place), VISIBLE)
-    for number, occluder in enumerate(occluders):
-        found[occluder.hides(place)] = number
-    return found
-
-
 def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
     step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
@@ -264,9 +280,12 @@ def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
 
 
 def peak_share(
-    lens2_px2: Floats, disk_px: Floats, defocus_px: Floats, streak_px: Floats
+    lens2_px2: Floats | float,
+    disk_px: Floats | float = 0.0,
+    defocus_px: Floats | float = 0.0,
+    streak_px: Floats | float = 0.0,
 ) -> Floats:
-    """(n,) share of the light in the brightest pixel.
+    """(n,) share of the light in the brightest pixel; arguments that are numbers hold for all.
 
     The image is a disk of radius R, the larger of LED and defocus disk, blurred by a Gaussian of variance
     s^2 = lens^2 + r^2 / 4 with the smaller radius r:

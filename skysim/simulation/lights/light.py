@@ -90,7 +90,7 @@ class Exposure:
     @cached_property
     def t_s(self) -> float:
         """Mid-exposure of the middle row, in seconds from the scene's start."""
-        return self.window.middle_s(self.optics.camera.height_px)
+        return self.window.middle_s
 
     @cached_property
     def time(self) -> datetime.datetime:
@@ -125,7 +125,7 @@ class Exposure:
     @cached_property
     def view(self) -> ExposureView:
         """Region of the sky that the camera sees from the opening of the first row to the end of the last row."""
-        duration_s = self.window.close_s(self.optics.camera.height_px) - self.window.open_s
+        duration_s = self.window.close_s - self.window.open_s
         turn_rad = float(np.linalg.norm(self.trajectory.rate_at(self.t_s))) * duration_s
         return ExposureView(self.boresight, self.optics.field_rad, turn_rad, duration_s)
 

@@ -97,7 +97,7 @@ def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:
         push.advance(Grip((0.5, 0.0, 0.0), (0.0, 0.5, 0.0)), 0.1)
     rate = push.simulation.rate_body_rad_s.copy()
     seen = push.seen()
-    close_s = window.close_s(free.scene.camera.height_px)
+    close_s = window.close_s
     turned = (seen.attitude_at(window.open_s).inv() * seen.attitude_at(close_s)).as_rotvec()
     np.testing.assert_allclose(turned, rate * (close_s - window.open_s), rtol=0.05, atol=1e-6)
     np.testing.assert_allclose(seen.rate_at(close_s), rate, rtol=0.01, atol=1e-9)

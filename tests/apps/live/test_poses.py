@@ -104,8 +104,7 @@ def flown() -> Iterator[Flight]:
 def flown_pose(flown: Flight, index: int) -> Any:
     scene = flown.lab.scene
     window = exposure_window(scene, index)
-    close_s = window.close_s(scene.camera.height_px)
-    return pose_of(flown.trajectory(), flown.lab.camera.orbit, window.open_s, close_s)
+    return pose_of(flown.trajectory(), flown.lab.camera.orbit, window.open_s, window.close_s)
 
 
 def good_pose(**changes: Any) -> dict[str, Any]:

@@ -248,7 +248,7 @@ class Push:
         self.lab = lab
         window = exposure_window(lab.scene, 0)
         self.start_s = window.open_s - MARGIN_S
-        self.end_s = window.close_s(lab.scene.camera.height_px) + MARGIN_S
+        self.end_s = window.close_s + MARGIN_S
         kept_s = self.end_s - self.start_s + MAX_ADVANCE_S
         self.simulation = multibody.Simulation(
             lab.vehicle, lab_from_body, np.zeros(3), math.inf, kept_s

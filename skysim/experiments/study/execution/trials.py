@@ -513,13 +513,11 @@ def constant_acceleration(
     The acceleration is along the rate, or the rate is zero: the rotation vector is rate t + acceleration t^2 / 2.
     """
     windows = [exposure_window(scene, index) for index in range(frame + 1)]
-    rows = scene.camera.height_px
     exposures = [
-        np.linspace(one.open_s - MARGIN_S, one.close_s(rows) + MARGIN_S, KNOTS)
-        for one in windows
+        np.linspace(one.open_s - MARGIN_S, one.close_s + MARGIN_S, KNOTS) for one in windows
     ]
     t_s = np.unique(np.concatenate(exposures))
-    since_s = t_s - windows[-1].middle_s(rows)
+    since_s = t_s - windows[-1].middle_s
     turned = np.outer(since_s, rate_body) + np.outer(since_s**2 / 2, acceleration_body)
     rate = rate_body + np.outer(since_s, acceleration_body)
     return Trajectory(t_s, middle * Rotation.from_rotvec(turned), rate)
