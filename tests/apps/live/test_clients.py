@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,8 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
 def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = block("sh", "--tcp 8091") + block("sh", "--display")
+    if find_spec("mcap_ros2"):
+        lines += block("sh", "--mcap")
     for line in lines.splitlines():
         words = re.sub(r"8091|8765", "0", line.partition("#")[0]).split()[1:]
         done = CliRunner().invoke(main.app, [*words, "--speed", "2"], catch_exceptions=False)
