@@ -1,12 +1,13 @@
 """A client of GigE Vision cameras by Aravis: run by the system's Python, which has Debian's gir1.2-aravis-0.8.
 
 Sets features from a JSON object in the first argument, acquires the number of frames in the second from the camera at
-127.0.0.1, and prints a line of JSON for each: status, number, timestamp and the digest of its bytes.
+127.0.0.1, and prints a line of JSON for each: status, number, timestamp, Unix time of arrival and the digest of its bytes.
 """
 
 import hashlib
 import json
 import sys
+import time
 
 import gi
 
@@ -30,10 +31,12 @@ for _ in range(int(sys.argv[2])):
     buffer = stream.timeout_pop_buffer(10_000_000)
     if buffer is None:
         break
+    arrival_s = time.time()
     line = {
         "status": buffer.get_status().value_nick,
         "id": buffer.get_frame_id(),
         "t_ns": buffer.get_timestamp(),
+        "arrival_s": arrival_s,
         "digest": hashlib.sha256(buffer.get_data()).hexdigest(),
     }
     print(json.dumps(line), flush=True)

@@ -1,4 +1,4 @@
-"""The two clients of docs/howto/live.md close the attitude loop over the wire, and the page's other blocks run."""
+"""The two clients of docs/howto/live.md close the attitude loop over the wire; its other blocks, and protocols.md's."""
 
 import re
 import subprocess
@@ -18,15 +18,14 @@ from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 from tests.docs.test_docs_blocks import blocks
 
-PAGE = Path(__file__).parents[3] / "docs/howto/live.md"
+HOWTO = Path(__file__).parents[3] / "docs/howto"
 SPEED = 4.0
 
 
 def block(language: str, first: str) -> str:
-    """The block of the page that begins so."""
-    (found,) = (
-        one.text for one in blocks(PAGE) if one.language == language and first in one.text
-    )
+    """The block of the two pages that has this text in it."""
+    every = [one for page in ("live.md", "protocols.md") for one in blocks(HOWTO / page)]
+    (found,) = (one.text for one in every if one.language == language and first in one.text)
     return found
 
 
