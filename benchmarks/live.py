@@ -171,7 +171,9 @@ def watch(port: int, arrivals: dict[int, float], has_subscribed: threading.Event
 
     async def receive() -> None:
         async with websockets.connect(
-            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None
+            f"ws://127.0.0.1:{port}",
+            subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
+            max_size=None,
         ) as client:
             await client.recv()
             channels = json.loads(await client.recv())["channels"]
@@ -183,6 +185,7 @@ def watch(port: int, arrivals: dict[int, float], has_subscribed: threading.Event
             has_subscribed.set()
             async for data in client:
                 # Message data: opcode 1, subscription, and log time, little-endian.
+                assert isinstance(data, bytes)
                 arrivals[int.from_bytes(data[5:13], "little")] = time.time()
 
     asyncio.run(receive())

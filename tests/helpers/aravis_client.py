@@ -1,7 +1,7 @@
 """A client of GigE Vision cameras by Aravis: run by the system's Python, which has Debian's gir1.2-aravis-0.8.
 
 Sets features from a JSON object in the first argument, acquires the number of frames in the second from the camera at
-127.0.0.1, and prints a line of JSON for each: status, number, timestamp, Unix time of arrival and the digest of its bytes.
+127.0.0.1, and prints a line of JSON for each: status, number, timestamp, Unix time of arrival, digest of its bytes.
 """
 
 import hashlib
