@@ -209,7 +209,9 @@ def fuzz_by_coverage(names: list[str], seconds_each: float) -> int:
 
 def compiled_modules() -> list[str]:
     """Names of the modules with compiled functions: numba can't read bytecode that is instrumented."""
-    files = [path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")]
+    files = [
+        path for package in ("skysim", "estimator") for path in (ROOT / package).rglob("*.py")
+    ]
     return [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for path in files

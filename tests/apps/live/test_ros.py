@@ -27,8 +27,7 @@ from skysim.apps.live.commands import CommandState
 from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.poses import PosedLive
-from skysim.apps.live.ros_messages import TOPICS, TRUE_TOPICS, RosEncoder
-from skysim.apps.live.ros_outputs import FoxgloveSink, McapSink
+from skysim.apps.live.ros import TOPICS, TRUE_TOPICS, FoxgloveSink, McapSink, RosEncoder
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
@@ -263,8 +262,8 @@ def test_a_file_is_never_overwritten(flown: Flown, tmp_path: Path) -> None:
 def test_without_the_extra_a_line_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.delitem(sys.modules, "skysim.apps.live.ros_outputs")
-    monkeypatch.delattr("skysim.apps.live.ros_outputs")
+    monkeypatch.delitem(sys.modules, "skysim.apps.live.ros")
+    monkeypatch.delattr("skysim.apps.live.ros")
     monkeypatch.setitem(sys.modules, "foxglove", None)
     command = ["live", "shefex2", "--mcap", str(tmp_path / "a.mcap"), "--frames", "1"]
     done = CliRunner().invoke(main.app, command)

@@ -283,13 +283,13 @@ def open_indi(opening: Opening, port: int) -> Output:
 
 
 def open_mcap(opening: Opening, path: Path) -> Output:
-    from skysim.apps.live.ros_outputs import McapSink, RosEncoder
+    from skysim.apps.live.ros import McapSink, RosEncoder
 
     return McapSink(RosEncoder(opening.live), path)
 
 
 def open_foxglove(opening: Opening, port: int) -> Output:
-    from skysim.apps.live.ros_outputs import FoxgloveSink, RosEncoder
+    from skysim.apps.live.ros import FoxgloveSink, RosEncoder
 
     sink = FoxgloveSink(RosEncoder(opening.live), port)
     opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
