@@ -35,6 +35,7 @@ ELSEWHERE = {  # pages whose blocks have a test of their own, which knows what i
     "docs/howto/external_tracker.md": "tracking/test_interface.py",
     "docs/howto/light.md": "simulation/test_lights.py",
     "docs/howto/live.md": "apps/live/test_clients.py",
+    "docs/howto/protocols.md": "apps/live/test_clients.py",
     "docs/findings/papers.md": "experiments/papers/test_reproduction.py",
     "docs/findings/studies.md": "docs/test_docs.py",
     "estimator/README.md": "docs/test_estimator_readme.py",

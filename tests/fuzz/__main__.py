@@ -48,6 +48,7 @@ TARGETS = {
     "packets": (),
     "commands": (),
     "poses": (),
+    "datagrams": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

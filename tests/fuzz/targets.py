@@ -11,13 +11,18 @@ from contextlib import redirect_stdout
 from functools import cache
 from io import BytesIO, TextIOWrapper
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
+from skysim.apps.live import gvcp
 from skysim.apps.live.commands import CommandState, Inbox, parse
+from skysim.apps.live.gige import GigeCamera
+from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import unpack
 from skysim.apps.live.poses import pose_samples
 from skysim.apps.plate_solver import picture
@@ -248,6 +253,40 @@ def packets(data: bytes) -> None:
 
 
 @cache
+def camera_flight() -> Any:
+    """What a camera needs of a flight."""
+    control = SimpleNamespace(exposure_s=0.01)
+    return SimpleNamespace(
+        lab=SimpleNamespace(scene=loader.load("shefex2")),
+        now_s=1.0,
+        schedules=[SimpleNamespace(triggers_s=None, exposure_control=control)],
+    )
+
+
+def datagrams(data: bytes) -> None:
+    """Datagrams to a GigE Vision camera, one after another: each is ignored, or answered as the standard says."""
+    flight = camera_flight()
+    camera = GigeCamera(
+        Live(flight, Pace(0.0, 1.0), [], CommandState(flight, 1.0, False)), "127.0.0.1", 0
+    )
+    camera.stream.close()  # nothing leaves the process
+    sent = 0
+    try:
+        while sent < len(data):
+            length = int.from_bytes(data[sent + 4 : sent + 6])
+            one = data[sent : sent + 8 + length]
+            sent += len(one)
+            answer = camera.answer(one, ("127.0.0.1", 1), 0.0)
+            if answer is not None:
+                status, _, size, number = gvcp.ANSWER.unpack_from(answer)
+                gvcp.GvcpStatus(status)
+                if size != len(answer) - 8 or number != int.from_bytes(one[6:8]):
+                    raise AssertionError(f"a malformed answer: {answer!r}")
+    finally:
+        camera.close()
+
+
+@cache
 def commanded_flight() -> CommandState:
     """A flight that takes every kind of command."""
     flight = open_flight(loader.load("simsat_bump"), keeps_history=False)
@@ -295,6 +334,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         packets,
         commands,
         poses,
+        datagrams,
         quantities,
     )
 }

@@ -1,8 +1,9 @@
-"""The two clients of docs/howto/live.md close the attitude loop over the wire, and the page's other blocks run."""
+"""The two clients of docs/howto/live.md close the attitude loop over the wire; its other blocks, and protocols.md's."""
 
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,14 @@ from skysim.scene import loader
 from skysim.simulation.flight import open_flight
 from tests.docs.test_docs_blocks import blocks
 
-PAGE = Path(__file__).parents[3] / "docs/howto/live.md"
+HOWTO = Path(__file__).parents[3] / "docs/howto"
 SPEED = 4.0
 
 
 def block(language: str, first: str) -> str:
-    """The block of the page that begins so."""
-    (found,) = (
-        one.text for one in blocks(PAGE) if one.language == language and first in one.text
-    )
+    """The block of the two pages that has this text in it."""
+    every = [one for page in ("live.md", "protocols.md") for one in blocks(HOWTO / page)]
+    (found,) = (one.text for one in every if one.language == language and first in one.text)
     return found
 
 
@@ -85,6 +85,8 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
 def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = block("sh", "--tcp 8091") + block("sh", "--display")
+    if find_spec("mcap_ros2"):
+        lines += block("sh", "--mcap")
     for line in lines.splitlines():
         words = re.sub(r"8091|8765", "0", line.partition("#")[0]).split()[1:]
         done = CliRunner().invoke(main.app, [*words, "--speed", "2"], catch_exceptions=False)

@@ -246,7 +246,9 @@ def test_a_client_that_does_not_read_is_not_waited_for(
     monkeypatch.setattr(wire, "SOCKET_TIMEOUT_S", 1.0)
     client = Client(server_of(live), token="secret", take=["frame"])
     client.receive()
-    (served,) = server_of(live).clients
+    # The server adds a client while it has the lock; its greeting may come first.
+    with server_of(live).lock:
+        (served,) = server_of(live).clients
     large = Packet(
         {"channel": "frame", "index": 0, "dropped": 0}, np.zeros((4000, 4000), "<u2")
     )

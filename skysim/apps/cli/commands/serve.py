@@ -37,6 +37,10 @@ def live(
         int | None,
         Option(**PORTS, help="Serve MJPEG on this port; 0: any free port."),
     ] = None,
+    gige: Annotated[
+        bool | None,
+        Option("--gige", help="Be a GigE Vision camera, which GenICam clients control."),
+    ] = None,
     folder: Annotated[
         Path | None,
         Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
@@ -48,10 +52,28 @@ def live(
             help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
         ),
     ] = None,
+    indi: Annotated[
+        int | None,
+        Option(
+            **PORTS,
+            help="Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.",
+        ),
+    ] = None,
     pipe: Annotated[
         str | None,
         Option(
             help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
+        ),
+    ] = None,
+    mcap: Annotated[
+        Path | None,
+        Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
+    ] = None,
+    foxglove: Annotated[
+        int | None,
+        Option(
+            **PORTS,
+            help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
         ),
     ] = None,
     host: Annotated[
@@ -97,7 +119,7 @@ def live(
         bool,
         Option(
             "--wait",
-            help="Start when the first client of --tcp takes channels.",
+            help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
         ),
     ] = False,
     frames: Frames = None,
@@ -127,11 +149,11 @@ def live(
     if not chosen:
         raise InputError("", "no output", ", ".join(f"--{name}" for name in OPENERS))
     needs: dict[tuple[str, ...], bool] = {
-        (f"--host {host}", "tcp", "http"): host != HOST,
+        (f"--host {host}", "tcp", "http", "gige"): host != HOST,
         ("--token", "tcp", "http"): bool(token),
         ("--display", "http"): bool(display),
-        ("--trigger", "tcp"): trigger,
-        ("--wait", "tcp"): wait,
+        ("--trigger", "tcp", "gige"): trigger,
+        ("--wait", "tcp", "gige"): wait,
         ("--client-tracker", "tcp"): client_tracker,
         ("--poses", "tcp"): poses,
     }
@@ -153,10 +175,10 @@ def live(
         flight,
         Pace(0.0 if poses else speed, loaded.exposure.rate_hz),
         [],
-        CommandState(flight, command_timeout, trigger),
+        CommandState(flight, command_timeout, trigger or indi is not None),
         has_truth=truth,
         solves_itself=not client_tracker,
-        may_solve=tcp is not None,
+        may_solve=bool(chosen.keys() & TAKE_SOLUTIONS),
     )
     with ExitStack() as stack:
         if not token and host not in LOOPBACK:
@@ -251,6 +273,29 @@ def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
     return show
 
 
+def open_indi(opening: Opening, port: int) -> Output:
+    from skysim.apps.live.indi import IndiCamera
+
+    camera = IndiCamera(opening.live, port)
+    opening.stack.callback(camera.close)
+    opening.say(f"indi {HOST}:{camera.port}")
+    return camera.sink
+
+
+def open_mcap(opening: Opening, path: Path) -> Output:
+    from skysim.apps.live.ros import McapSink, RosEncoder
+
+    return McapSink(RosEncoder(opening.live), path)
+
+
+def open_foxglove(opening: Opening, port: int) -> Output:
+    from skysim.apps.live.ros import FoxgloveSink, RosEncoder
+
+    sink = FoxgloveSink(RosEncoder(opening.live), port)
+    opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
+    return sink
+
+
 def open_tcp(opening: Opening, port: int) -> Output:
     from skysim.apps.live.wire import WireServer
 
@@ -260,18 +305,37 @@ def open_tcp(opening: Opening, port: int) -> Output:
     return server
 
 
+def open_gige(opening: Opening, _: bool) -> Output:
+    from skysim.apps.live.gige import GigeCamera
+
+    camera = GigeCamera(opening.live, opening.host)
+    risk = "" if camera.is_local else ", no token: all that reach it can control it"
+    opening.say(f"gige {camera.host}:{camera.port}{risk}")
+    return camera
+
+
 # By the option's name, in the order in which they are opened.
 OPENERS: dict[str, Callable[[Opening, Any], Output]] = {
     "folder": open_folder,
     "pipe": open_pipe,
     "http": open_http,
+    "gige": open_gige,
+    "indi": open_indi,
+    "mcap": open_mcap,
+    "foxglove": open_foxglove,
     "tcp": open_tcp,
 }
+EXTRAS = {"indi": "indi", "mcap": "ros", "foxglove": "ros"}
+TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
 
 
 def open_output(opening: Opening, name: str, value: Any) -> None:
-    """Send the flight's packets to an output, which the stack closes."""
-    output = OPENERS[name](opening, value)
+    """Send the flight's packets to an output, which the stack closes; name the extra that it needs."""
+    try:
+        output = OPENERS[name](opening, value)
+    except ModuleNotFoundError as error:
+        allowed = f"after pip install 'skysim[{EXTRAS[name]}]'"
+        raise InputError(f"--{name}", f"{error.name} is not installed", allowed) from None
     opening.live.outputs.append(output)
     opening.stack.callback(output.close)
 

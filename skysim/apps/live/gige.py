@@ -1,0 +1,317 @@
+"""A GigE Vision camera: control by GVCP, frames by GVSP, and a GenICam file that tells clients what it can do.
+
+The features are those of data/gige_camera.xml. A frame (a "block") is a leader, packets with its pixels row by row,
+and a trailer, numbered from 0; the newest are kept, so that a client can have lost packets sent again. Its timestamp
+is the clock of the simulator at mid-exposure, in nanoseconds.
+
+Pixels are little-endian. Mono16 holds the detector's numbers. Mono8 and Mono12 hold DN >> (bits - n), the highest n
+bits of a detector with more; the numbers of one with fewer bits are sent as they are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+import threading
+import time
+import uuid
+from collections import deque
+from typing import Any
+
+from skysim.apps.live.gvcp import (
+    GVCP_PORT,
+    HEARTBEAT,
+    MOST_DATAGRAM_BYTES,
+    PRIVILEGE,
+    STREAM_PORT,
+    ControlChannel,
+    GvcpStatus,
+    RefusedError,
+    Sender,
+)
+from skysim.apps.live.pacing import Live
+from skysim.apps.live.packets import Packet
+from skysim.apps.live.sinks import Sink
+from skysim.core import __version__
+from skysim.core.errors import InputError
+from skysim.core.paths import DATA
+
+# Registers of GigE Vision that the camera uses.
+ADDRESS = 0x0024
+PACKET_SIZE = 0x0D04
+PACKET_DELAY = 0x0D08  # ns
+STREAM_ADDRESS = 0x0D18
+# Its own, as in data/gige_camera.xml.
+PIXEL_FORMAT = 0xA008
+PAYLOAD_BYTES = 0xA00C
+EXPOSURE_US = 0xA010
+LONGEST_US = 0xA018
+CELSIUS = 0xA028
+ACQUISITION_MODE = 0xA038
+START = 0xA03C
+STOP = 0xA040
+TRIGGER_MODE = 0xA044
+TRIGGER = 0xA048
+XML = 0x10000
+XML_BYTES = 0x4000  # room for it
+
+PIXEL_BITS = {0x01080001: 8, 0x01100005: 12, 0x01100007: 16}  # of Mono8, Mono12, Mono16
+WRITABLE = {
+    HEARTBEAT: range(500, 600_001),
+    PRIVILEGE: range(4),
+    STREAM_PORT: range(1 << 16),
+    PACKET_SIZE: range(576, 16129),
+    PACKET_DELAY: range(10_000_001),
+    STREAM_ADDRESS: range(1 << 32),
+    PIXEL_FORMAT: PIXEL_BITS,
+    EXPOSURE_US: None,
+    ACQUISITION_MODE: range(2),
+    START: {1},
+    STOP: {1},
+    TRIGGER_MODE: range(2),
+    TRIGGER: {1},
+}
+HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
+LEADER = 1
+TRAILER = 2
+PIXELS = 3
+IMAGE = 1  # type of payload
+MOST_BLOCKS = 4  # that are kept
+POLL_S = 0.1
+
+
+class GigeCamera(Sink, ControlChannel):
+    """The camera of a live flight. The interface is that of `Output`.
+
+    Parameters
+    ----------
+    live
+        The flight; commands go into its inbox
+    host, port
+        IPv4 address or name to serve on
+
+    Raises
+    ------
+    InputError
+        For an address that cannot be bound, and a detector whose frames are not whole numbers.
+    """
+
+    ranges = (
+        (0, 0x00F8),
+        (0x0200, 0x0604),
+        (0x0900, 0x0944),
+        (0x0A00, 0x0A04),
+        (0x0D00, 0x0D20),
+        (0xA000, 0xA04C),
+        (XML, XML + XML_BYTES),
+    )
+    allowed = WRITABLE
+
+    def __init__(self, live: Live, host: str, port: int = GVCP_PORT) -> None:
+        self.live = live
+        self.scene = live.flight.lab.scene
+        if not self.scene.camera.detector.noise:
+            raise InputError(
+                "--gige", "a camera without noise has no whole numbers", "noise: true"
+            )
+        self.socket = udp_socket()
+        try:
+            self.socket.bind((host, port))
+        except OSError as error:
+            self.socket.close()
+            problem = f"cannot serve on {host}:{port}: {error.strerror or error}"
+            raise InputError("--gige", problem, "an IPv4 address that is free") from None
+        self.host, self.port = self.socket.getsockname()
+        self.is_local = self.host.startswith("127.")
+        self.broadcasts = udp_socket()
+        # Several cameras of a machine hear the same broadcast.
+        self.broadcasts.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Not every system allows it, and 0.0.0.0 hears broadcasts by itself.
+        with contextlib.suppress(OSError):
+            self.broadcasts.bind(("255.255.255.255", port))
+        self.stream = udp_socket()
+        self.stream.bind((self.host, 0))
+        self.start_s = 0.0
+        self.block = 0
+        self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
+        self.entered = live.entered
+        ControlChannel.__init__(self)
+        self.fill_memory()
+        Sink.__init__(self, "gige", self.send_frame, ())
+        threading.Thread(target=self.serve, name="gvcp", daemon=True).start()
+
+    # Registers
+
+    def fill_memory(self) -> None:
+        """Set the registers to their first values."""
+        camera = self.scene.camera
+        detector = camera.detector
+        celsius = detector.temperature_c
+        serial = uuid.getnode()
+        for address, value in {
+            0x0000: struct.pack(
+                ">IIQII12x4s32x32s32s32s48s16s15s",
+                0x00010002,  # version 1.2
+                0x80000001,  # big-endian, UTF-8
+                serial,  # address of the hardware
+                4,  # configured by link-local address
+                4,
+                socket.inet_aton(self.host),
+                b"skysim",
+                b"star camera",
+                __version__.encode(),
+                b"simulated",
+                b"%012x" % serial,
+                self.scene.name.encode(),
+            ),
+            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
+            0x0600: 1,  # network interface
+            0x0904: 1,  # stream channel
+            0x0934: 0xC0000007,  # name, serial number; resend, WRITEMEM, several registers in a command
+            HEARTBEAT: 3000,
+            0x0940: 1_000_000_000,  # ticks of the clock a second
+            PACKET_SIZE: 1500,
+            0x0D1C: self.stream.getsockname()[1],
+            0xA000: camera.width_px,
+            0xA004: camera.height_px,
+            PIXEL_FORMAT: next(code for code, n in PIXEL_BITS.items() if n >= detector.bits),
+            # Whole microseconds: the longest exposure must not be refused for its rounding.
+            LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
+            0xA020: 1 / detector.gain_e_dn,
+            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
+            0xA030: self.scene.exposure.rate_hz,
+            XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
+        }.items():
+            self.put(address, value)
+
+    def refresh(self) -> None:
+        """Update the registers whose values change."""
+        # The second byte of a format is the number of bits that a pixel takes.
+        pixel_bytes = self.memory[PIXEL_FORMAT + 1] // 8
+        self.put(PAYLOAD_BYTES, self.value(0xA000) * self.value(0xA004) * pixel_bytes)
+        # While commands wait for the flight, the registers hold what was commanded.
+        if not self.live.inbox.waiting:
+            control = self.live.flight.schedules[0].exposure_control
+            self.put(EXPOSURE_US, 1e6 * control.exposure_s)
+            self.put(TRIGGER_MODE, self.live.commands.has_triggers)
+
+    def command(self, **command: Any) -> None:
+        """Command the flight, whose statistics count a late refusal. Raises RefusedError if too many commands wait."""
+        if not self.live.inbox.put(command, lambda _: None):
+            raise RefusedError(GvcpStatus.BUSY)
+
+    def effect(self, address: int, value: Any) -> None:
+        """Do what the writing of a register means.
+
+        Raises InputError for an exposure time that is not allowed, and RefusedError for a pixel format while frames
+        are sent, and for a trigger where the schedule exposes the frames.
+        """
+        if (address == PIXEL_FORMAT and self.channels) or (
+            address == TRIGGER and not self.value(TRIGGER_MODE)
+        ):
+            raise RefusedError(GvcpStatus.WRITE_PROTECT)
+        if address == EXPOSURE_US:
+            self.command(exposure_s=self.live.commands.exposure_s(value / 1e6))
+        elif address == TRIGGER_MODE:
+            self.command(triggered=value == 1)
+        elif address == TRIGGER:
+            self.command(trigger=True)
+        elif address == START:
+            # The frames whose exposure begins from now on are sent.
+            self.start_s = self.live.flight.now_s
+            self.channels = ("frame",)
+            self.entered.set()
+        elif address == STOP:
+            self.stop()
+        elif address == STREAM_PORT:
+            # A new receiver's frames are numbered from 1 on.
+            self.block = 0
+
+    def stop(self) -> None:
+        """Send no more frames than those that wait."""
+        self.channels = ()
+
+    # Network
+
+    def serve(self) -> None:
+        """Body of the thread that answers datagrams, and notices that the application in control has gone."""
+        sockets = (self.socket, self.broadcasts)
+        with self.socket, self.broadcasts, self.stream:
+            # The sink's thread ends when the frames that wait are sent.
+            while self.thread.is_alive():
+                # An answer to a client that has gone raises OSError.
+                with contextlib.suppress(OSError):
+                    for ready in select.select(sockets, (), (), POLL_S)[0]:
+                        datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
+                        self.reply(datagram, sender, ready is self.broadcasts)
+                    self.check_heartbeat(time.monotonic())
+
+    def reply(self, datagram: bytes, sender: Sender, is_broadcast: bool) -> None:
+        """Answer a datagram, if it has an answer."""
+        # A broadcast finds a camera (command 2) and does nothing else; on the loopback address only this machine's.
+        is_foreign = self.is_local and not sender[0].startswith("127.")
+        if is_broadcast and (is_foreign or datagram[2:4] != b"\0\2"):
+            return
+        if self.host == "0.0.0.0":
+            with udp_socket() as route:
+                route.connect(sender)  # sends nothing
+                self.put(ADDRESS, socket.inet_aton(route.getsockname()[0]))
+        if answer := self.answer(datagram, sender, time.monotonic()):
+            self.socket.sendto(answer, sender)
+
+    def offer(self, packet: Packet, patient: bool) -> None:
+        """Take a frame that was exposed since the acquisition has begun; stop after a single one."""
+        header = packet.header
+        if header["t_s"] - header["exposure_s"] / 2 >= self.start_s:
+            # All modes but the first, Continuous, are of a single frame.
+            if self.value(ACQUISITION_MODE):
+                self.stop()
+            super().offer(packet, patient)
+
+    def send_frame(self, packet: Packet) -> None:
+        """Send a frame, and keep its packets."""
+        # The number of a block has 16 bits and is not 0.
+        self.block = self.block % 0xFFFF + 1
+        packets = self.packets_of(packet)
+        self.blocks.append((self.block, packets))
+        self.send(packets, 1e-9 * self.value(PACKET_DELAY))
+
+    def packets_of(self, packet: Packet) -> list[bytes]:
+        """Leader, pixels and trailer of a frame."""
+        pixel_format = self.value(PIXEL_FORMAT)
+        bits = PIXEL_BITS[pixel_format]
+        pixels = packet.pixels >> max(self.scene.camera.detector.bits - bits, 0)
+        data = pixels.astype("<u1" if bits == 8 else "<u2").tobytes()
+        height, width = pixels.shape
+        t_ns = round(1e9 * packet.header["t_s"])
+        size = self.value(PACKET_SIZE) - HEADER_BYTES
+        parts = [
+            # No offset and no padding.
+            (LEADER, struct.pack(">IQIII12x", IMAGE, t_ns, pixel_format, width, height)),
+            *((PIXELS, data[at : at + size]) for at in range(0, len(data), size)),
+            (TRAILER, struct.pack(">II", IMAGE, height)),
+        ]
+        return [
+            struct.pack(">II", self.block, kind << 24 | number) + part
+            for number, (kind, part) in enumerate(parts)
+        ]
+
+    def send(self, packets: list[bytes], delay_s: float = 0.0) -> None:
+        """Send packets to the receiver of the stream; it asks again for those that the network loses."""
+        address = socket.inet_ntoa(self.memory[STREAM_ADDRESS : STREAM_ADDRESS + 4])
+        for packet in packets:
+            with contextlib.suppress(OSError):
+                self.stream.sendto(packet, (address, self.value(STREAM_PORT)))
+            if delay_s:
+                time.sleep(delay_s)
+
+    def resend(self, block: int, first: int, last: int) -> None:
+        """Send packets again, if their frame is still kept."""
+        self.send(dict(tuple(self.blocks)).get(block, [])[first : last + 1])
+
+
+def udp_socket() -> socket.socket:
+    """A socket for datagrams."""
+    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
