@@ -151,7 +151,8 @@ def project(
     direction_cam, distance, cos_out = _directions(
         sources.place, motion, after_s, sources.normal, cam_from_lab, camera_m
     )
-    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, :, 2]
+    xy_px = _pixels(sources, optics, direction_cam, distance)
+    return xy_px, distance, cos_out, direction_cam[:, :, 2]
 
 
 def project_each(
@@ -169,11 +170,16 @@ def project_each(
     direction_cam, distance, cos_out = _directions_each(
         sources.place, NO_MOTION, NOW, sources.normal, *poses, ends
     )
-    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, 2]
+    xy_px = _pixels(sources, optics, direction_cam, distance)
+    return xy_px, distance, cos_out, direction_cam[:, 2]
 
 
-def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
-    """(..., N, 2) pixels of (..., N, 3) directions; lateral color displaces each along its radius."""
+def _pixels(
+    sources: Sources, optics: Optics, direction_cam: Floats, distance_m: Floats
+) -> Floats:
+    """(..., N, 2) pixels of (..., N, 3) directions at distances (..., N); lateral color displaces each radially."""
+    if any(optics.camera.pupil_walk_m):
+        direction_cam = optics.from_pupil(direction_cam, sources.place[:, 3] / distance_m)
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         # Lateral color moves an image along its radius, in proportion to the distance from the

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
-from skysim.camera import thermal_motion
+from skysim.camera import as_built
 from skysim.camera.detector import (
     AddedCharge,
     add_snr_and_saturation,
@@ -131,7 +131,7 @@ def exposure_of(
     window: Window,
     seeds: Seeds | None,
 ) -> Exposure:
-    """An exposure of a camera, with mount error and temperature of mid-exposure applied to mount and lens.
+    """An exposure of a camera, with mount error, temperature, sag and run-out of mid-exposure applied.
 
     Parameters
     ----------
@@ -153,8 +153,10 @@ def exposure_of(
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
-        mount, optics = thermal_motion.camera_at(scene.thermal, mount, optics, middle_s)
+        mount, optics = as_built.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
+    if scene.vehicle.is_bent:
+        mount = as_built.mount_at(scene.vehicle, mount, lab_from_body)
     return Exposure(
         index,
         window,

@@ -454,6 +454,9 @@ class DetectorConfig(ConfigModel):
         return self
 
 
+Walk = Annotated[Length, Field(ge=-0.1, le=0.1)]
+
+
 class CameraConfig(ConfigModel):
     """The true lens and detector. The section `tracker` has the assumptions of the tracker.
 
@@ -462,6 +465,9 @@ class CameraConfig(ConfigModel):
     transmission
         Transmission of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, which
         is 0 beyond its ends
+    pupil_walk
+        Displacement z = a tan^2 t + b tan^4 t of the entrance pupil along the boresight for light at the field angle t;
+        only near lights (LEDs) are displaced
     ghosts, glare
         Stray light of lights in the field
     baffle
@@ -488,6 +494,7 @@ class CameraConfig(ConfigModel):
         0.0,
     )
     principal_point_px: tuple[Number, Number] | None = None
+    pupil_walk_m: tuple[Walk, Walk] = (0.0, 0.0)
     psf: Psf = GaussianPsfConfig()
     chromatic: ChromaticConfig | None = None
     ghosts: tuple[GhostConfig, ...] = ()

@@ -19,6 +19,7 @@ axes and R the rotation from lab to camera axes:
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     common survey  : E_i = G_i dP_i + change by the lens, dP_i of LED i from the pupil; with it no lever, focal length
+    hardware as built : E_i = image position minus that by the survey
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row, minus the delay that the tracker assumes
 
@@ -85,6 +86,8 @@ def mean_root(variance_rad2: Floats) -> float:
     finite = variance_rad2[np.isfinite(variance_rad2)]
     return float(np.sqrt(finite.mean()) / ARCSEC_RAD) if len(finite) else math.nan
 
+
+AS_BUILT = "hardware as built"
 
 # Causes of the attitude error. Each returns None if the scene does not have it, else the displacements (n, 2, k) of the
 # image positions in px by k errors of unit variance that all lights share. Errors of surveyed LEDs are independent:
@@ -218,6 +221,21 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Flo
     return (velocity_px_s * delay_s[:, None])[:, :, None]
 
 
+def as_built(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
+    """Images minus those of the surveyed hardware: temperature, sag, run-out, dies of LEDs, pupil of the lens."""
+    scene = context.scene
+    walk_m = scene.camera.pupil_walk_m
+    die_m = scene.dome.led.die_m if scene.dome else ()
+    if not (scene.thermal or scene.vehicle.is_bent or any((*walk_m, *die_m))):
+        return None
+    mount = context.lab.camera.mount
+    place = context.beliefs.lights.place[view.row]
+    # From the bearing to the camera, in camera axes.
+    lever_m = mount.cam_from_body.apply(mount.camera_body_m)
+    surveyed_m = lab_from_cam.inv().apply(place[:, :3]) - place[:, 3:] * lever_m
+    return (view.xy_px - context.camera.optics.project(surveyed_m))[:, :, None]
+
+
 def displacement(view: View, shift_lab: Floats, lab_from_cam: Rotation) -> Floats:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
     shift_cam = lab_from_cam.inv().apply(shift_lab)
@@ -236,6 +254,7 @@ CAUSES = {
     "star places": star_places,
     "rolling shutter": rolling_shutter,
     "other map": other_map,
+    AS_BUILT: as_built,
 }
 UNKNOWN_TO_TRACKER = (
     "focal length",
@@ -243,6 +262,7 @@ UNKNOWN_TO_TRACKER = (
     "assumed lever",
     "rolling shutter",
     "other map",
+    AS_BUILT,
 )
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
