@@ -19,6 +19,8 @@ from skysim.camera.as_built import (
     temperature_c,
 )
 from skysim.camera.optics import Optics
+from skysim.camera.projection import beside_edges
+from skysim.camera.psf.kernel import build_kernel
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
 from skysim.results.simulate import simulate
@@ -26,10 +28,11 @@ from skysim.scene import loader
 from skysim.scene.sections.surroundings import ThermalConfig
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.checks import attitudes
-from skysim.simulation.checks.expected_error import AS_BUILT
+from skysim.simulation.checks.expected_error import AS_BUILT, pixel_response
 from skysim.simulation.checks.plan_check import plan_of
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_lab
+from tests.helpers.splatting import add_kernel
 
 MOUNT = {"mount_arcsec_k": [3.0, -2.0, 1.0]}
 LINEAR = {"kind": "linear", "start_c": 20.0, "rate_c_h": 2.0}
@@ -256,7 +259,44 @@ def test_light_enters_where_the_pupil_is_at_its_angle() -> None:
     np.testing.assert_array_equal(optics.from_pupil(u, np.zeros(4)), u)
 
 
+# The chip's edge.
+
+
+def test_images_near_an_edge_are_displaced_outward_by_an_exponential() -> None:
+    scene = loader.load(
+        "afit_simsat",
+        {"camera.detector.edge_px": "0.8", "camera.detector.edge_reach_px": "12"},
+    )
+    width = scene.camera.width_px
+    height = scene.camera.height_px
+    xy = np.array([[-0.5, height / 2], [width - 12.5, 11.5], [width / 2, height / 2]])
+    moved = beside_edges(scene.camera, xy) - xy
+    np.testing.assert_allclose(
+        moved, 0.8 * np.array([[-1, 0], [np.exp(-1), -np.exp(-1)], [0, 0]]), atol=1e-9
+    )
+
+
 # What a run does, and what `check` counts.
+
+
+def test_the_response_within_pixels_shifts_centers_as_check_counts() -> None:
+    """Against images that are drawn at even steps over a pixel."""
+    sharp = {"camera.psf": "{kind: gaussian, sigma_px: 0.4}"}
+    even = loader.load("shefex2", sharp).camera
+    scene = loader.load("shefex2", sharp | {"camera.detector.intrapixel": "0.1"})
+    lab = build_lab(scene)
+    plan = plan_of(lab, attitudes.of_frames(lab))
+    counted_px2 = pixel_response(plan.frames.used[0], plan)
+    assert counted_px2 is not None
+    moved_px = []
+    for phase in np.linspace(-0.5, 0.5, 40, endpoint=False):
+        centers = []
+        for one in (even, scene.camera):
+            patch = np.zeros((11, 11))
+            add_kernel(patch, 0, 11, 5 + phase, 5.0, 1.0, build_kernel(one.psf, one))
+            centers.append(patch.sum(axis=0) @ np.arange(11) / patch.sum())
+        moved_px.append(centers[1] - centers[0])
+    assert np.sqrt(counted_px2[0, 0, 0]) == pytest.approx(np.std(moved_px), rel=0.1)
 
 
 @pytest.mark.slow

@@ -108,6 +108,21 @@ def led_survey(view: View, lab_from_cam: Rotation, context: Context) -> Floats |
     return sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)
 
 
+def pixel_response(view: View, context: Context) -> Floats | None:
+    """Errors of centroids by the response within pixels, at random places in them.
+
+    The response 1 + p cos 2 pi x moves the center of gravity of the pixels of a Gaussian of deviation s, to first order
+    in p, by p exp(-2 pi^2 s^2) (1 / 4 pi - 2 pi s^2) sin 2 pi x. A fit errs by between half of it and all.
+    """
+    depth = context.scene.camera.detector.intrapixel
+    if not depth:
+        return None
+    # Without the pixel's own variance.
+    s2 = np.maximum(view.sigma_px**2 - 1 / 12, 0)
+    moved_px = depth * np.exp(-2 * np.pi**2 * s2) * (1 / (4 * np.pi) - 2 * np.pi * s2)
+    return (moved_px**2 / 2)[:, None, None] * np.eye(2)
+
+
 def survey_setup(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
     """Errors of the set-up of the survey's instrument, common to all LEDs."""
     instrument = context.scene.tracker.survey.instrument
@@ -222,11 +237,12 @@ def rolling_shutter(view: View, lab_from_cam: Rotation, context: Context) -> Flo
 
 
 def as_built(view: View, lab_from_cam: Rotation, context: Context) -> Floats | None:
-    """Images minus those of the surveyed hardware: temperature, sag, run-out, dies of LEDs, pupil of the lens."""
+    """Images minus those of the surveyed hardware: temperature, sag, run-out, dies, pupil of the lens, chip's edge."""
     scene = context.scene
-    walk_m = scene.camera.pupil_walk_m
+    camera = scene.camera
     die_m = scene.dome.led.die_m if scene.dome else ()
-    if not (scene.thermal or scene.vehicle.is_bent or any((*walk_m, *die_m))):
+    shifts = (*camera.pupil_walk_m, *die_m, camera.detector.edge_px)
+    if not (scene.thermal or scene.vehicle.is_bent or any(shifts)):
         return None
     mount = context.lab.camera.mount
     place = context.beliefs.lights.place[view.row]
@@ -269,6 +285,7 @@ OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
 # More causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
 LED_SURVEY = "LED survey"
+PIXEL_RESPONSE = "response within pixels"
 SOLVER = "solver"
 EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 
@@ -459,7 +476,7 @@ def solver_error(view: View, lab_from_cam: Rotation, context: Context) -> Floats
 
 def expected(views: list[View], attitudes: CheckedAttitudes, context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
-    names = (CENTROIDS, LED_SURVEY, *CAUSES, SOLVER)
+    names = (CENTROIDS, LED_SURVEY, PIXEL_RESPONSE, *CAUSES, SOLVER)
     cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
     cam_from_body = context.lab.camera.mount.cam_from_body
     for a, view in enumerate(views):
@@ -486,9 +503,13 @@ def causes_at(view: View, lab_from_cam: Rotation, context: Context) -> dict[str,
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. and 3. Covariances by each cause, and the solver's own error squared.
     found = {CENTROIDS: of_independent(gain, centroid_variance(view, context))}
-    survey_px2 = led_survey(view, lab_from_cam, context)
-    if survey_px2 is not None:
-        found[LED_SURVEY] = of_independent(gain, survey_px2)
+    independent = {
+        LED_SURVEY: led_survey(view, lab_from_cam, context),
+        PIXEL_RESPONSE: pixel_response(view, context),
+    }
+    for name, covariance_px2 in independent.items():
+        if covariance_px2 is not None:
+            found[name] = of_independent(gain, covariance_px2)
     for name, cause in CAUSES.items():
         shift_px = cause(view, lab_from_cam, context)
         if shift_px is not None:
