@@ -36,6 +36,9 @@ VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {
 }
 
 
+PUPIL_ROUNDS = 4
+
+
 @dataclass(frozen=True, slots=True)
 class Optics:
     """Lens and image geometry of a camera, in camera axes +x right, +y down, +z boresight.
@@ -90,6 +93,26 @@ class Optics:
             x, y = distort(self.camera.distortion, self.fold_r, x, y)
         xy_px = np.stack([x * focal + center[0], y * focal + center[1]], axis=-1)
         return xy_px if self.scale is None else center + self.scale * (xy_px - center)
+
+    def from_pupil(self, direction_cam: Floats, nearness: Floats) -> Floats:
+        """Vectors (..., 3) along which lights at unit directions from the nominal pupil enter the real one.
+
+        The entrance pupil of light at the field angle t is z = a tan^2 t + b tan^4 t farther along the boresight (pupil
+        aberration; Kingslake & Johnson 2010, Lens Design Fundamentals, 2nd ed., ch. 8). So a light at d u is in the
+        direction u - (z / d) e_z, whose angle t decides z; a few rounds solve for it, each z / d times nearer.
+
+        Parameters
+        ----------
+        nearness
+            (...,) 1 / d in 1/m, 0 for stars
+        """
+        a, b = self.camera.pupil_walk_m
+        seen = direction_cam.copy()
+        across2 = direction_cam[..., 0] ** 2 + direction_cam[..., 1] ** 2
+        for _ in range(PUPIL_ROUNDS):
+            tangent2 = across2 / seen[..., 2] ** 2
+            seen[..., 2] = direction_cam[..., 2] - nearness * tangent2 * (a + b * tangent2)
+        return seen
 
     def throughput(self, cos_field: Floats) -> Floats:
         """Relative throughput at field angles theta of any shape: cos(theta) V(theta), zero behind the camera.

@@ -13,6 +13,7 @@ from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Ints, Mount, Sources, StarSources, Trajectory
+from skysim.scene.sections.camera import CameraConfig
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 
 # Number of poses in an exposure.
@@ -151,7 +152,8 @@ def project(
     direction_cam, distance, cos_out = _directions(
         sources.place, motion, after_s, sources.normal, cam_from_lab, camera_m
     )
-    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, :, 2]
+    xy_px = _pixels(sources, optics, direction_cam, distance)
+    return xy_px, distance, cos_out, direction_cam[:, :, 2]
 
 
 def project_each(
@@ -169,18 +171,39 @@ def project_each(
     direction_cam, distance, cos_out = _directions_each(
         sources.place, NO_MOTION, NOW, sources.normal, *poses, ends
     )
-    return _pixels(sources, optics, direction_cam), distance, cos_out, direction_cam[:, 2]
+    xy_px = _pixels(sources, optics, direction_cam, distance)
+    return xy_px, distance, cos_out, direction_cam[:, 2]
 
 
-def _pixels(sources: Sources, optics: Optics, direction_cam: Floats) -> Floats:
-    """(..., N, 2) pixels of (..., N, 3) directions; lateral color displaces each along its radius."""
+def _pixels(
+    sources: Sources, optics: Optics, direction_cam: Floats, distance_m: Floats
+) -> Floats:
+    """(..., N, 2) pixels of (..., N, 3) directions at distances (..., N); lateral color displaces each radially."""
+    if any(optics.camera.pupil_walk_m):
+        direction_cam = optics.from_pupil(direction_cam, sources.place[:, 3] / distance_m)
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
         # Lateral color moves an image along its radius, in proportion to the distance from the
         # center.
         camera = optics.camera
         xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
-    return xy_px
+    return beside_edges(optics.camera, xy_px)
+
+
+def beside_edges(camera: CameraConfig, xy_px: Floats) -> Floats:
+    """(..., 2) pixels that collect the light at xy_px (..., 2): x + A (exp(-d_high / L) - exp(-d_low / L)).
+
+    The field of the guard ring bends the paths of charge at the distances d from a chip's edges (Plazas, Bernstein &
+    Sheldon 2014, PASP 126, 750: an exponential of 1 px and more).
+    """
+    detector = camera.detector
+    if not detector.edge_px:
+        return xy_px
+    from_low_px = xy_px + 0.5
+    from_high_px = np.array([camera.width_px, camera.height_px]) - from_low_px
+    reach_px = detector.edge_reach_px
+    bend = np.exp(-np.abs(from_high_px) / reach_px) - np.exp(-np.abs(from_low_px) / reach_px)
+    return xy_px + detector.edge_px * bend
 
 
 @jit

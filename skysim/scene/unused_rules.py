@@ -483,6 +483,12 @@ RULES = (
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
     ),
     Rule(
+        ("camera.pupil_walk",),
+        without_dome,
+        "light from infinity passes any place of the pupil alike",
+        "light of kind dome",
+    ),
+    Rule(
         ("thermal.dome_ppm_k", "thermal.anchor_height", "thermal.creep"),
         without_dome,
         "there is no dome to move",

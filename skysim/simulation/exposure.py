@@ -4,7 +4,7 @@
 2. Draw extended light (camera/glow).
 3. Draw points and discs along each path through the lens (camera/render.py, camera/discs), then the lens's glare.
    A color camera draws 2. and 3. once for the pixels of each color.
-4. Add the charge smear of the shutter (camera/detector).
+4. Add the charge smear of the shutter, and let charge repel charge (camera/detector).
 5. Convert the light to digital numbers: noise, charge, analog-to-digital conversion (camera/detector).
 6. Collect the truth of the frame.
 """
@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.trackers.pipeline import Clock
-from skysim.camera import thermal_motion
+from skysim.camera import as_built
 from skysim.camera.detector import (
     AddedCharge,
     add_snr_and_saturation,
     expose,
+    repel,
     saturation_dn,
     smear,
 )
@@ -94,8 +95,9 @@ def render_frame(
         draw_glow(light_e, beam, window.exposure_s)
         # 3. Points, discs, glare.
         sources = draw_lights(light_e, beam, exposure)
-    # 4. Smear.
+    # 4. Smear, and charge that repels charge.
     smear(light_e, window.exposure_s, detector.shutter, added)
+    repel(light_e, detector.config)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, detector)
     clock.lap("render")
@@ -131,7 +133,7 @@ def exposure_of(
     window: Window,
     seeds: Seeds | None,
 ) -> Exposure:
-    """An exposure of a camera, with mount error and temperature of mid-exposure applied to mount and lens.
+    """An exposure of a camera, with mount error, temperature, sag and run-out of mid-exposure applied.
 
     Parameters
     ----------
@@ -153,8 +155,10 @@ def exposure_of(
     if camera.mount_error is not None:
         mount = replace(mount, cam_from_body=camera.mount_error * mount.cam_from_body)
     if scene.thermal is not None:
-        mount, optics = thermal_motion.camera_at(scene.thermal, mount, optics, middle_s)
+        mount, optics = as_built.camera_at(scene.thermal, mount, optics, middle_s)
     lab_from_body = trajectory.attitude_at(middle_s)
+    if scene.vehicle.is_bent:
+        mount = as_built.mount_at(scene.vehicle, mount, lab_from_body)
     return Exposure(
         index,
         window,

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.camera import thermal_motion
+from skysim.camera import as_built
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import AIR_CURRENT, IMU, random_stream
@@ -306,8 +306,7 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     error = camera.mount_error or Rotation.identity()
     config = camera.scene.thermal
     turned = [
-        (thermal_motion.turned(config, t) if config else Rotation.identity()) * error
-        for t in t_s
+        (as_built.turned(config, t) if config else Rotation.identity()) * error for t in t_s
     ]
     return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
 

@@ -1,6 +1,7 @@
 """The air over a site at a time: refraction, extinction, scintillation and seeing of stars and bodies."""
 
 import datetime
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,6 +21,7 @@ from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors,
 from skysim.sources.refraction import (
     Refraction,
     Weather,
+    refractivity,
     standard_pressure_hpa,
     standard_temperature_c,
 )
@@ -50,6 +52,7 @@ TOP_M = 25_000.0
 LAYERS = 20
 FREQUENCIES = 300
 FREQUENCY_1_M = 1e-2, 3e3  # lowest and highest
+B_V = np.linspace(-0.3, 1.7, 21)  # colors at which the dispersion is computed
 # Nodes of the table.
 AIR_MASSES = np.geomspace(1.0, 40.0, 12)
 EXPOSURES_S = np.geomspace(1e-5, 1e2, 22)
@@ -179,6 +182,8 @@ class Air:
         (N,) ascending numbers of the catalog's stars, and their colors
     wavelength_m
         Wavelength of scintillation: the mean of a G2 star's photo-electrons
+    dispersion
+        Refraction at the colors B_V, over that of the weather's wavelength
     """
 
     config: AirConfig
@@ -187,6 +192,7 @@ class Air:
     star_id: Ints
     b_v: Floats
     wavelength_m: float
+    dispersion: Floats
 
     @classmethod
     def from_config(
@@ -195,8 +201,20 @@ class Air:
         """The air over a site for a catalog's stars and a chip's band."""
         order = np.argsort(stars.hip)
         b_v = complete_colors(stars.b_v, stars.v_i)[0][order]
-        refraction = Refraction(weather_of(config, site, band))
-        return cls(config, site, refraction, stars.hip[order], b_v, mean_wavelength_m(band))
+        weather = weather_of(config, site, band)
+        relative = np.ones(len(B_V))
+        if config.dispersion:
+            own = mean_of(band, refractivity, temperature_k(B_V, np.nan))
+            relative = own / refractivity(weather.wavelength_m)
+        return cls(
+            config,
+            site,
+            Refraction(weather),
+            stars.hip[order],
+            b_v,
+            mean_wavelength_m(band),
+            relative,
+        )
 
     def at(self, time: datetime.datetime) -> "Sky":
         """The sky at a time."""
@@ -247,7 +265,8 @@ class Sky:
     def points_seen(self, lights: Sources) -> Sources:
         """Lights at infinity, raised by refraction and dimmed by extinction, in their order; motions are unchanged."""
         b_v = self.air.b_v_of(lights.id)
-        directions = self.air.refraction.apparent(lights.place[:, :3], self.zenith)
+        relative = np.interp(b_v, B_V, self.air.dispersion)
+        directions = self.air.refraction.apparent(lights.place[:, :3], self.zenith, relative)
         passed = transmission(self.air_mass(directions), self.air.extinction_mag(b_v))
         place = np.column_stack([directions, lights.place[:, 3]])
         return replace(lights, place=place, strength=lights.strength * passed)
@@ -325,10 +344,14 @@ def weather_of(config: AirConfig, site: SiteConfig, band: Band) -> Weather:
 
 
 def mean_wavelength_m(band: Band) -> float:
-    """Mean wavelength of a G2 star's photo-electrons: int lambda n R d lambda / int n R d lambda."""
-    sun_k = temperature_k(*SUN)
-    total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, sun_k))
+    """Mean wavelength of a G2 star's photo-electrons."""
+    return float(mean_of(band, lambda wavelength_m: wavelength_m, temperature_k(*SUN)))
+
+
+def mean_of(band: Band, value: Callable[[Floats], Floats], kelvin: Floats) -> Floats:
+    """Mean of a function f of the wavelength over black bodies' photo-electrons: int f n R / int n R."""
+    total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, kelvin))
     weighted = band.integral(
-        lambda wavelength_m: wavelength_m * black_body_v0(wavelength_m, sun_k)
+        lambda wavelength_m: value(wavelength_m) * black_body_v0(wavelength_m, kelvin)
     )
-    return float(weighted / total)
+    return weighted / total

@@ -61,6 +61,12 @@ def standard_temperature_c(height_m: float) -> float:
     return 15.0 - LAPSE_K_M * height_m
 
 
+def refractivity(wavelength_m: float | Floats) -> Floats:
+    """n - 1 of dry air at 0 deg C and the standard pressure, by its dispersion (IAG 1999)."""
+    um2 = (np.asarray(wavelength_m) * 1e6) ** 2
+    return 1e-6 * (287.6155 + (1.62887 + 0.0136 / um2) / um2)
+
+
 @dataclass(frozen=True, slots=True)
 class Atmosphere:
     """A troposphere with a constant lapse rate and water vapor, and an isothermal stratosphere.
@@ -99,10 +105,10 @@ class Atmosphere:
         )
         scale_per_k = gravity * DRY_KG_KMOL / GAS_J_KMOL_K
         gamma = scale_per_k / LAPSE_K_M
-        # Refractivity per hPa at 1 K, by the dispersion of dry air (IAG 1999).
-        um2 = (weather.wavelength_m * 1e6) ** 2
-        refractivity = 287.6155 + (1.62887 + 0.0136 / um2) / um2
-        per_hpa = refractivity * 1e-6 * ZERO_CELSIUS_K / STANDARD_PRESSURE_HPA
+        # Refractivity per hPa at 1 K.
+        per_hpa = (
+            float(refractivity(weather.wavelength_m)) * ZERO_CELSIUS_K / STANDARD_PRESSURE_HPA
+        )
         # Pressure of saturated vapor, and that of the vapor at this humidity.
         saturated_hpa = 10 ** ((0.7859 + 0.03477 * t_c) / (1 + 0.00412 * t_c))
         saturated_hpa *= 1 + p_hpa * (4.5e-6 + 6e-10 * t_c**2)
@@ -206,7 +212,9 @@ class Refraction:
         """(N,) angles by which sources appear nearer to the zenith, at (N,) zenith distances without air."""
         return self.spline(np.minimum(zenith_rad, self.last_rad))
 
-    def apparent(self, directions: Floats, zenith: Floats) -> Floats:
+    def apparent(
+        self, directions: Floats, zenith: Floats, scale: float | Floats = 1.0
+    ) -> Floats:
         """Turn directions toward the zenith, each in its vertical plane.
 
         Parameters
@@ -215,6 +223,8 @@ class Refraction:
             (N, 3) unit vectors as without air
         zenith
             (3,) unit vector in the same axes
+        scale
+            (N,) refractivities for the sources' colors, over that for the weather's wavelength
 
         Returns
         -------
@@ -224,6 +234,6 @@ class Refraction:
         cosine = directions @ zenith
         across = zenith - cosine[:, None] * directions
         sine = np.linalg.norm(across, axis=1)
-        bending = self.bending_rad(np.arctan2(sine, cosine))
+        bending = scale * self.bending_rad(np.arctan2(sine, cosine))
         along = np.sin(bending) / np.maximum(sine, 1e-12)
         return np.cos(bending)[:, None] * directions + along[:, None] * across

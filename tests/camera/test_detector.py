@@ -510,3 +510,47 @@ def test_a_source_is_saturated_where_its_brightest_pixel_is(
         seen(peak_e, 1.0, peak_e), spot(peak_e).astype(np.float32), 0.05, made
     )
     assert sources.saturated[0] == full
+
+
+# Charge that repels charge.
+
+
+def test_charge_moves_over_the_boundaries_and_none_is_lost() -> None:
+    """Boundary by boundary: the brighter of two pixels loses a (q - p) (q + p) / 2 to the other."""
+    shift_per_e = 2e-6
+    chip = detector_with((16, 17), full_well_e=1e5, brighter_fatter_per_e=shift_per_e)
+    before = np.random.default_rng(4).uniform(0, 6e4, (16, 17))
+    light_e = before.copy()
+    detector.repel(light_e, chip.config)
+    expected = before.copy()
+    for here, there in [
+        *(((j, i), (j, i + 1)) for j in range(16) for i in range(16)),
+        *(((j, i), (j + 1, i)) for j in range(15) for i in range(17)),
+    ]:
+        flow_e = (
+            shift_per_e * (before[here] - before[there]) * (before[here] + before[there]) / 2
+        )
+        expected[here] -= flow_e
+        expected[there] += flow_e
+    np.testing.assert_allclose(light_e, expected, rtol=1e-12)
+    assert light_e.sum() == pytest.approx(before.sum(), rel=1e-12)
+
+
+def test_a_bright_star_is_wider_than_a_faint_one() -> None:
+    """By the law's own second moment: a sum of squares of the light, over the light."""
+    chip = detector_with((21, 21), full_well_e=1e5, brighter_fatter_per_e=1e-6)
+    y, x = np.mgrid[-10:11, -10:11]
+    light = np.exp(-(x**2 + y**2) / (2 * 1.1**2))
+    widths = []
+    for peak_e in (100.0, 6e4):
+        light_e = peak_e * light
+        detector.repel(light_e, chip.config)
+        widths.append((light_e * x**2).sum() / light_e.sum())
+    # The Laplacian moves a moment of x^2 by 2 for each unit of q^2 a / 2.
+    wider = 1e-6 * 6e4 * (light**2).sum() / light.sum()
+    assert widths[1] - widths[0] == pytest.approx(wider, rel=0.01)
+
+
+def test_wells_that_would_lose_more_than_they_hold_are_refused() -> None:
+    with pytest.raises(ValueError, match="brighter_fatter_per_e"):
+        detector_with(full_well_e=1e5, brighter_fatter_per_e=1e-5)

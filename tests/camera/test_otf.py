@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import special
+from scipy.integrate import simpson
 from scipy.signal import fftconvolve
 
 from skysim.camera.psf.kernel import (
@@ -479,3 +480,29 @@ def test_a_file_that_is_not_a_psf_is_refused_in_one_line(
     assert message.startswith("camera.psf.file: ")
     assert said in message
     assert "\n" not in message
+
+
+# The response within a pixel.
+
+
+@pytest.mark.parametrize("sigma_px", [0.25, 0.45])
+def test_an_image_on_pixels_with_a_response_is_its_integral(sigma_px: float) -> None:
+    """Each pixel has the integral of the Gaussian times 1 + p cos 2 pi u along x and along y, by Simpson's rule."""
+    depth = 0.4
+    lens = camera(psf={"kind": "gaussian", "sigma_px": sigma_px})
+    chip = lens.detector.model_copy(update={"intrapixel": depth})
+    lens = lens.model_copy(update={"detector": chip})
+    image = build_kernel(lens.psf, lens)
+    u = np.linspace(-0.5, 0.5, 401)
+    response = 1 + depth * np.cos(2 * np.pi * u)
+
+    def along(place: float) -> Floats:
+        """(9,) integrals over the pixels of one axis."""
+        x = np.arange(9)[:, None] + u - place
+        gauss = np.exp(-(x**2) / (2 * sigma_px**2)) / (sigma_px * math.sqrt(2 * np.pi))
+        return simpson(gauss * response, u, axis=1)
+
+    for dx, dy in PLACES:
+        expected = np.outer(along(4 + dy), along(4 + dx))
+        drawn = draw(image, 4 + dx, 4 + dy, 9)
+        np.testing.assert_allclose(drawn, expected, atol=1e-3)

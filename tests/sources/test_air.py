@@ -6,6 +6,7 @@ import datetime
 from dataclasses import replace
 from typing import Any
 
+import erfa
 import numpy as np
 import pytest
 from astropy import units as u
@@ -227,3 +228,59 @@ def test_refraction_uses_the_band_s_wavelength() -> None:
     )
     narrow = Band(np.array([500e-9, 501e-9]), np.ones(2))
     assert mean_wavelength_m(narrow) == pytest.approx(500.5e-9, abs=0.1e-9)
+
+
+# Refraction by color.
+
+
+def test_stars_are_refracted_by_the_mean_of_their_colors() -> None:
+    """ERFA's constant A of refraction at a wavelength, over that of the weather, averaged over Planck's photons."""
+    time = datetime.datetime(2012, 6, 24, 23, 10)
+    place = SITES[0]
+    keys = {"pressure_hpa": 1000.0, "temperature_c": 10.0, "humidity": 0.0}
+    one = air_at(place, dispersion=True, **keys)
+    nm = np.linspace(400, 1000, 601)
+    weather_nm = 1e9 * mean_wavelength_m(BAND)
+
+    def constant(wavelength_nm: float) -> float:
+        return float(erfa.refco(1000.0, 10.0, 0.0, wavelength_nm / 1e3)[0])
+
+    relative = np.array([constant(each) for each in nm]) / constant(weather_nm)
+    for b_v, kelvin in ((0.0, 9700.0), (1.5, 3585.0)):
+        photons = nm**-4.0 / np.expm1(1.43878e7 / (nm * kelvin))
+        expected = (relative * photons).sum() / photons.sum()
+        own = np.interp(b_v, starlight.B_V, one.dispersion)
+        assert own - 1 == pytest.approx(expected - 1, abs=1e-4)
+    # A blue star at 45 deg is raised by half an arcsecond more than a red one.
+    blue, red = np.interp([0.0, 1.5], starlight.B_V, one.dispersion)
+    sky = one.at(time)
+    halfway = (sky.axes[0] + sky.axes[2]) / np.sqrt(2)
+    apart = [
+        one.refraction.apparent(halfway[None], sky.zenith, scale)[0] for scale in (blue, red)
+    ]
+    assert 0.2 < np.arccos(apart[0] @ apart[1]) / ARCSEC < 1.0
+    assert np.all(air_at(place, **keys).dispersion == 1)
+
+
+def test_a_star_of_the_catalog_is_refracted_by_its_own_color() -> None:
+    """The light of Betelgeuse is raised less than that of Rigel, in proportion to its refraction."""
+    time = datetime.datetime(2012, 12, 24, 23, 10)
+    stars_of = catalog.read_for("x", "hipparcos_hp6.5")
+    row = np.flatnonzero(np.isin(stars_of.hip, (27989, 24436)))
+    # In their places at the epoch, high over the site or not: only the ratio is compared.
+    ra = stars_of.ra_rad[row]
+    dec = stars_of.dec_rad[row]
+    place = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    chosen = stars.steady_points(stars_of.hip[row], place, np.ones(2), np.zeros(2))
+    with_color = air_at(SITES[0], dispersion=True).at(time)
+    without = air_at(SITES[0]).at(time)
+    for n, hip in enumerate(chosen.id.tolist()):
+        true = chosen.place[n, :3]
+        raised = [
+            np.arccos(true @ sky.points_seen(chosen).place[n, :3])
+            for sky in (with_color, without)
+        ]
+        own = np.interp(
+            with_color.air.b_v_of(np.array([hip])), starlight.B_V, with_color.air.dispersion
+        )
+        assert raised[0] / raised[1] == pytest.approx(own[0], rel=1e-5)

@@ -23,6 +23,7 @@ import numpy as np
 from scipy import special
 
 from skysim.camera.psf.kernel import FADE_PX, PsfModel, passband, reach_px, softening_sigma_px
+from skysim.camera.psf.otf import pixel
 from skysim.camera.psf.splat import cubic, reached
 from skysim.core.jit import jit
 from skysim.core.types import Floats, Singles
@@ -84,7 +85,8 @@ def ellipse_box(psf: Psf, camera: CameraConfig, half: int) -> EllipseBox:
     f = np.arange(waves) / size
     # fy > 0 represents -fy too; fx = 0 is in both halves.
     weight = np.outer(np.where(f > 0, 1.0, 0.5), np.where(f > 0, 2.0, 1.0)) / size**2
-    weight *= np.outer(np.sinc(f), np.sinc(f))
+    one_axis = pixel(camera.detector.intrapixel, f)
+    weight *= np.outer(one_axis, one_axis)
     # Lens and pixel at (fx, fy) and at (-fx, fy).
     softening_px = softening_sigma_px(passed, f[-1])
     spectra = [weight * lens.otf(fx[:, None], f[None, :], softening_px) for fx in (f, -f)]

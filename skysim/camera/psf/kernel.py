@@ -23,7 +23,16 @@ import scipy
 from scipy import fft, special
 
 from skysim.camera.optics import Optics
-from skysim.camera.psf.otf import EXTENT, NOT_ROUND, PSFS, WINGED, Otf, blur, uniform_disk
+from skysim.camera.psf.otf import (
+    EXTENT,
+    NOT_ROUND,
+    PSFS,
+    WINGED,
+    Otf,
+    blur,
+    pixel,
+    uniform_disk,
+)
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, cubic
 from skysim.core.types import Floats, Singles
 from skysim.scene.sections.camera import CameraConfig, Psf
@@ -117,7 +126,7 @@ def build_kernel(
         for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
     )
     model = PsfModel(psf, camera, sigma_px, tuple(filter(None, radii_px)))
-    if psf.kind == "gaussian" and not model.radii_px:
+    if psf.kind == "gaussian" and not (camera.detector.intrapixel or model.radii_px):
         return gaussian_kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)))
     round_image = None if psf.kind in NOT_ROUND else round_kernel(model)
     return round_image or grid_kernel(model)
@@ -213,7 +222,7 @@ class FourierBesselSeries:
 
 @lru_cache(maxsize=8)
 def fourier_bessel_series(
-    box_px: float, reach_px: float, highest: float, per_px: int
+    depth: float, box_px: float, reach_px: float, highest: float, per_px: int
 ) -> FourierBesselSeries:
     """The series up to a frequency; it does not depend on the image.
 
@@ -225,7 +234,8 @@ def fourier_bessel_series(
     f = zeros / (2 * np.pi * box_px)
     # The pixel's harmonics P_n: its transfer function sinc(fx) sinc(fy) on circles, projected on cos n theta.
     angle = np.arange(256) * 2 * np.pi / 256
-    square = np.sinc(f[..., None] * np.cos(angle)) * np.sinc(f[..., None] * np.sin(angle))
+    f_circle = f[..., None]
+    square = pixel(depth, f_circle * np.cos(angle)) * pixel(depth, f_circle * np.sin(angle))
     weight = np.empty_like(f)
     matrix = np.empty((len(f), len(r), f.shape[1]), np.float32)
     x = np.arange(0, zeros.max() + 1, 0.05)
@@ -259,7 +269,8 @@ def round_kernel(model: PsfModel) -> Kernel | None:
     highest = min(highest_passed, 16.0, max(MAX_TERMS / 2 / box_px, 0.5))
     # A series of low frequencies is summed at every fourth radius.
     coarse = 4 if highest <= 4 else 1
-    terms = fourier_bessel_series(box_px, table_px, highest, PER_PX // coarse)
+    depth = model.camera.detector.intrapixel
+    terms = fourier_bessel_series(depth, box_px, table_px, highest, PER_PX // coarse)
     # 2. Sum the series.
     softening_px = softening_sigma_px(highest_passed, highest)
     spectrum = model.otf(terms.f, np.zeros(1), softening_px) * terms.weight
@@ -331,7 +342,8 @@ def grid_kernel(model: PsfModel) -> Kernel:
 
     1. S is a power of two from 4 to 128: more than seven times the highest frequency, but less for a large image.
     2. Transform the product of the transfer functions to an image of S samples per pixel.
-    3. Sort the samples: one table of pixels for each sub-pixel position, each normalized to 1.
+    3. Sort the samples: one table of pixels for each sub-pixel position, each normalized to 1, all together if the
+       response varies within a pixel.
     """
     # 1. Number of samples.
     half = int(np.ceil(model.reach_px()))
@@ -347,15 +359,19 @@ def grid_kernel(model: PsfModel) -> Kernel:
     fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
     fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
     softening_px = softening_sigma_px(highest_passed, 0.4 * samples)
-    otf = model.otf(fx, fy, softening_px) * np.sinc(fx) * np.sinc(fy)
+    otf = model.otf(fx, fy, softening_px)
+    depth = model.camera.detector.intrapixel
+    otf = otf * pixel(depth, fx) * pixel(depth, fy)
     image = fft.irfft2(otf, s=(samples * box,) * 2)
-    pixel = np.arange(size) - half
+    place = np.arange(size) - half
     position = np.arange(-1, samples + 2)
     # 3. Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.
-    index = (pixel * samples + samples // 2 - position[:, None]) % (samples * box)
+    index = (place * samples + samples // 2 - position[:, None]) % (samples * box)
     # Negative ringing is cut.
     tables = np.maximum(image[index[:, None, :, None], index[None, :, None, :]], 0)
-    normalized = (tables / tables.sum(axis=(2, 3), keepdims=True)).astype(np.float32)
+    light = tables.sum(axis=(2, 3), keepdims=True)
+    # The response within a pixel makes the light depend on the position.
+    normalized = (tables / (light[1:-2, 1:-2].mean() if depth else light)).astype(np.float32)
     peak = normalized.max()
     slope = max(np.abs(np.diff(normalized, axis=axis)).max() for axis in (0, 1)) * samples
     return Kernel(GRID, 0.0, normalized, size / 2, float(peak), float(0.5 * peak / slope))

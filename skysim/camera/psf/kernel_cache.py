@@ -173,7 +173,7 @@ def source_kernels(
     # 2. Ellipses.
     disk = ellipses(keys, camera, disks, axes_px, sizes)
     # 3. Gaussians need no shared table, so all have the key of sharp points.
-    gaussian = camera.psf.kind == "gaussian"
+    gaussian = camera.psf.kind == "gaussian" and not camera.detector.intrapixel
     if gaussian:
         keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
     kernels = look_up(camera, keys, disk)

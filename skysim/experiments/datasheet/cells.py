@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from skysim.camera import thermal_motion
+from skysim.camera import as_built
 from skysim.core.constants import DAY_S, HOUR_S
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
@@ -165,7 +165,7 @@ def states_c(scene: Scene, count: int) -> list[float]:
         hours = np.linspace(history.hours[0], history.hours[-1], count)
     if history.kind == "steady":
         hours = hours[:1]
-    return [float(thermal_motion.TEMPERATURES[history.kind](history, hour)) for hour in hours]
+    return [float(as_built.TEMPERATURES[history.kind](history, hour)) for hour in hours]
 
 
 class Designer:

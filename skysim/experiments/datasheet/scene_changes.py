@@ -1,6 +1,7 @@
 """Changes of a scene that a datasheet measures: what would lower the error, and disturbances."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from skysim.experiments.study.factors import Settings
@@ -62,6 +63,18 @@ def causes(scene: Scene) -> Changes:
     if scene.thermal:
         reference = {"kind": "steady", "temperature_c": scene.thermal.reference_c}
         changes["the temperature held"] = {"thermal.temperature": reference}
+    die_m = scene.dome.led.die_m if scene.dome else ()
+    built: dict[str, tuple[str, Sequence[float], Any]] = {
+        "the pupil fixed": ("camera.pupil_walk", camera.pupil_walk_m, 2 * ["0 mm"]),
+        "dies centered": ("light.led.die", die_m, 3 * ["0 mm"]),
+        "no sag": ("vehicle.sag_arcsec", scene.vehicle.sag_arcsec, [0, 0]),
+        "a round ball": ("vehicle.runout", scene.vehicle.runout_m, 3 * ["0 mm"]),
+        "even pixels": ("camera.detector.intrapixel", [chip.intrapixel], 0),
+        "straight edges": ("camera.detector.edge_px", [chip.edge_px], 0),
+    }
+    for name, (key, values, ideal) in built.items():
+        if any(values):
+            changes[name] = {key: ideal}
     fainter_mag = scene.tracker.limit_mag + 0.5
     if fainter_mag <= catalog_end_mag(scene):
         changes["half a magnitude more stars known"] = {"tracker.limit_mag": fainter_mag}

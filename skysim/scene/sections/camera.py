@@ -347,6 +347,9 @@ Transmission = Annotated[
 ]
 
 
+MOST_SHIFT_PX = 0.5  # of a boundary: beyond it charge would be negative
+
+
 class DetectorConfig(ConfigModel):
     """The detector and its electronics, in the order of the signal path. A parameter can switch off each effect.
 
@@ -383,6 +386,12 @@ class DetectorConfig(ConfigModel):
         Standard deviation of the fixed offsets of the columns
     nonlinearity
         Fraction of the signal that is missing at full well: e (1 - nonlinearity e / full_well)
+    intrapixel
+        Amplitude p of the response 1 + p cos 2 pi u along each axis of a pixel, whose center is at u = 0
+    brighter_fatter_per_e
+        Displacement of the boundary of two pixels, in pixels, per electron of the difference of their charges
+    edge_px, edge_reach_px
+        Outward displacement of images at the chip's edge, which falls by e per edge_reach_px
     noise
         False gives the expected value, not rounded, with fixed pattern and transfer loss, but without particles,
         full-well limit, nonlinearity and converter range
@@ -411,6 +420,10 @@ class DetectorConfig(ConfigModel):
     gain_e_dn: Annotated[Number, Field(ge=1e-6, le=1e9)]
     offset_dn: NotNegative = 0.0
     nonlinearity: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
+    intrapixel: Annotated[Number, Field(ge=0, lt=1)] = 0.0
+    brighter_fatter_per_e: Annotated[Number, Field(ge=0, le=1e-3)] = 0.0
+    edge_px: Annotated[Number, Field(ge=-10, le=10)] = 0.0
+    edge_reach_px: Annotated[Number, Field(gt=0, le=1000)] = 10.0
     bits: Annotated[int, Field(ge=1, le=16)]
     noise: bool = True
 
@@ -434,10 +447,19 @@ class DetectorConfig(ConfigModel):
                 f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
                 "up to 40",
             )
+        if self.brighter_fatter_per_e * self.full_well_e > MOST_SHIFT_PX:
+            raise InputError(
+                "brighter_fatter_per_e",
+                f"a full well displaces its boundaries by more than {MOST_SHIFT_PX} px",
+                f"up to {MOST_SHIFT_PX / self.full_well_e:.2g}",
+            )
         if self.offset_dn >= 2**self.bits:
             raise InputError(
                 "offset_dn", f"{self.offset_dn:g} is beyond the range of {self.bits} bits"
             )
+
+
+Walk = Annotated[Length, Field(ge=-0.1, le=0.1)]
 
 
 class CameraConfig(ConfigModel):
@@ -448,6 +470,9 @@ class CameraConfig(ConfigModel):
     transmission
         Transmission of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, which
         is 0 beyond its ends
+    pupil_walk
+        Displacement z = a tan^2 t + b tan^4 t of the entrance pupil along the boresight for light at the field angle t;
+        only near lights (LEDs) are displaced
     ghosts, glare
         Stray light of lights in the field
     baffle
@@ -472,6 +497,7 @@ class CameraConfig(ConfigModel):
         0.0,
     )
     principal_point_px: tuple[Number, Number] | None = None
+    pupil_walk_m: tuple[Walk, Walk] = (0.0, 0.0)
     psf: Psf = GaussianPsfConfig()
     chromatic: ChromaticConfig | None = None
     ghosts: tuple[GhostConfig, ...] = ()

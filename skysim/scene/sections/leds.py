@@ -36,6 +36,7 @@ from skysim.core.units import (
 
 Distance = Literal[3, 5, 7, 11]
 ClockError = Annotated[NumberError, Field(le=10_000)]
+Offset = Annotated[Length, Field(ge=-0.01, le=0.01)]
 
 
 class CosineLobeConfig(ConfigModel):
@@ -344,6 +345,9 @@ class LedConfig(LedLightConfig):
     ----------
     disk_diameter
         Diameter of the emitting disk
+    die
+        Apparent place of the disk beside the center of the LED's window, which a survey measures: level, across, and
+        outward along the normal (the lens of an LED magnifies it). All LEDs of a batch share it
     types
         Further types by name, for `types` of a layout; all share the keys below. A series resistor scales the current,
         so LEDs of one type with several resistors have levels, by the drive `direct`
@@ -362,6 +366,7 @@ class LedConfig(LedLightConfig):
     """
 
     disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
+    die_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     types: dict[str, LedTypeConfig] = Field(default_factory=dict)

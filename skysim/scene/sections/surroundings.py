@@ -81,6 +81,8 @@ class AirConfig(ConfigModel):
         Extinction k' at the zenith in the camera's band
     color_extinction_mag
         Color coefficient k'': a star loses (k' + k'' (B-V)) mag for each air mass
+    dispersion
+        Whether each star is refracted by its own color, or all by `wavelength`
     scintillation
         Whether stars scintillate
     seeing_arcsec
@@ -97,6 +99,7 @@ class AirConfig(ConfigModel):
     wavelength_m: Annotated[Length, Field(ge=300e-9, le=2e-6)] | None = None
     extinction_mag: Annotated[Number, Field(ge=0, le=5)] = 0.172
     color_extinction_mag: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    dispersion: bool = False
     scintillation: bool = True
     seeing_arcsec: Annotated[Number, Field(ge=0, le=20)] = 0.0
     horizon: HorizonConfig | None = None

@@ -41,6 +41,8 @@ ActuatorsName = Literal["ideal", "wheels", "fans", "thrusters", "trims", "cmgs"]
 TorqueLimit = AboveZero[Torque]
 TorqueLevel = ZeroOrMore[Torque]
 Friction = ZeroOrMore[Damping]
+Bend = Annotated[Number, Field(ge=-3600, le=3600)]
+Deviation = Annotated[Length, Field(ge=-1e-3, le=1e-3)]
 LagTime = Annotated[Time, Field(ge=5e-3)]
 
 
@@ -331,6 +333,10 @@ class VehicleConfig(ConfigModel):
     camera_rotation_deg
         Rotation vector from the axes of the file's camera to those of the scene's, in the axes of the file's camera
         (+x right, +y down, +z boresight): [0, 0, 55] rolls it about its boresight
+    sag_arcsec
+        Bending of mast and bracket by 1 g across the boresight, about the camera's x and y axes; aligned when level
+    runout
+        Deviations of the ball's radius along the body's axes, which displace the bearing's center as it turns
     torque_limit
         Limit of each ideal torque about body x, y, z
     wheels, fans, thrusters, cmgs
@@ -348,6 +354,8 @@ class VehicleConfig(ConfigModel):
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
     camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
+    sag_arcsec: tuple[Bend, Bend] = (0.0, 0.0)
+    runout_m: tuple[Deviation, Deviation, Deviation] = (0.0, 0.0, 0.0)
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None
@@ -361,6 +369,11 @@ class VehicleConfig(ConfigModel):
     imu: ImuConfig | None = None
     gimbals: GimbalsConfig | None = None
 
+    @property
+    def is_bent(self) -> bool:
+        """Whether camera and bearing move in the vehicle with its attitude."""
+        return any((*self.sag_arcsec, *self.runout_m))
+
     def check(self) -> None:
         inertia = self.inertia_kg_m2
         if inertia and (min(inertia) <= 0 or 2 * max(inertia) > sum(inertia)):
@@ -371,6 +384,10 @@ class VehicleConfig(ConfigModel):
             )
         if self.mount != "free":
             return
+        if self.is_bent:
+            raise InputError(
+                "sag_arcsec", "a free vehicle has no weight", "mount: air_bearing"
+            )
         if self.disturbances != DisturbancesConfig():
             raise InputError("disturbances", "a free vehicle has none", "mount: air_bearing")
         if self.imu and self.imu.earth_rate != "none":

@@ -19,6 +19,7 @@ axes and R the rotation from lab to camera axes:
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     common survey  : E_i = G_i dP_i + change by the lens, dP_i of LED i from the pupil; with it no lever, focal length
+    hardware as built : E_i = image position minus that by the survey
     survey rotation r : E_i = G_i R (r x P_i)                distortion, star places : difference of the image positions
     rolling shutter : E_i = velocity times the row's delay from the middle row, minus the delay that the tracker assumes
 
@@ -83,6 +84,8 @@ def mean_root(variance_rad2: Floats) -> float:
     return float(np.sqrt(finite.mean()) / ARCSEC_RAD) if len(finite) else math.nan
 
 
+AS_BUILT = "hardware as built"
+
 # Causes of the attitude error. Each returns None if the scene does not have it, else the displacements (n, 2, k) of the
 # image positions in px by k errors of unit variance that all lights share. Errors of surveyed LEDs are independent:
 # they are covariances (n, 2, 2) in px^2.
@@ -100,6 +103,21 @@ def led_survey(view: View, context: Context) -> Floats | None:
     if not sigma_m:
         return None
     return sigma_m**2 * view.gradient @ np.swapaxes(view.gradient, 1, 2)
+
+
+def pixel_response(view: View, context: Context) -> Floats | None:
+    """Errors of centroids by the response within pixels, at random places in them.
+
+    The response 1 + p cos 2 pi x moves the center of gravity of the pixels of a Gaussian of deviation s, to first order
+    in p, by p exp(-2 pi^2 s^2) (1 / 4 pi - 2 pi s^2) sin 2 pi x. A fit errs by between half of it and all.
+    """
+    depth = context.scene.camera.detector.intrapixel
+    if not depth:
+        return None
+    # Without the pixel's own variance.
+    s2 = np.maximum(view.sigma_px**2 - 1 / 12, 0)
+    moved_px = depth * np.exp(-2 * np.pi**2 * s2) * (1 / (4 * np.pi) - 2 * np.pi * s2)
+    return (moved_px**2 / 2)[:, None, None] * np.eye(2)
 
 
 def survey_setup(view: View, context: Context) -> Floats | None:
@@ -213,6 +231,20 @@ def rolling_shutter(view: View, context: Context) -> Floats | None:
     return (velocity_px_s * delay_s[:, None])[:, :, None]
 
 
+def as_built(view: View, context: Context) -> Floats | None:
+    """Images minus those of the surveyed hardware: temperature, sag, run-out, dies, pupil of the lens, chip's edge."""
+    scene = context.scene
+    camera = scene.camera
+    die_m = scene.dome.led.die_m if scene.dome else ()
+    shifts = (*camera.pupil_walk_m, *die_m, camera.detector.edge_px)
+    if not (scene.thermal or scene.vehicle.is_bent or any(shifts)):
+        return None
+    mount = context.lab.camera.mount
+    place = context.beliefs.lights.place[view.row]
+    surveyed_m = mount.toward(place, view.lab_from_cam * mount.cam_from_body)
+    return (view.xy_px - context.camera.optics.project(surveyed_m))[:, :, None]
+
+
 def displacement(view: View, shift_lab: Floats) -> Floats:
     """The displacement of the images by shifts (n, 3) of the lights in lab axes, E_i = G_i R shift_i."""
     shift_cam = view.lab_from_cam.inv().apply(shift_lab)
@@ -231,6 +263,7 @@ CAUSES = {
     "star places": star_places,
     "rolling shutter": rolling_shutter,
     "other map": other_map,
+    AS_BUILT: as_built,
 }
 UNKNOWN_TO_TRACKER = (
     "focal length",
@@ -238,12 +271,14 @@ UNKNOWN_TO_TRACKER = (
     "assumed lever",
     "rolling shutter",
     "other map",
+    AS_BUILT,
 )
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
 # More causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
 LED_SURVEY = "LED survey"
+PIXEL_RESPONSE = "response within pixels"
 SOLVER = "solver"
 EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 
@@ -434,7 +469,7 @@ def solver_error(view: View, context: Context) -> Floats | None:
 
 def expected(views: list[View], context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
-    names = (CENTROIDS, LED_SURVEY, *CAUSES, SOLVER)
+    names = (CENTROIDS, LED_SURVEY, PIXEL_RESPONSE, *CAUSES, SOLVER)
     cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
     for a, view in enumerate(views):
         variances = causes_at(view, context)
@@ -460,9 +495,13 @@ def causes_at(view: View, context: Context) -> dict[str, Floats]:
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. and 3. Covariances by each cause, and the solver's own error squared.
     found = {CENTROIDS: of_independent(gain, centroid_variance(view, context))}
-    survey_px2 = led_survey(view, context)
-    if survey_px2 is not None:
-        found[LED_SURVEY] = of_independent(gain, survey_px2)
+    independent = {
+        LED_SURVEY: led_survey(view, context),
+        PIXEL_RESPONSE: pixel_response(view, context),
+    }
+    for name, covariance_px2 in independent.items():
+        if covariance_px2 is not None:
+            found[name] = of_independent(gain, covariance_px2)
     for name, cause in CAUSES.items():
         shift_px = cause(view, context)
         if shift_px is not None:

@@ -9,29 +9,24 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from skysim.camera import thermal_motion
+from skysim.camera import as_built
 from skysim.camera.detector import saturation_dn
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.simulation.checks import vehicle_facts
 from skysim.simulation.checks.detection import (
-    Context,
     detected_area_px,
     threshold_e,
 )
 from skysim.simulation.checks.expected_error import (
-    believed_px2,
-    gains,
+    AS_BUILT,
     mismatch,
 )
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short, uneven_px
 from skysim.simulation.checks.sampling import Plan
-from skysim.simulation.checks.views import View
 from skysim.simulation.lights.starlight import BACKGROUND
 from skysim.sources.dome.layouts.placing import largest_cap_deg
 
@@ -473,44 +468,22 @@ def unknown_tag_error(plan: Plan) -> str:
 def thermal_drift(plan: Plan) -> str:
     """Warn if thermal drift of dome, mount and lens causes larger errors than expected otherwise."""
     thermal_config = plan.scene.thermal
-    frames = plan.frames
     if thermal_config is None:
         return ""
-    at = frames.attitudes
-    rows = zip(frames.used, at.lab_from_body, at.t_s.tolist(), strict=True)
-    turns = [drift_rad(*row, plan) for row in rows]
-    cross_rad = np.hypot(*np.array(turns)[:, :2].T)
-    expected_rad = np.sqrt(frames.error.total("cross"))
-    if not (cross_rad > expected_rad).any():
+    error = plan.frames.error
+    drift_rad2 = error.rad2["cross"][AS_BUILT]
+    if not (drift_rad2 > error.total("cross") / 2).any():
         return ""
-    n = int(np.nanargmax(cross_rad))
-    warm_c = thermal_motion.temperature_c(thermal_config, float(at.t_s[n]))
+    n = int(np.nanargmax(drift_rad2))
+    t_s = float(plan.frames.attitudes.t_s[n])
+    others_rad = math.sqrt(error.total("cross")[n] - drift_rad2[n])
     return (
-        f"thermal.reference_c: dome, mount and lens turn the solution by {short(cross_rad[n] / ARCSEC_RAD)}″ (cross) at"
-        f" {warm_c:.1f} °C, t = {at.t_s[n]:.1f} s, beside an expected error of"
-        f" {short(float(expected_rad[n]) / ARCSEC_RAD)}″; survey and calibrate nearer to that temperature, or change"
+        f"thermal.reference_c: dome, mount and lens turn the solution by"
+        f" {short(math.sqrt(drift_rad2[n]) / ARCSEC_RAD)}″ (cross) at"
+        f" {as_built.temperature_c(thermal_config, t_s):.1f} °C, t = {t_s:.1f} s, beside an expected error of"
+        f" {short(others_rad / ARCSEC_RAD)}″; survey and calibrate nearer to that temperature, or change"
         " thermal.mount_arcsec_k"
     )
-
-
-def drift_rad(view: View, lab_from_body: Rotation, t_s: float, context: Context) -> Floats:
-    """(3,) error of a solution by thermal drift, to first order, a rotation vector in camera axes.
-
-    It is sum K_i (drifted - surveyed image position); NaN with too few lights.
-    """
-    config = context.scene.thermal
-    assert config is not None
-    if len(view) < MIN_LIGHTS:
-        return np.full(3, np.nan)
-    gain = gains(view, believed_px2(view, context))
-    lights = context.beliefs.lights.take(view.row)
-    mount = context.camera.mount
-    optics = context.camera.optics
-    surveyed_px = optics.project(mount.toward(lights.place, lab_from_body))
-    moved_place = thermal_motion.leds_at(config, lights, t_s).place
-    moved_mount, moved_optics = thermal_motion.camera_at(config, mount, optics, t_s)
-    drifted_px = moved_optics.project(moved_mount.toward(moved_place, lab_from_body))
-    return np.einsum("nij,nj->i", gain, drifted_px - surveyed_px)
 
 
 FINDINGS = (

@@ -4,9 +4,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
+
+from skysim.camera.as_built import leds_at, off_center
 from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.render import Window
-from skysim.camera.thermal_motion import leds_at
 from skysim.core.types import Floats, Sources
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig, StarsConfig
 from skysim.scene.sections.surroundings import ThermalConfig
@@ -55,7 +57,7 @@ class LedDome(KnownLight):
         """The LEDs and the light of black pixels. Without seeds the LEDs are lit for their share of the time.
 
         1. Warm-up reduces the strength of all LEDs.
-        2. Temperature moves them.
+        2. Their dies are beside the surveyed centers of the windows, and temperature moves them.
         3. Pulses and codes of this run set their on-times.
         """
         # 1. Warm-up.
@@ -63,7 +65,10 @@ class LedDome(KnownLight):
         leds = self.sources
         if left < 1:
             leds = replace(leds, strength=left * leds.strength)
-        # 2. Thermal motion.
+        # 2. Dies and thermal motion.
+        die_m = np.array(self.config.led.die_m)
+        if die_m.any():
+            leds = off_center(leds, die_m)
         if self.thermal is not None:
             leds = leds_at(self.thermal, leds, exposure.t_s)
         # 3. Pulses and codes.

@@ -1,6 +1,7 @@
-"""Thermal motion: LEDs move with the dome's expansion, the camera on its mount, the image with the focal length.
+"""Where LEDs and camera are, beside where a survey has them: temperature, gravity, the bearing, dies of LEDs.
 
-Each effect is linear in the difference dT from the reference temperature, at which the set-up was surveyed.
+Each effect of temperature is linear in the difference dT from the reference temperature, at which the set-up was
+surveyed: LEDs move with the dome's expansion, the camera on its mount, the image with the focal length.
 """
 
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
-from skysim.core.types import Mount, Sources
+from skysim.core.types import Floats, Mount, Sources, normalized
 from skysim.scene.sections.surroundings import (
     LinearTemperatureConfig,
     SineTemperatureConfig,
@@ -20,6 +21,10 @@ from skysim.scene.sections.surroundings import (
     TemperatureTableConfig,
     ThermalConfig,
 )
+from skysim.scene.sections.vehicle import VehicleConfig
+
+UP = np.array([0.0, 0.0, 1.0])  # of the lab, and of a level body
+BORESIGHT = UP  # in camera axes
 
 
 def steady(config: SteadyTemperatureConfig, _hours: float) -> float:
@@ -92,3 +97,40 @@ def camera_at(
     mount = replace(mount, cam_from_body=turned(config, t_s) * mount.cam_from_body)
     scale = 1 + PPM * config.lens_ppm_k * difference_k
     return mount, replace(optics, scale=scale) if config.lens_ppm_k else optics
+
+
+def mount_at(vehicle: VehicleConfig, mount: Mount, lab_from_body: Rotation) -> Mount:
+    """The camera's mount at an attitude, at which gravity bends it and the bearing's ball displaces it.
+
+    1. Gravity across the boresight b bends the bracket, with compliances k about the camera's axes in angle per g: the
+       camera turns by k (b x (d - d_0)), d the down direction in its axes and d_0 that of a level vehicle, at which it
+       was aligned.
+    2. A ball has the radius R + sum q_i u_i^2 in the direction u of the body. Around its lowest point, which is in the
+       direction d, the surface is a sphere about c = 2 q d - (d . q d) d (elementwise products q d): it has the radius
+       there and its slope. The cup holds this sphere, so the body moves by -c, minus its place when level.
+    """
+    # 1. Sag. Directions in the camera's axes turn the other way.
+    down_body = lab_from_body.inv().apply(-UP)
+    down_cam = mount.cam_from_body.apply(down_body + UP)
+    compliance_rad = ARCSEC_RAD * np.array([*vehicle.sag_arcsec, 0.0])
+    cam_from_aligned = Rotation.from_rotvec(compliance_rad * np.cross(down_cam, BORESIGHT))
+    # 2. Run-out. A level body is higher by q_z.
+    deviation_m = np.array(vehicle.runout_m) * down_body
+    lift_m = down_body @ deviation_m + vehicle.runout_m[2]
+    moved_m = lift_m * down_body - 2 * deviation_m
+    return Mount(mount.camera_body_m + moved_m, cam_from_aligned * mount.cam_from_body)
+
+
+def off_center(leds: Sources, die_m: Floats) -> Sources:
+    """LEDs whose light comes from places (3,) beside the centers of their windows, in the axes of each LED.
+
+    Its z is the LED's normal n, x is level (z_lab x n, the lab's x for an LED that looks straight up or down) and y is
+    n x x: all LEDs of a batch are soldered the same way.
+    """
+    level = np.cross(UP, leds.normal)
+    level[np.linalg.norm(level, axis=1) < 1e-9] = (1.0, 0.0, 0.0)
+    level = normalized(level)
+    axes = np.stack([level, np.cross(leds.normal, level), leds.normal], axis=1)
+    place = leds.place.copy()
+    place[:, :3] += np.einsum("i,nij->nj", die_m, axes)
+    return replace(leds, place=place)
