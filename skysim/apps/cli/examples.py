@@ -25,14 +25,16 @@ PARAMETERS = "\n\nParameters\n----------\n"
 
 
 def documented(command: Any) -> None:
-    """Give a command's parameters the help in its docstring; one that is not annotated is an option."""
+    """Give a command's parameters the help in its docstring; one that is not annotated is an option, a bool a flag."""
     text, _, section = (inspect.getdoc(command) or "").partition(PARAMETERS)
     signature = inspect.signature(command, eval_str=True)
     options = dict(signature.parameters)
     for name, explained in re.findall(r"^(\w+)\n((?: +.+\n?)+)", section, re.MULTILINE):
         kind = options[name].annotation
         if not hasattr(kind, "__metadata__"):
-            kind = Annotated[kind, typer.Option()]
+            # Otherwise typer would add an option --no-NAME.
+            flag = [f"--{name.replace('_', '-')}"] if kind is bool else []
+            kind = Annotated[kind, typer.Option(*flag)]
         kind.__metadata__[0].help = " ".join(explained.split())
         options[name] = options[name].replace(annotation=kind)
     command.__doc__ = text

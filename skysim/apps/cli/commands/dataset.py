@@ -28,7 +28,7 @@ def dataset(
     vary: Variations = None,
     to: list[str] | None = None,
     shard_frames: int = 64,
-    compress: Annotated[bool, Option("--compress")] = False,
+    compress: bool = False,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Workers = None,

@@ -30,25 +30,23 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 
-EstimateOnly = Annotated[bool, Option("--estimate-only")]
 Tilt = Annotated[float, Option(min=0.1, max=60)]
 Longer = Annotated[float, Option(min=0.1, max=100)]
 Flights = Annotated[int | None, Option(min=1, max=50)]
 InertiaBar = Annotated[float, Option(min=0.01)]
-InFlight = Annotated[bool, Option("--in-flight")]
 
 
 def balance(
     scene: SceneArg,
     excite: Literal["wheels", "swing"] = "wheels",
-    estimate_only: EstimateOnly = False,
+    estimate_only: bool = False,
     tilt: Tilt = 8.0,
     longer: Longer = 1.0,
     torque: str = "5e-5 N m",
     flights: Flights = None,
     inertia_bar: InertiaBar = 1.0,
     offset_bar: str | None = None,
-    in_flight: InFlight = False,
+    in_flight: bool = False,
     # The errors of the onboard model before the first flight.
     inertia_sigma: str = "10%",
     offset_sigma: str = "500 um",

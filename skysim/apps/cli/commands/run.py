@@ -127,7 +127,7 @@ def render(
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
-    preview: Annotated[bool, typer.Option("--preview")] = False,
+    preview: bool = False,
     json: Json = False,
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them.

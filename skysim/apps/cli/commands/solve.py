@@ -54,7 +54,7 @@ def solve(
     wcs: Path | None = None,
     table: Path | None = None,
     annotate: Path | None = None,
-    sequence: bool = False,
+    sequence: Annotated[bool, Option()] = False,
     rate: float | None = None,
     out: Path = Path("out/solve"),
     json: Json = False,

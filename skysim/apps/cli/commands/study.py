@@ -111,7 +111,7 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, Option("--failed")] = False,
+    failed: bool = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,

@@ -21,14 +21,11 @@ FrameCount = Annotated[
         help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
-PlanOnly = Annotated[bool, Option("--plan")]
-Watch = Annotated[bool, Option("--watch")]
 Repeat = Annotated[int | None, Option(min=2)]
 Next = Annotated[
     int | None,
     Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
 ]
-Distortion = Annotated[bool, Option("--distortion")]
 Checks = Annotated[
     int | None,
     Option(
@@ -41,10 +38,10 @@ Checks = Annotated[
 def survey(
     scene: SceneArg,
     frames: FrameCount = None,
-    plan: PlanOnly = False,
+    plan: bool = False,
     images: Path | None = None,
     camera: Path | None = None,
-    watch: Watch = False,
+    watch: bool = False,
     repeat: Repeat = None,
     attitudes: Literal["plan", "random"] | None = None,
     next_: Next = None,
@@ -57,7 +54,7 @@ def survey(
     led_sigma: str = "2 mm",
     lever_sigma: str = "5 mm",
     focal_error: str = "1%",
-    distortion: Distortion = False,
+    distortion: bool = False,
     checks: Checks = None,
     json: Json = False,
 ) -> None:
