@@ -13,7 +13,7 @@ from skysim.results.report import page_path, print_blocks
 
 
 def reproduce(
-    ids: Annotated[list[str] | None, Argument(metavar="ID|all")] = None,
+    ids: Annotated[list[str] | None, Argument()] = None,
     quick: bool = False,
     seed: int = 1,
     report: bool = False,
@@ -26,7 +26,7 @@ def reproduce(
 
     Parameters
     ----------
-    ids
+    ids : ID|all
         Experiments, or all; default: list them.
     quick
         Run fewer trials; the intervals are wider.

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
@@ -102,7 +102,7 @@ def scenes_export(
 @scenes_app.command("parts")
 def scenes_parts(
     scene: SceneArg,
-    prices: Annotated[str, Option(metavar="FILE")] = "assumed",
+    prices: str = "assumed",
     out: Path | None = None,
     seed: Seed = None,
     set_: Overrides = None,
@@ -112,7 +112,7 @@ def scenes_parts(
 
     Parameters
     ----------
-    prices
+    prices : FILE
         Table of prices (.csv); `assumed` is the one that comes along.
     out
         Also write the list as CSV.
@@ -148,7 +148,7 @@ def new(
             autocompletion=lambda: list(KINDS),
         ),
     ],
-    name: Annotated[str, Argument(metavar="NAME")],
+    name: Annotated[str, Argument()],
     out: Path = Path(),
 ) -> None:
     """Begin a scene, vehicle, camera, study, controller or tracker: write a commented file that runs as it is.
@@ -157,7 +157,7 @@ def new(
 
     Parameters
     ----------
-    name
+    name : NAME
         Name of the new file, without its ending.
     out
         Folder of the new file.
@@ -185,8 +185,8 @@ def new(
 
 
 def export(
-    folder: Annotated[Path, Argument(metavar="FOLDER")],
-    to: Annotated[list[str], Option(metavar="FORMAT")],
+    folder: Annotated[Path, Argument()],
+    to: list[str],
     out: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -194,9 +194,9 @@ def export(
 
     Parameters
     ----------
-    folder
+    folder : FOLDER
         Output folder of `skysim run` or `render`.
-    to
+    to : FORMAT
         aem, ecsv, parquet, tiff, zarr or video; repeatable.
     out
         Output folder; default: FOLDER.

@@ -29,7 +29,7 @@ def live(
     tcp: Annotated[int | None, Option(**PORTS)] = None,
     http: Annotated[int | None, Option(**PORTS)] = None,
     folder: Path | None = None,
-    display: Annotated[str | None, Option(metavar="BENCH")] = None,
+    display: str | None = None,
     pipe: str | None = None,
     host: str = HOST,
     token: str = "",
@@ -37,7 +37,7 @@ def live(
     trigger: bool = False,
     poses: bool = False,
     client_tracker: bool = False,
-    command_timeout: Annotated[float, Option(min=0, metavar="SECONDS")] = 0.5,
+    command_timeout: Annotated[float, Option(min=0)] = 0.5,
     wait: bool = False,
     frames: Frames = None,
     endless: bool = False,
@@ -56,7 +56,7 @@ def live(
         Serve MJPEG on this port; 0: any free port.
     folder
         Write frames to a folder: a 16-bit PNG and a JSON file per frame.
-    display
+    display : BENCH
         Serve /display by --http: the sky for the display of this scene, before a real camera.
     pipe
         Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output.
@@ -72,7 +72,7 @@ def live(
         A client simulates the motion: expose a frame for each of its poses.
     client_tracker
         The filter takes attitudes of clients, not of the scene's tracker.
-    command_timeout
+    command_timeout : SECONDS
         Time of the simulator after which a client's command of actuators ends.
     wait
         Start when the first client of --tcp takes channels.
@@ -286,7 +286,7 @@ def gui(
     token: str = "",
     folder: Path = Path("."),
     out: Path = Path("out"),
-    camera: Annotated[list[str] | None, Option(metavar="SOURCE")] = None,
+    camera: list[str] | None = None,
     workers: Annotated[int, Option(min=1)] = 12,
     show: Annotated[bool, Option("--open/--no-open")] = True,
 ) -> None:
@@ -304,7 +304,7 @@ def gui(
         Folder in which new scenes are saved.
     out
         Folder of studies and their reports.
-    camera
+    camera : SOURCE
         Live camera that the page may watch: index, file or address; repeatable.
     workers
         Most worker processes, one for each page; further pages wait.

@@ -30,10 +30,7 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-Images = Annotated[list[Path] | None, Argument(metavar="IMAGES")]
-MapFile = Annotated[Path | None, Option("--map")]
-Near = Annotated[str | None, Option(metavar="RA,DEC,DEG")]
-Size = Annotated[str | None, Option(metavar="WxH")]
+Images = Annotated[list[Path] | None, Argument()]
 
 
 def solve(
@@ -41,7 +38,7 @@ def solve(
     fov: float | None = None,
     camera: Path | None = None,
     dome: str | None = None,
-    map_: MapFile = None,
+    map_: Path | None = None,
     live: str | None = None,
     time: str | None = None,
     catalog: str | None = None,
@@ -49,8 +46,8 @@ def solve(
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
-    near: Near = None,
-    size: Size = None,
+    near: str | None = None,
+    size: str | None = None,
     wcs: Path | None = None,
     table: Path | None = None,
     annotate: Path | None = None,
@@ -65,7 +62,7 @@ def solve(
 
     Parameters
     ----------
-    images
+    images : IMAGES
         Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:
         x_px, y_px, flux).
     fov
@@ -82,9 +79,9 @@ def solve(
         UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.
     catalog
         Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees.
-    near
+    near : RA,DEC,DEG
         Circle of the sky in which the image center is sought, in degrees.
-    size
+    size : WxH
         Size of the picture of a list of lights, in pixels.
     wcs
         Also write the FITS header (TAN-SIP) of one image here.
