@@ -38,7 +38,7 @@ from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.search_models import QUAD_SEARCHES
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
 from skysim.core.types import Bools
@@ -276,7 +276,7 @@ def make_solver(
     Parameters
     ----------
     stages
-        Names of algorithms by stage (`check_stages`); the tracker's defaults for the others
+        Names of algorithms by stage: detector, centroider, identifier, solver; the tracker's defaults for the others
     catalog
         Name or file of a star catalog; the shipped one, CATALOG, if left out
     size_px, near_deg
@@ -302,7 +302,10 @@ def make_solver(
         raise InputError("solve.time_utc", warning)
     camera, settings = read_camera(camera_file) if camera_file else (None, PHOTOGRAPH)
     if stages:
-        check_stages(stages)
+        from skysim.tracking.factory import STAR_ALGORITHMS
+
+        for stage, name in stages.items():
+            check_name(f"solve.{stage}", stage, name, STAR_ALGORITHMS[stage])
         settings = replace(settings, **stages)  # type: ignore[arg-type]
     stars = read_catalog(catalog)
     return Solver(
@@ -326,17 +329,6 @@ def kept_solver(
         Pairs of stage and algorithm
     """
     return make_solver(fov_deg, None, time_utc, dict(stages))
-
-
-def check_stages(stages: Mapping[str, str]) -> None:
-    """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
-    from skysim.tracking.factory import STAR_ALGORITHMS
-
-    for stage, name in stages.items():
-        if name not in STAR_ALGORITHMS[stage]:
-            raise InputError(
-                f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage])
-            )
 
 
 def read_camera(path: Path) -> tuple[KnownCamera, Settings]:

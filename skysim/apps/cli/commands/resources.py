@@ -9,7 +9,7 @@ from typer import Argument
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.paths import DATA, SCENES
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
@@ -162,8 +162,7 @@ def new(
     out
         Folder of the new file.
     """
-    if kind not in KINDS:
-        raise InputError("", *unknown_name("kind", kind, KINDS))
+    check_name("", "kind", kind, KINDS)
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise InputError(
             "NAME", f"{name!r} is no name", "a letter, then letters, digits and _"

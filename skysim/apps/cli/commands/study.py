@@ -33,7 +33,7 @@ from skysim.apps.cli.terminal import (
     trial_progress,
     write_3d_views,
 )
-from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.errors import InputError, check_name, printable
 
 if TYPE_CHECKING:
     from skysim.core.types import Record
@@ -475,8 +475,7 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     """Create the engine that runs the trials. Raises InputError for an unknown name or a missing scheduler."""
     from skysim.experiments.study.execution.runner import ENGINES
 
-    if name not in ENGINES:
-        raise InputError("--engine", *unknown_name("engine", name, ENGINES))
+    check_name("--engine", "engine", name, ENGINES)
     if workers is not None and name != "pool":
         raise InputError(
             f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool"
