@@ -195,9 +195,9 @@ def command_line() -> str:
     return shlex.join(["skysim", *sys.argv[1:]])
 
 
-def selected_stages(**stages: str | None) -> dict[str, str]:
-    """The tracker stages for which the command line names an algorithm."""
-    return {stage: name for stage, name in stages.items() if name is not None}
+def given_options(**options: Any) -> dict[str, Any]:
+    """The options that the command line has, without those that are left out."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 # Errors with the option that a user typed in place of the key.

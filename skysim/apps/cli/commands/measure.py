@@ -15,6 +15,7 @@ from skysim.apps.cli.options import (
     SceneArg,
     Seed,
     command_line,
+    given_options,
     load,
     output_folder,
 )
@@ -230,12 +231,10 @@ def characterize(
 
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
-        given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        for option, value in given.items():
-            if value is not None:
-                raise InputError(
-                    f"--{option}", "has no effect with --frames-to", "one of the two"
-                )
+        for option in given_options(darks=darks, flats=flats, night=night, out=out):
+            raise InputError(
+                f"--{option}", "has no effect with --frames-to", "one of the two"
+            )
         write_simulated(config, frames_to, seed, json)
         return
     folders = characterize_camera.check_folders(darks, flats)

@@ -25,10 +25,10 @@ from skysim.apps.cli.options import (
     Seed,
     SolverName,
     command_line,
+    given_options,
     load,
     output_folder,
     scene_names,
-    selected_stages,
     used_programs,
     with_location,
 )
@@ -62,7 +62,7 @@ def run(
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.flight import open_flight
 
-    stages = selected_stages(
+    stages = given_options(
         detector=detector,
         centroider=centroider,
         identifier=identifier,

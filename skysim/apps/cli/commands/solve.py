@@ -17,7 +17,7 @@ from skysim.apps.cli.options import (
     Identifier,
     Json,
     SolverName,
-    selected_stages,
+    given_options,
 )
 from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
 from skysim.core.errors import InputError
@@ -101,7 +101,7 @@ def solve(
     from skysim.core import files
 
     sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
-    stages = selected_stages(
+    stages = given_options(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
     settings = solver_of(sky | {"camera": camera, "wcs": wcs}, dome, map_, stages)
@@ -133,9 +133,8 @@ def solver_of(
     from skysim.apps import plate_solver
 
     if dome is not None:
-        for name, value in sky.items():
-            if value is not None:
-                raise InputError(f"--{name}", "has no effect with --dome", "without it")
+        for name in given_options(**sky):
+            raise InputError(f"--{name}", "has no effect with --dome", "without it")
         return plate_solver.make_dome_solver(dome, map_, stages)
     if map_ is not None:
         raise InputError("--map", "has no effect without --dome", "with --dome SCENE")

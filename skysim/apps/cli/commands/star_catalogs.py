@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Argument, Option
 
-from skysim.apps.cli.options import Json, write_file
+from skysim.apps.cli.options import Json, given_options, write_file
 from skysim.apps.cli.terminal import print_catalog, print_json
 from skysim.core.errors import InputError
 
@@ -106,14 +106,13 @@ def catalog_select(
     from skysim.sources import catalog
     from skysim.tracking.onboard_model import onboard_catalog
 
-    options = {
-        "bright_mag": bright,
-        "faintest_mag": faintest,
-        "north_mag": north,
-        "south_mag": south,
-        "count": count,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
+    given = given_options(
+        bright_mag=bright,
+        faintest_mag=faintest,
+        north_mag=north,
+        south_mag=south,
+        count=count,
+    )
     known = list(inspect.signature(CATALOGS[rule]).parameters)[1:]
     if useless := [name for name in given if name not in known]:
         key, *allowed = (f"--{name.removesuffix('_mag')}" for name in (useless[0], *known))
