@@ -137,9 +137,9 @@ class Solver:
     Attributes
     ----------
     time_utc
-        Time at which the images were taken; None takes the date of each FITS header. Without any
-        date the epoch is 2020, and stellar aberration (20") is left out because its direction
-        depends on the season
+        Time at which the images were taken; if it is None, `skysim solve` sets the date of each FITS
+        header. Without any date the epoch is 2020, and stellar aberration (20") is left out because
+        its direction depends on the season
     fov_uncertainty
         Relative uncertainty of the focal length that follows from fov_deg
     hypotheses
@@ -200,21 +200,19 @@ class Solver:
         ]
         return min(ends), max(ends)
 
-    def trackers(
-        self, width_px: int, height_px: int, date_utc: datetime | None
-    ) -> Iterator[StarTracker]:
-        """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
+    def trackers(self, width_px: int, height_px: int) -> Iterator[StarTracker]:
+        """Yield the trackers for an image of this size: one, or one per range of fields of view.
 
         Trackers are built when first needed and cached until an image of another size or date comes.
         """
-        date_utc = self.time_utc or date_utc
-        if (width_px, height_px, date_utc) not in self.tracker_cache:
+        key = width_px, height_px, self.time_utc
+        if key not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
-        cached = self.tracker_cache.setdefault((width_px, height_px, date_utc), {})
+        cached = self.tracker_cache.setdefault(key, {})
         vectors = None
         for camera, uncertainty in self.candidate_cameras(width_px, height_px):
             if (camera, uncertainty) not in cached:
-                vectors = self.vectors(date_utc) if vectors is None else vectors
+                vectors = self.vectors() if vectors is None else vectors
                 cached[camera, uncertainty] = self.tracker(camera, vectors, uncertainty)
             yield cached[camera, uncertainty]
 
@@ -228,11 +226,11 @@ class Solver:
             / (4 * math.pi)
         )
 
-    def vectors(self, date_utc: datetime | None) -> Floats:
-        """(N, 3) directions of the stars as seen from the Earth at a date, or at the default epoch."""
-        if date_utc is None:
+    def vectors(self) -> Floats:
+        """(N, 3) directions of the stars as seen from the Earth at the solver's time, or at the default epoch."""
+        if self.time_utc is None:
             return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
-        return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
+        return star_catalog.apparent(self.stars, star_catalog.on_earth(self.time_utc))
 
     def within_reach(self, camera: Camera, vectors: Floats) -> Bools:
         """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
@@ -394,7 +392,6 @@ def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
 def solve_array(
     image: NDArray,
     solver: Solver,
-    date_utc: datetime | None,
     centroids: Centroids | None = None,
     efforts: int | None = None,
 ) -> tuple[Report, StarTracker]:
@@ -402,20 +399,18 @@ def solve_array(
 
     Parameters
     ----------
-    date_utc
-        Date of the image; None if unknown
     centroids
         Centroids of this image, if they are known
     efforts
         As in `solve_centroids`
     """
     height_px, width_px = image.shape
-    first = next(solver.trackers(width_px, height_px, date_utc))
+    first = next(solver.trackers(width_px, height_px))
     clock = Clock()
     if centroids is None:  # only the size of the camera is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
     attitude, tracker = solve_centroids(
-        centroids, solver, (width_px, height_px), date_utc, clock, efforts
+        centroids, solver, (width_px, height_px), clock, efforts
     )
     if attitude.camera:
         # Of a half, the camera of the whole picture.
@@ -427,7 +422,6 @@ def solve_centroids(
     centroids: Centroids,
     solver: Solver,
     size_px: tuple[int, int],
-    date_utc: datetime | None,
     clock: Clock,
     efforts: int | None = None,
 ) -> Solved:
@@ -438,7 +432,7 @@ def solve_centroids(
     efforts
         Number of searches that are made, of growing effort; None: all of them
     """
-    first = next(solver.trackers(*size_px, date_utc))
+    first = next(solver.trackers(*size_px))
     made = range(first.efforts)[:efforts]
     if solver.field_is_known:
         for effort in [None] if efforts is None else made:
@@ -450,7 +444,7 @@ def solve_centroids(
         return (Attitude(NO_MATCH) if refused else attitude), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in made:  # try all fields of view quickly before trying any thoroughly
-        trackers = solver.trackers(*size_px, date_utc)
+        trackers = solver.trackers(*size_px)
         attitude, tracker = best_attitude(centroids, trackers, clock, effort, tries)
         if attitude.solved:
             break
