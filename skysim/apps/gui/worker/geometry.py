@@ -12,7 +12,7 @@ from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats, Ints, Record, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
+from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
 from skysim.results import scoring
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig
@@ -61,17 +61,10 @@ def lights(sources: Sources) -> tuple[Ints, Floats, Floats, Bools]:
     The radius of an LED grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; that
     of a star grows with the square root of its light, as in the MJCF file.
     """
-    power = sources.strength * np.minimum(sources.on_s / sources.period_s, 1.0)
-    stars = bool((sources.place[:, 3] == 0).any())
-    rows = np.argsort(-power, kind="stable")[: MAX_STARS if stars else MAX_LEDS]
-    fraction = power[rows] / power.max(initial=1e-300)
-    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = (
-        0.006 + 0.04 * np.sqrt(fraction)
-        if stars
-        else LED_RADIUS_M * np.clip(fraction**0.3, 0.3, 1.0)
-    )
-    return sources.id[rows], position_m, radius_m, power[rows] > 0
+    stars, rows, fraction, position_m, radius_m = brightest(sources, MAX_STARS, MAX_LEDS)
+    if not stars:
+        radius_m *= np.clip(fraction**0.3, 0.3, 1.0)
+    return sources.id[rows], position_m, radius_m, fraction > 0
 
 
 def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
