@@ -6,6 +6,7 @@
 import asyncio
 import time
 from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any
 
 from nicegui import run, ui
@@ -27,6 +28,10 @@ class PageContext:
 
     Attributes
     ----------
+    id, user
+        The browser's tab, and the browser, by `server.user_of`
+    folder, out
+        Folder in which scenes are saved, and that of the studies
     session
         Its worker, once it has one
     editing
@@ -52,6 +57,10 @@ class PageContext:
         Function that adds a line to the log
     """
 
+    id: str
+    user: str
+    folder: Path
+    out: Path
     session: Session
     editing: asyncio.Lock
     state: PageView
