@@ -31,21 +31,15 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 
-Tilt = Annotated[float, Option(min=0.1, max=60)]
-Longer = Annotated[float, Option(min=0.1, max=100)]
-Flights = Annotated[int | None, Option(min=1, max=50)]
-InertiaBar = Annotated[float, Option(min=0.01)]
-
-
 def balance(
     scene: SceneArg,
     excite: Literal["wheels", "swing"] = "wheels",
     estimate_only: bool = False,
-    tilt: Tilt = 8.0,
-    longer: Longer = 1.0,
+    tilt: Annotated[float, Option(min=0.1, max=60)] = 8.0,
+    longer: Annotated[float, Option(min=0.1, max=100)] = 1.0,
     torque: str = "5e-5 N m",
-    flights: Flights = None,
-    inertia_bar: InertiaBar = 1.0,
+    flights: Annotated[int | None, Option(min=1, max=50)] = None,
+    inertia_bar: Annotated[float, Option(min=0.01)] = 1.0,
     offset_bar: str | None = None,
     in_flight: bool = False,
     # The errors of the onboard model before the first flight.

@@ -30,11 +30,8 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-Images = Annotated[list[Path] | None, Argument()]
-
-
 def solve(
-    images: Images = None,
+    images: Annotated[list[Path] | None, Argument()] = None,
     fov: float | None = None,
     camera: Path | None = None,
     dome: str | None = None,

@@ -31,7 +31,6 @@ FrameCount = Annotated[
         help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
-Repeat = Annotated[int | None, Option(min=2)]
 Next = Annotated[
     int | None,
     Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
@@ -52,7 +51,7 @@ def survey(
     images: Path | None = None,
     camera: Path | None = None,
     watch: bool = False,
-    repeat: Repeat = None,
+    repeat: Annotated[int | None, Option(min=2)] = None,
     attitudes: Literal["plan", "random"] | None = None,
     next_: Next = None,
     frames_to: Path | None = None,
