@@ -96,9 +96,9 @@ Json = Annotated[bool, Option("--json", help="Print JSON instead of text.")]
 
 def load(
     name: str,
-    frames: int | None,
-    seed: int | None,
     overrides: list[str] | None,
+    seed: int | None = None,
+    frames: int | None = None,
     trackers: list[str] | None = None,
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.

@@ -62,7 +62,7 @@ def datasheet(
     from skysim.experiments.datasheet.statement import state
 
     require_outputs(markdown, model, fmu)
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     folder = out or Path("out") / f"{loaded.name}_datasheet"
     title = f"datasheet of {loaded.name}"
     with ExitStack() as stack:

@@ -96,7 +96,7 @@ def balance(
         inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma
     )
     bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     plan = balance_procedure.BalancePlan(
         excite, tilt, bars.torque_nm, flights or 6, not estimate_only, longer
     )
@@ -176,7 +176,7 @@ def calibrate(
     """
     from skysim.experiments import home_calibration
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     with progress_callback(loaded.title) as watch:
         known, frames = (
             home_calibration.measure_folder(images, loaded)

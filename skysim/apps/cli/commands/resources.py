@@ -71,7 +71,7 @@ def scenes_export(
     from skysim.simulation.lab import build_lab
     from skysim.sources.dome.layouts.led_list import led_list
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     path = out or Path("out") / f"{loaded.name}.xml"
     ending = path.suffix.lower()
     if ending == ".fmu":
@@ -119,7 +119,7 @@ def scenes_parts(
     """
     from skysim.results.files import parts
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     found = parts.parts_list(loaded, parts.read_prices(parts.find_prices(prices)))
     if out:
         write_file(out, parts.to_csv(found, loaded.name))

@@ -112,7 +112,7 @@ def live(
         )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    loaded = load(scene, frames, seed, set_)
+    loaded = load(scene, set_, seed, frames)
     if client_tracker and not loaded.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
     flight = open_flight(loaded, endless=endless, keeps_history=False)

@@ -110,7 +110,7 @@ def survey(
         frames=frames, attitudes=attitudes, next=next_, frames_to=frames_to, checks=checks
     )
     check_mode(plan, images, camera, watch, repeat, limited)
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     if seed is not None:
         # The list, the lever and the focal length before a survey are drawn by the command, not by the scene.
         loaded = with_config(loaded, "tracker.survey", seed=seed)

@@ -87,7 +87,7 @@ def check(
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.lab import UserParts, build_lab
 
-    loaded = load(scene, None, None, set_)
+    loaded = load(scene, set_)
     result = check_plan(
         build_lab(loaded, UserParts(used_programs(program, scene_names(loaded))))
     )
