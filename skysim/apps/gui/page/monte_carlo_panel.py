@@ -238,7 +238,7 @@ class MonteCarloPanel:
                 for name, field in noise.items()
             }
             trial |= {"false_lights": int(self.false_lights.value or 0)}
-        if not (self.count.value and 1 <= self.count.value <= 100_000):
+        if not 1 <= (self.count.value or 0) <= 100_000:
             raise InputError("runs", "", "1 to 100000")
         scene = forms.absolute_path(self.page.state.scene)
         # A study with changes of the scene that have no effect on a trial would be refused.

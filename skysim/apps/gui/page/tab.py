@@ -131,9 +131,7 @@ class Tab(context.PageContext):
                             sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
-        self.history = history.History(
-            self, self.state.scene, self.show_query, self.is_settling
-        )
+        self.history = history.History(self, self.show_query, self.is_settling)
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
         )
