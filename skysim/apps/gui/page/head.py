@@ -90,7 +90,7 @@ class Head:
     async def go_live(self) -> None:
         """Return to the live scene at the newest attitude."""
         self.page.stop_playback()
-        await self.page.show_live("render", self.page.solving)
+        await self.page.show_live("render")
 
     def toggle_noise(self) -> None:
         self.noise.set_value(not self.noise.value)

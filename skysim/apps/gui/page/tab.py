@@ -228,7 +228,7 @@ class Tab(context.PageContext):
     async def identify(self) -> None:
         """Render a new frame of the live scene, solve it, and log the result."""
         self.stop_playback()
-        await self.show_live("render", True)
+        await self.show_live("render", solve=True)
         if self.view and self.view.result and self.scene_info:
             self.log_panel.identified(self.view, self.scene_info)
 
@@ -283,7 +283,7 @@ class Tab(context.PageContext):
             now.kind != "live" or now.angles_deg != wanted.angles_deg
         ):
             self.stop_playback()
-            await self.show_live("point", wanted.angles_deg, self.solving)
+            await self.show_live("point", wanted.angles_deg)
         if wanted.study != self.state.study:
             await self.study_panel.show_study(wanted.study)
         if wanted.kind == "flight":

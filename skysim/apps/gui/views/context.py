@@ -130,10 +130,18 @@ class PageContext:
                 if activity and self.message_text == activity:
                     self.show_message("")
 
-    async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
-        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab."""
+    async def show_live(
+        self, task: str, *arguments: Any, solve: bool = False
+    ) -> FrameView | None:
+        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab.
+
+        Parameters
+        ----------
+        solve
+            Whether it is solved even if not every frame is
+        """
         begin = time.perf_counter()
-        view = await self.ask(task, *arguments)
+        view = await self.ask(task, *arguments, solve or self.solving)
         if view is not None:
             self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
             self.show_frame(view, kind="live", angles_deg=view.angles_deg)
