@@ -18,9 +18,10 @@ import math
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -492,16 +493,14 @@ def attitudes(
 ) -> Iterator[Solved]:
     """Yield the attitudes of trackers in their order. THREADS of them solve at once: compiled code holds no GIL."""
     pool = ThreadPoolExecutor(THREADS)
-    running: deque[tuple[Future[Attitude], StarTracker]] = deque()
+    begun = (
+        (pool.submit(one.solve_centroids, centroids, None, effort), one) for one in trackers
+    )
     try:
-        for tracker in trackers:
-            running.append(
-                (pool.submit(tracker.solve_centroids, centroids, None, effort), tracker)
-            )
-            if len(running) == THREADS:
-                future, first = running.popleft()
-                yield future.result(), first
-        for future, tracker in running:
+        running = deque(islice(begun, THREADS))
+        while running:
+            future, tracker = running.popleft()
             yield future.result(), tracker
+            running.extend(islice(begun, 1))
     finally:
         pool.shutdown(cancel_futures=True)
