@@ -55,7 +55,7 @@ def measure(count: int = COUNT, seed: int = 25) -> list[dict[str, Any]]:
                 told = plate_solver.make_solver(shot.fov_deg * rng.uniform(0.97, 1.03), None)
                 for how, solver in (("told", told), ("not told", blind)):
                     found = plate_picture.solve_picture(
-                        ViewedImage(image), solver, None
+                        ViewedImage(image), solver
                     ).report.attitude.cam_from_ref
                     right = found is not None and not starless and is_same(found, truth)
                     solved[how] += right

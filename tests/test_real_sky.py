@@ -119,11 +119,11 @@ def test_a_mirrored_photograph_is_refused(row, blind):
     """No rotation maps the sky to its mirror image, so every answer would be wrong; the hint names the mirror."""
     image = images.monochrome(images.read_image(FOLDER / row["file"]))
     outcome = plate_solver.solve_picture(
-        images.ViewedImage(np.ascontiguousarray(image[:, ::-1])), blind, None
+        images.ViewedImage(np.ascontiguousarray(image[:, ::-1])), blind
     )
     assert not outcome.report.attitude.solved
     assert len(outcome.report.centroids) >= 10
-    assert plate_solver.outcome_fields(outcome, None)["hint"].startswith("perhaps mirrored: ")
+    assert plate_solver.outcome_fields(outcome)["hint"].startswith("perhaps mirrored: ")
 
 
 @pytest.mark.long

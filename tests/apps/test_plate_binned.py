@@ -43,10 +43,10 @@ def test_a_defocused_image_is_solved_binned_and_reported_as_such(
 ) -> None:
     blurred, truth = drawn
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
-    alone, _ = plate_solver.solve_array(blurred, solver, None)
+    alone, _ = plate_solver.solve_array(blurred, solver)
     assert not alone.attitude.solved
-    outcome = plate_solver.solve_picture(images.ViewedImage(blurred), solver, None)
-    found = plate_solver.outcome_fields(outcome, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(blurred), solver)
+    found = plate_solver.outcome_fields(outcome)
     assert found["status"] == "solved"
     assert (
         math.degrees((outcome.report.attitude.cam_from_ref * truth.inv()).magnitude()) < 0.1
@@ -104,13 +104,13 @@ def test_a_binned_image_needs_more_evidence(
 
     monkeypatch.setattr(plate_picture, "solve_array", never)
     plate_solver.solve_picture(
-        images.ViewedImage(blurred), plate_solver.make_solver(SHOT.fov_deg, None), None
+        images.ViewedImage(blurred), plate_solver.make_solver(SHOT.fov_deg, None)
     )
     assert tries[0] == 1
     assert set(tries[1:]) == {1000}
     tries.clear()
     fits = images.ViewedImage(blurred, row_order_known=False)
-    plate_solver.solve_picture(fits, plate_solver.make_solver(None, None), None)
+    plate_solver.solve_picture(fits, plate_solver.make_solver(None, None))
     assert tries[:2] == [2, 2]
     assert set(tries[2:]) == {2000}
 

@@ -111,9 +111,9 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
     """Hint of an image's refusal; "" for a solution."""
     picture = images.ViewedImage(image)
     outcome = plate_solver.solve_picture(
-        picture, make_solver(fov_deg, None, catalog=catalog_name), None
+        picture, make_solver(fov_deg, None, catalog=catalog_name)
     )
-    return str(plate_solver.outcome_fields(outcome, None)["hint"])
+    return str(plate_solver.outcome_fields(outcome)["hint"])
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_long_trails_are_solved_at_the_true_attitude(length_px: int) -> None:
     # The whole kernel would move the stars by a quarter of its side.
     centered = trail(length_px)[: length_px // 2 + 1]
     report, _ = plate_solver.solve_array(
-        spread(centered)(photograph()), make_solver(FOV_DEG, None), None
+        spread(centered)(photograph()), make_solver(FOV_DEG, None)
     )
     pointing = plate_solver.solution_fields(report)
     ours, truth = (
@@ -227,7 +227,7 @@ def test_a_too_shallow_catalog_is_named_and_a_deeper_one_solves(
         " take the catalog gaia_v8.0"
     )
     deep = plate_solver.make_solver(fov_deg, None, catalog=str(CATALOGS / "gaia_v8.0.ecsv"))
-    report, _ = plate_solver.solve_array(image, deep, None)
+    report, _ = plate_solver.solve_array(image, deep)
     pointing = plate_solver.solution_fields(report)
     ours, truth = (
         stars.cam_from_icrs(*angles)

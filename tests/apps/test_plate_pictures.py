@@ -181,7 +181,7 @@ def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(
         np.ascontiguousarray(STORED[orientation](gray)), focal_35mm=focal_35mm
     )
     unknown = plate_solver.make_solver(None, None)
-    outcome = plate_solver.solve_picture(seen, unknown, None)
+    outcome = plate_solver.solve_picture(seen, unknown)
     assert outcome.report.attitude.solved
     assert outcome.hypothesis.solver.fov_deg is not None
     assert [one.solver.hypotheses for one in outcome.tried] == [2, 2]
@@ -196,8 +196,7 @@ def test_trackers_are_cached_by_their_uncertainty(gray: NDArray) -> None:
     # Of the same picture: they share their trackers' cache.
     by_exif = solver.replace(default_solver, fov_uncertainty=0.1)
     first, second, again = (
-        next(one.trackers(640, 480, None))
-        for one in (default_solver, by_exif, default_solver)
+        next(one.trackers(640, 480)) for one in (default_solver, by_exif, default_solver)
     )
     assert (first.focal_uncertainty, second.focal_uncertainty) == (
         solver.FOV_UNCERTAINTY,
@@ -255,7 +254,7 @@ def test_every_hypothesis_reduces_the_allowed_chance_probability(
     for log10_chance, accepted in ((limit - 0.01, True), (limit + 0.01, False)):
         tracker = FixedTracker(log10_chance)
         monkeypatch.setattr(solver.Solver, "trackers", lambda *_: iter([tracker]))  # noqa: B023
-        attitude, _ = solver.solve_centroids(Centroids.empty(), one, (64, 48), None, Clock())
+        attitude, _ = solver.solve_centroids(Centroids.empty(), one, (64, 48), Clock())
         assert attitude.solved is accepted
 
 

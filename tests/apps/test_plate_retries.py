@@ -39,11 +39,11 @@ def town(light: NDArray, rng: np.random.Generator) -> None:
 def test_an_image_with_a_town_below_is_solved_by_its_upper_half() -> None:
     image, truth = drawn(replace(SHOT, limit_mag=5.4, spoil=town), 3)
     solver = plate_solver.make_solver(SHOT.fov_deg, None)
-    assert not plate_solver.solve_array(image, solver, None)[0].attitude.solved
-    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver, None)
+    assert not plate_solver.solve_array(image, solver)[0].attitude.solved
+    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
     assert (
-        plate_solver.outcome_fields(outcome, None)["hint"]
+        plate_solver.outcome_fields(outcome)["hint"]
         == "its stars were found in its upper half alone"
     )
     assert (outcome.report.centroids.xy_px[:, 1] < 480).all()
@@ -62,11 +62,7 @@ def test_removing_clouds_keeps_the_stars() -> None:
     image, _ = drawn(replace(SHOT, spoil=clouds), 4)
     plain, _ = drawn(SHOT, 4)
     seen = [
-        len(
-            plate_solver.solve_array(one, plate_solver.make_solver(22.0, None), None)[
-                0
-            ].centroids
-        )
+        len(plate_solver.solve_array(one, plate_solver.make_solver(22.0, None))[0].centroids)
         for one in (image, plain)
     ]
     found = retries.without_clouds(image, Settings())
@@ -115,12 +111,12 @@ def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number:
         return int(np.count_nonzero(off.min(axis=1) < 2))
 
     solver = plate_solver.make_solver(shot.fov_deg, None)
-    report, _ = plate_solver.solve_array(image, solver, None)
+    report, _ = plate_solver.solve_array(image, solver)
     assert not report.attitude.solved
     first = right(report.centroids)
     most = max(map(right, retries.trails(image, Settings())))
     assert most > 2 * first
-    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver, None)
+    outcome = plate_solver.solve_picture(images.ViewedImage(image), solver)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
 
 
@@ -132,12 +128,12 @@ def test_round_stars_are_not_taken_for_trails() -> None:
 def test_an_upper_half_is_solved_in_its_own_field() -> None:
     """The trackers' field is the upper half; attitude and camera refer to the whole image."""
     image, truth = drawn(replace(SHOT, fov_deg=36.0, limit_mag=5.6), 7)
-    centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None), None)[
+    centroids = plate_solver.solve_array(image, plate_solver.make_solver(36.0, None))[
         0
     ].centroids
     upper = centroids.take(centroids.xy_px[:, 1] < 479.5)
     solver = replace(plate_solver.make_solver(None, None), upper_half=True)
-    report, tracker = plate_solver.solve_array(image, solver, None, upper)
+    report, tracker = plate_solver.solve_array(image, solver, upper)
     assert tracker.camera.height_px == 480
     assert report.attitude.camera.height_px == 960
     assert photographs.is_same(report.attitude.cam_from_ref, truth)
@@ -168,5 +164,5 @@ def test_lights_at_random_are_refused_in_every_part() -> None:
     for seed in range(10):
         image, _ = drawn(replace(SHOT, starless=True, spoil=photographs.trees), seed)
         assert not plate_solver.solve_picture(
-            images.ViewedImage(image), blind, None
+            images.ViewedImage(image), blind
         ).report.attitude.solved

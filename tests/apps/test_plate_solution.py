@@ -236,5 +236,5 @@ def test_false_lights_are_not_solved_near_a_place_either(lights: int) -> None:
         centroids = Centroids(
             xy_px, np.full(lights, 0.1), np.sort(rng.lognormal(size=lights))[::-1]
         )
-        attitude, _ = solve_centroids(centroids, solver, (659, 493), None, Clock())
+        attitude, _ = solve_centroids(centroids, solver, (659, 493), Clock())
         assert not attitude.solved

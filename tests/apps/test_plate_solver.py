@@ -60,7 +60,7 @@ def test_a_given_field_is_the_only_one_tried() -> None:
 def test_trackers_are_kept_for_images_of_one_size_and_time() -> None:
     solver = plate_solver.make_solver(20.0, None)
     first, again, other = (
-        next(solver.trackers(*size, None)) for size in ((640, 480), (640, 480), (640, 400))
+        next(solver.trackers(*size)) for size in ((640, 480), (640, 480), (640, 400))
     )
     assert first is again
     assert other is not first
@@ -178,7 +178,7 @@ def test_a_rendered_field_is_solved_without_any_hint(
 ) -> None:
     """2 atan(658 x 9.9 um / 2 f) between the middles of the edge columns, to half a per cent; three arc-minutes."""
     frame, truth = photographed(focal)
-    found, _ = plate_solver.solve_array(frame.image_dn, blind, None)
+    found, _ = plate_solver.solve_array(frame.image_dn, blind)
     solution = plate_solver.solution_fields(found)
     ours = stars.cam_from_icrs(solution["ra_deg"], solution["dec_deg"], solution["roll_deg"])
     x, y, _ = np.degrees((ours * truth.cam_from_lab.inv()).as_rotvec())
@@ -191,12 +191,11 @@ def test_centroids_of_smeared_frames_of_a_known_camera_use_their_streaks() -> No
     """14 px of unmodeled smear: error below 100" and consistent with the covariance; round-star fits roll 400" off."""
     fast = {"exposure.frames": "16", "motion.rate_deg_s": "[4.8, 6.4, 0]"}
     flight = simulate_motion(loader.load("scoreboard", fast))
-    camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml")
+    start_utc = flight.lab.scene.start_time
+    camera = plate_solver.make_solver(None, SCENES / "shefex2.yaml", start_utc)
     for n in (5, 15):
         frame, truth = flight.render(n)
-        found = plate_solver.solve_array(frame.image_dn, camera, flight.lab.scene.start_time)[
-            0
-        ].attitude
+        found = plate_solver.solve_array(frame.image_dn, camera)[0].attitude
         assert found.cam_from_ref is not None
         error_rad = (found.cam_from_ref * truth.cam_from_lab.inv()).as_rotvec()
         assert np.abs(error_rad).max() < 100 * ARCSEC_RAD
@@ -209,9 +208,7 @@ def test_centroids_of_smeared_frames_of_a_known_camera_use_their_streaks() -> No
 def test_a_mirrored_sky_is_refused_by_the_plate_solver(blind: plate_solver.Solver) -> None:
     """No rotation maps the sky to its mirror image, so every solution would be wrong."""
     frame, _ = photographed("25 mm")
-    found, _ = plate_solver.solve_array(
-        np.ascontiguousarray(frame.image_dn[:, ::-1]), blind, None
-    )
+    found, _ = plate_solver.solve_array(np.ascontiguousarray(frame.image_dn[:, ::-1]), blind)
     assert not found.attitude.solved
     assert len(found.centroids) >= 4
 

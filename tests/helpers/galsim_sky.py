@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -227,9 +227,9 @@ def plate_solver_way(setup: CameraSetup) -> Ours:
     fov_deg = float(np.degrees(setup.camera.fov_rad)) * (1 + setup.fov_error)
     solver = plate_solver.make_solver(fov_deg, None)
     return lambda image, path: (
-        plate_solver.solve_array(image, solver, images.read_picture(path).date_utc)[
-            0
-        ].attitude
+        plate_solver.solve_array(
+            image, replace(solver, time_utc=images.read_picture(path).date_utc)
+        )[0].attitude
     )
 
 

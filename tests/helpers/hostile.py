@@ -374,7 +374,7 @@ class Judge:
         if shape not in cached:
             cached[shape] = plate_solver.make_solver(*how)
             if shape:
-                list(cached[shape].trackers(*shape[::-1], None))
+                list(cached[shape].trackers(*shape[::-1]))
         return cached[shape]
 
     def take(self, n: int, seed: int) -> tuple[str, HostileInput, dict, float, float]:

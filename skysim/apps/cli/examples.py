@@ -25,15 +25,21 @@ PARAMETERS = "\n\nParameters\n----------\n"
 
 
 def documented(command: Any) -> None:
-    """Give a command's parameters the help in its docstring; one that is not annotated is an option."""
+    """Give a command's parameters the help in its docstring, and the metavar there, as in `size : WxH`.
+
+    A parameter that is not annotated is an option. A bool is a flag: typer alone would add an option --no-NAME.
+    """
     text, _, section = (inspect.getdoc(command) or "").partition(PARAMETERS)
     signature = inspect.signature(command, eval_str=True)
     options = dict(signature.parameters)
-    for name, explained in re.findall(r"^(\w+)\n((?: +.+\n?)+)", section, re.MULTILINE):
+    described = re.findall(r"^(\w+)(?: : (.+))?\n((?: +.+\n?)+)", section, re.MULTILINE)
+    for name, metavar, explained in described:
         kind = options[name].annotation
         if not hasattr(kind, "__metadata__"):
-            kind = Annotated[kind, typer.Option()]
-        kind.__metadata__[0].help = " ".join(explained.split())
+            kind = Annotated[kind, typer.Option(f"--{name.rstrip('_').replace('_', '-')}")]
+        parameter = kind.__metadata__[0]
+        parameter.help = " ".join(explained.split())
+        parameter.metavar = metavar or parameter.metavar
         options[name] = options[name].replace(annotation=kind)
     command.__doc__ = text
     command.__signature__ = signature.replace(parameters=list(options.values()))

@@ -81,11 +81,8 @@ def relaxed(node: Any, name: str = "") -> Any:
         elif (
             key in BOUND_KEYWORDS
         ):  # pydantic's keyword remains where a validator precedes the bound
-            relaxed_node |= (
-                {BOUND_KEYWORDS[key]: value}
-                if node.get("type") in ("number", "integer")
-                else {}
-            )
+            if node.get("type") in ("number", "integer"):
+                relaxed_node[BOUND_KEYWORDS[key]] = value
         elif key not in DROPPED_KEYWORDS and (key != "title" or name):
             relaxed_node["anyOf" if key == "oneOf" else key] = relaxed(value)
     return relaxed_node

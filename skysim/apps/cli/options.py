@@ -96,9 +96,9 @@ Json = Annotated[bool, Option("--json", help="Print JSON instead of text.")]
 
 def load(
     name: str,
-    frames: int | None,
-    seed: int | None,
     overrides: list[str] | None,
+    seed: int | None = None,
+    frames: int | None = None,
     trackers: list[str] | None = None,
 ) -> Scene:
     """Load the scene with the command line's overrides. Raises InputError.
@@ -195,9 +195,9 @@ def command_line() -> str:
     return shlex.join(["skysim", *sys.argv[1:]])
 
 
-def selected_stages(**stages: str | None) -> dict[str, str]:
-    """The tracker stages for which the command line names an algorithm."""
-    return {stage: name for stage, name in stages.items() if name is not None}
+def given_options(**options: Any) -> dict[str, Any]:
+    """The options that the command line has, without those that are left out."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 # Errors with the option that a user typed in place of the key.

@@ -7,7 +7,6 @@ view. Such a solution only shows the cause; it is never the answer.
 import functools
 import math
 from dataclasses import dataclass, replace
-from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +58,6 @@ class Refusal:
     image: NDArray
     centroids: Centroids
     solvers: tuple[Solver, ...]
-    date_utc: datetime | None = None
     row_order_known: bool = True
 
     @property
@@ -138,9 +136,7 @@ def mirrored(refusal: Refusal) -> str:
         return ""
     flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
     for solver in refusal.solvers:
-        attitude, _ = solve_centroids(
-            flipped, solver, refusal.size_px, refusal.date_utc, Clock(), EFFORTS
-        )
+        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, Clock(), EFFORTS)
         if attitude.solved:
             return MIRRORED
     return ""
@@ -163,7 +159,7 @@ def other_field(refusal: Refusal) -> str:
         return ""
     unknown = replace(refusal.solvers[0], fov_deg=None, camera=None)
     cameras = unknown.candidate_cameras(*refusal.size_px)
-    trackers = unknown.trackers(*refusal.size_px, refusal.date_utc)
+    trackers = unknown.trackers(*refusal.size_px)
     attitude, _ = best_attitude(refusal.centroids, trackers, Clock(), 0, len(cameras))
     if not attitude.solved:
         return ""

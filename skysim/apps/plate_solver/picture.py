@@ -236,7 +236,7 @@ def read_and_solve(
     """As `solve_file`, but raise InputError for an unreadable image."""
     result = blank_result(path, solver)
     begin = time.perf_counter()
-    date_utc = None
+    taken_utc = solver.time_utc
     reading: SolvedReading | DomeReading
     try:
         source: images.ViewedImage | Centroids
@@ -245,14 +245,15 @@ def read_and_solve(
         else:
             source = load_picture(path, solver.camera, picture)
             date_utc, warning = validated_date(source.date_utc)
-            if warning and not solver.time_utc:
+            taken_utc = taken_utc or date_utc
+            if warning and not taken_utc:
                 result["warning"] = f"{path}: DATE-OBS {warning}: ignored"
         if isinstance(solver, DomeSolver):
             reading = solve_dome(source, solver)
         elif isinstance(source, Centroids):
             reading = solve_list(path, source, solver)
         else:
-            reading = solve_picture(source, solver, date_utc)
+            reading = solve_picture(source, replace(solver, time_utc=taken_utc))
     except InputError as error:
         raise error if error.key == printable(path) else error.within(path) from None
     except ImageError as error:
@@ -262,8 +263,7 @@ def read_and_solve(
     if isinstance(reading, DomeReading):
         result |= dome_fields(reading)
     else:
-        result |= outcome_fields(reading, date_utc)
-    taken_utc = solver.time_utc or date_utc
+        result |= outcome_fields(reading)
     result["date_utc"] = taken_utc.isoformat() if taken_utc else None
     write_outputs(outputs, reading, result)
     return result
@@ -316,7 +316,7 @@ def solve_list(path: Path, centroids: Centroids, solver: Solver) -> SolvedReadin
             "a size in pixels, or a camera",
         )
     begin = Clock()
-    attitude, tracker = solve_centroids(centroids, solver, size_px, None, begin)
+    attitude, tracker = solve_centroids(centroids, solver, size_px, begin)
     report = Report(attitude, centroids, begin.seconds)
     reading = Reading(np.zeros(size_px[::-1], np.uint8), solver)
     return SolvedReading(reading, report, tracker, [reading])
@@ -397,9 +397,7 @@ def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
         )
 
 
-def solve_picture(
-    picture: images.ViewedImage, solver: Solver, date_utc: datetime | None
-) -> SolvedReading:
+def solve_picture(picture: images.ViewedImage, solver: Solver) -> SolvedReading:
     """Solve the hypotheses about a monochrome picture in turn, up to the first that is solved."""
     tried = hypotheses(picture, solver)
     outcomes = []
@@ -407,17 +405,15 @@ def solve_picture(
     centroids: dict[bool, Centroids] = {}
     for one in tried:
         known = centroids.get(one.flipped)
-        report, tracker = solve_array(one.pixels, one.solver, date_utc, known)
+        report, tracker = solve_array(one.pixels, one.solver, known)
         outcomes.append(SolvedReading(one, report, tracker, tried))
         centroids[one.flipped] = report.centroids
         if report.attitude.solved:
             return outcomes[-1]
-    return solve_again(outcomes, date_utc) or outcomes[0]
+    return solve_again(outcomes) or outcomes[0]
 
 
-def solve_again(
-    refused: list[SolvedReading], date_utc: datetime | None
-) -> SolvedReading | None:
+def solve_again(refused: list[SolvedReading]) -> SolvedReading | None:
     """The first hypothesis that is solved by other centroids of its picture (`retries`), if any."""
     camera = refused[0].hypothesis.solver.camera
     if camera and camera.detector:
@@ -430,9 +426,7 @@ def solve_again(
             for one in (one.hypothesis for one in readings):
                 tries = one.solver.hypotheses * retries.EXTRA_TRIES
                 solver = replace(one.solver, hypotheses=tries, upper_half=retry.upper_half)
-                report, tracker = solve_array(
-                    pixels, solver, date_utc, retry.centroids, retry.efforts
-                )
+                report, tracker = solve_array(pixels, solver, retry.centroids, retry.efforts)
                 if report.attitude.solved:
                     notes = "; ".join(filter(None, (one.assumption, retry.note)))
                     return SolvedReading(
@@ -471,7 +465,7 @@ def hypotheses(picture: images.ViewedImage, solver: Solver) -> list[Reading]:
     ]
 
 
-def outcome_fields(outcome: SolvedReading, date_utc: datetime | None) -> Record:
+def outcome_fields(outcome: SolvedReading) -> Record:
     """The fields of PlateSolution: image statistics, tried fields, and solution or likely cause of the refusal."""
     report = outcome.report
     (pixels, solver, assumption, _) = outcome.hypothesis
@@ -489,9 +483,7 @@ def outcome_fields(outcome: SolvedReading, date_utc: datetime | None) -> Record:
         notes = camera_notes(report.attitude.camera, outcome.tracker)
         return seen | solved | {"hint": "; ".join([assumption] * bool(assumption) + notes)}
     rows_known = len({one.flipped for one in outcome.tried}) == 1
-    refusal = diagnosis.Refusal(
-        pixels, report.centroids, tuple(solvers), date_utc, rows_known
-    )
+    refusal = diagnosis.Refusal(pixels, report.centroids, tuple(solvers), rows_known)
     assumed = outcome.tried[0].assumption
     hint = diagnosis.likely_cause(refusal) + f" ({assumed})" * bool(assumed)
     return seen | {"hint": hint}

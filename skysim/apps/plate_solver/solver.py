@@ -18,9 +18,10 @@ import math
 import os
 from collections import deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -38,7 +39,7 @@ from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.search_models import QUAD_SEARCHES
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
 from skysim.core.types import Bools
@@ -137,9 +138,9 @@ class Solver:
     Attributes
     ----------
     time_utc
-        Time at which the images were taken; None takes the date of each FITS header. Without any
-        date the epoch is 2020, and stellar aberration (20") is left out because its direction
-        depends on the season
+        Time at which the images were taken; if it is None, `skysim solve` sets the date of each FITS
+        header. Without any date the epoch is 2020, and stellar aberration (20") is left out because
+        its direction depends on the season
     fov_uncertainty
         Relative uncertainty of the focal length that follows from fov_deg
     hypotheses
@@ -200,21 +201,19 @@ class Solver:
         ]
         return min(ends), max(ends)
 
-    def trackers(
-        self, width_px: int, height_px: int, date_utc: datetime | None
-    ) -> Iterator[StarTracker]:
-        """Yield the trackers for an image of this size and date: one, or one per range of fields of view.
+    def trackers(self, width_px: int, height_px: int) -> Iterator[StarTracker]:
+        """Yield the trackers for an image of this size: one, or one per range of fields of view.
 
         Trackers are built when first needed and cached until an image of another size or date comes.
         """
-        date_utc = self.time_utc or date_utc
-        if (width_px, height_px, date_utc) not in self.tracker_cache:
+        key = width_px, height_px, self.time_utc
+        if key not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
-        cached = self.tracker_cache.setdefault((width_px, height_px, date_utc), {})
+        cached = self.tracker_cache.setdefault(key, {})
         vectors = None
         for camera, uncertainty in self.candidate_cameras(width_px, height_px):
             if (camera, uncertainty) not in cached:
-                vectors = self.vectors(date_utc) if vectors is None else vectors
+                vectors = self.vectors() if vectors is None else vectors
                 cached[camera, uncertainty] = self.tracker(camera, vectors, uncertainty)
             yield cached[camera, uncertainty]
 
@@ -228,11 +227,11 @@ class Solver:
             / (4 * math.pi)
         )
 
-    def vectors(self, date_utc: datetime | None) -> Floats:
-        """(N, 3) directions of the stars as seen from the Earth at a date, or at the default epoch."""
-        if date_utc is None:
+    def vectors(self) -> Floats:
+        """(N, 3) directions of the stars as seen from the Earth at the solver's time, or at the default epoch."""
+        if self.time_utc is None:
             return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
-        return star_catalog.apparent(self.stars, star_catalog.on_earth(date_utc))
+        return star_catalog.apparent(self.stars, star_catalog.on_earth(self.time_utc))
 
     def within_reach(self, camera: Camera, vectors: Floats) -> Bools:
         """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
@@ -276,7 +275,7 @@ def make_solver(
     Parameters
     ----------
     stages
-        Names of algorithms by stage (`check_stages`); the tracker's defaults for the others
+        Names of algorithms by stage: detector, centroider, identifier, solver; the tracker's defaults for the others
     catalog
         Name or file of a star catalog; the shipped one, CATALOG, if left out
     size_px, near_deg
@@ -302,7 +301,10 @@ def make_solver(
         raise InputError("solve.time_utc", warning)
     camera, settings = read_camera(camera_file) if camera_file else (None, PHOTOGRAPH)
     if stages:
-        check_stages(stages)
+        from skysim.tracking.factory import STAR_ALGORITHMS
+
+        for stage, name in stages.items():
+            check_name(f"solve.{stage}", stage, name, STAR_ALGORITHMS[stage])
         settings = replace(settings, **stages)  # type: ignore[arg-type]
     stars = read_catalog(catalog)
     return Solver(
@@ -326,17 +328,6 @@ def kept_solver(
         Pairs of stage and algorithm
     """
     return make_solver(fov_deg, None, time_utc, dict(stages))
-
-
-def check_stages(stages: Mapping[str, str]) -> None:
-    """Raise InputError for the name of an unknown algorithm; stages are detector, centroider, identifier, solver."""
-    from skysim.tracking.factory import STAR_ALGORITHMS
-
-    for stage, name in stages.items():
-        if name not in STAR_ALGORITHMS[stage]:
-            raise InputError(
-                f"solve.{stage}", *unknown_name(stage, name, STAR_ALGORITHMS[stage])
-            )
 
 
 def read_camera(path: Path) -> tuple[KnownCamera, Settings]:
@@ -402,7 +393,6 @@ def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
 def solve_array(
     image: NDArray,
     solver: Solver,
-    date_utc: datetime | None,
     centroids: Centroids | None = None,
     efforts: int | None = None,
 ) -> tuple[Report, StarTracker]:
@@ -410,20 +400,18 @@ def solve_array(
 
     Parameters
     ----------
-    date_utc
-        Date of the image; None if unknown
     centroids
         Centroids of this image, if they are known
     efforts
         As in `solve_centroids`
     """
     height_px, width_px = image.shape
-    first = next(solver.trackers(width_px, height_px, date_utc))
+    first = next(solver.trackers(width_px, height_px))
     clock = Clock()
     if centroids is None:  # only the size of the camera is used
         centroids = detect_and_centroid(image, first.camera, solver.settings, clock)
     attitude, tracker = solve_centroids(
-        centroids, solver, (width_px, height_px), date_utc, clock, efforts
+        centroids, solver, (width_px, height_px), clock, efforts
     )
     if attitude.camera:
         # Of a half, the camera of the whole picture.
@@ -435,7 +423,6 @@ def solve_centroids(
     centroids: Centroids,
     solver: Solver,
     size_px: tuple[int, int],
-    date_utc: datetime | None,
     clock: Clock,
     efforts: int | None = None,
 ) -> Solved:
@@ -446,7 +433,7 @@ def solve_centroids(
     efforts
         Number of searches that are made, of growing effort; None: all of them
     """
-    first = next(solver.trackers(*size_px, date_utc))
+    first = next(solver.trackers(*size_px))
     made = range(first.efforts)[:efforts]
     if solver.field_is_known:
         for effort in [None] if efforts is None else made:
@@ -458,7 +445,7 @@ def solve_centroids(
         return (Attitude(NO_MATCH) if refused else attitude), first
     tries = len(solver.candidate_cameras(*size_px)) * solver.hypotheses
     for effort in made:  # try all fields of view quickly before trying any thoroughly
-        trackers = solver.trackers(*size_px, date_utc)
+        trackers = solver.trackers(*size_px)
         attitude, tracker = best_attitude(centroids, trackers, clock, effort, tries)
         if attitude.solved:
             break
@@ -506,16 +493,14 @@ def attitudes(
 ) -> Iterator[Solved]:
     """Yield the attitudes of trackers in their order. THREADS of them solve at once: compiled code holds no GIL."""
     pool = ThreadPoolExecutor(THREADS)
-    running: deque[tuple[Future[Attitude], StarTracker]] = deque()
+    begun = (
+        (pool.submit(one.solve_centroids, centroids, None, effort), one) for one in trackers
+    )
     try:
-        for tracker in trackers:
-            running.append(
-                (pool.submit(tracker.solve_centroids, centroids, None, effort), tracker)
-            )
-            if len(running) == THREADS:
-                future, first = running.popleft()
-                yield future.result(), first
-        for future, tracker in running:
+        running = deque(islice(begun, THREADS))
+        while running:
+            future, tracker = running.popleft()
             yield future.result(), tracker
+            running.extend(islice(begun, 1))
     finally:
         pool.shutdown(cancel_futures=True)

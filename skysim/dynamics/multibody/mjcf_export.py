@@ -355,6 +355,32 @@ def add_mesh(
     add_visual_geom(body or spec.worldbody, name, kind, **more)
 
 
+def brightest(
+    sources: Sources, most_stars: int, most_leds: int | None = None
+) -> tuple[bool, Ints, Floats, Floats, Floats]:
+    """The brightest lights as they are drawn.
+
+    Returns
+    -------
+    stars
+        Whether they are stars, on a sphere
+    rows
+        (N,) their rows in the sources, brightest first
+    fraction
+        (N,) mean strength over a period, relative to the brightest light
+    position_m, radius_m
+        (N, 3) places in the lab frame, and (N,) sizes: of a star by the square root of its strength
+    """
+    mean = sources.strength * sources.on_s / sources.period_s
+    # A place whose fourth component is 0 is a direction.
+    stars = bool((sources.place[:, 3] == 0).any())
+    rows = np.argsort(-mean, kind="stable")[: most_stars if stars else most_leds]
+    fraction = mean[rows] / mean.max(initial=1e-300)
+    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
+    sizes_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(rows), LED_RADIUS_M)
+    return stars, rows, fraction, position_m, sizes_m
+
+
 def add_lights(spec: Any, sources: Sources) -> None:
     """Add a glowing octahedron for each LED, or for each of the brightest stars.
 
@@ -362,15 +388,7 @@ def add_lights(spec: Any, sources: Sources) -> None:
     share one mesh: as many sites would make a step eight times as slow, and a picture take seconds.
     """
     glow = spec.add_material(name="stage_glow", emission=0.8, specular=0.0)
-    mean = sources.strength * sources.on_s / sources.period_s
-    # Mean strength over a period, brightest first. A place whose fourth component is 0 is a direction.
-    stars = bool((sources.place[:, 3] == 0).any())
-    shown = np.argsort(-mean, kind="stable")[: MAX_STARS if stars else len(mean)]
-    fraction = mean[shown] / mean.max(initial=1e-300)
-    position_m = sources.place[shown, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = (
-        0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(shown), LED_RADIUS_M)
-    )
+    stars, shown, fraction, position_m, radius_m = brightest(sources, MAX_STARS)
     # One mesh for each step of brightness; all stars have the brightest.
     level = np.full(len(shown), LEVELS) if stars else np.ceil(fraction * LEVELS).astype(int)
     for step in np.unique(level):

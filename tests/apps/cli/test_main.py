@@ -861,11 +861,11 @@ def test_compare_takes_options_of_any_of_its_trackers() -> None:
     """An option is refused only if no compared tracker uses it."""
     words = ["tracker.solver=quest", "tracker.options={a: 1}"]
     both = ["own", "mine"]
-    assert load("shefex2", 1, None, words, both).tracker.name == "own"
+    assert load("shefex2", words, None, 1, both).tracker.name == "own"
     for trackers in (["own"], ["mine"]):
         with pytest.raises(InputError, match="has no effect"):
-            load("shefex2", 1, None, words, trackers)
+            load("shefex2", words, None, 1, trackers)
     with pytest.raises(
         InputError, match=r"tracker.assumed_camera_body: has no effect.*\(overrides\)"
     ):
-        load("shefex2", 1, None, ["tracker.assumed_camera_body=[1 m, 0 m, 0 m]"], both)
+        load("shefex2", ["tracker.assumed_camera_body=[1 m, 0 m, 0 m]"], None, 1, both)

@@ -113,16 +113,16 @@ def test_an_error_names_the_typed_option(error: InputError, line: str) -> None:
 
 def test_a_key_that_an_option_of_its_own_sets_is_named_by_that_option() -> None:
     with pytest.raises(InputError) as raised:
-        load("shefex2", 0, None, None)
+        load("shefex2", None, frames=0)
     assert str(as_typed(raised.value)).startswith("--frames: 0 is not allowed; allowed: ")
     with pytest.raises(InputError) as raised:
-        load("shefex2", None, None, ["exposure.frames=0"])
+        load("shefex2", ["exposure.frames=0"])
     assert str(as_typed(raised.value)).startswith("exposure.frames: 0 is not allowed; ")
     assert str(as_typed(raised.value)).endswith("(--set)")
 
 
 def test_a_key_that_is_checked_after_loading_gets_its_place() -> None:
-    load("shefex2", None, 5, ["camera.f_number=2"])
+    load("shefex2", ["camera.f_number=2"], 5)
     in_file = as_typed(InputError("light.kind", "cannot be built"))
     assert in_file.where is not None
     assert in_file.where.line

@@ -48,11 +48,11 @@ from skysim.core.errors import InputError
 from skysim.core.images import IMAGE_SUFFIXES
 from skysim.core.paths import ROOT, SCENES
 from skysim.core.types import Mount
-from skysim.dynamics import multibody
 from skysim.experiments.study import study_file as study_loader
 from skysim.results import plots, scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight, simulate_motion
+from skysim.simulation.lab import build_lab
 from skysim.sources import catalog, stars
 
 
@@ -81,9 +81,8 @@ def test_a_solar_system_body_is_listed_with_name_and_magnitude() -> None:
 
 # Where the camera looks.
 
-STARS = loader.load("shefex2")
-DOME = loader.load("afit_simsat")
-UPRIGHT = Mount(np.array([0.0, 0.0, 0.4]), Rotation.from_euler("x", 180, degrees=True))
+STARS = build_lab(loader.load("shefex2"))
+DOME = build_lab(loader.load("afit_simsat"))
 
 
 def boresight(mount: Mount, lab_from_body: Rotation) -> np.ndarray:
@@ -91,8 +90,8 @@ def boresight(mount: Mount, lab_from_body: Rotation) -> np.ndarray:
 
 
 def test_typed_angles_are_the_camera_s_under_the_stars() -> None:
-    mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    lab_from_body = geometry.from_angles(STARS, mount, (83.0, -5.0, 30.0))
+    mount = STARS.camera.mount
+    lab_from_body = geometry.from_angles(STARS, (83.0, -5.0, 30.0))
     ra, dec = np.radians([83.0, -5.0])
     towards = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
     np.testing.assert_allclose(boresight(mount, lab_from_body), towards, rtol=0, atol=1e-12)
@@ -103,17 +102,16 @@ def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
     dec_deg: float,
 ) -> None:
     """After the right key, a star at the image's center is a fiftieth of the field to its left."""
-    mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    before = geometry.from_angles(STARS, mount, (83.0, dec_deg, 20.0))
-    after = geometry.moved(STARS, mount, before, geometry.FINE, 0.0, 0.0)
+    mount = STARS.camera.mount
+    before = geometry.from_angles(STARS, (83.0, dec_deg, 20.0))
+    after = geometry.moved(STARS, before, geometry.FINE, 0.0, 0.0)
     star = boresight(mount, before)
     x, y, z = (mount.cam_from_body * after.inv()).apply(star)
-    across = 2 * np.arctan(STARS.camera.width_px / 2 / STARS.camera.focal_px)
+    across = 2 * np.arctan(STARS.scene.camera.width_px / 2 / STARS.scene.camera.focal_px)
     np.testing.assert_allclose(np.arctan2(x, z), -geometry.FINE * across, rtol=1e-9)
     np.testing.assert_allclose(y, 0.0, atol=1e-12)
     _, y, z = (
-        mount.cam_from_body
-        * geometry.moved(STARS, mount, before, 0.0, geometry.FINE, 0.0).inv()
+        mount.cam_from_body * geometry.moved(STARS, before, 0.0, geometry.FINE, 0.0).inv()
     ).apply(star)
     # Down: y is down.
     np.testing.assert_allclose(np.arctan2(y, z), geometry.FINE * across, rtol=1e-9)
@@ -121,12 +119,12 @@ def test_an_arrow_key_moves_stars_by_its_share_of_the_field_even_at_the_pole(
 
 def test_key_r_rolls_the_camera_clockwise_and_stars_counterclockwise() -> None:
     """PTASE's sign: positive when the sensor moves clockwise, stars appear counter-clockwise."""
-    mount = multibody.camera_mount(multibody.build(STARS.vehicle))
-    before = geometry.from_angles(STARS, mount, (83.0, 2.0, 0.0))
+    mount = STARS.camera.mount
+    before = geometry.from_angles(STARS, (83.0, 2.0, 0.0))
     above = stars.cam_from_icrs(83.0, 2.0, 0.0).inv().apply([0.0, -0.1, 1.0])
-    x, y, _ = (
-        mount.cam_from_body * geometry.moved(STARS, mount, before, 0, 0, 10.0).inv()
-    ).apply(above)
+    x, y, _ = (mount.cam_from_body * geometry.moved(STARS, before, 0, 0, 10.0).inv()).apply(
+        above
+    )
     np.testing.assert_allclose(
         np.degrees(np.arctan2(-x, -y)), 10.0, rtol=1e-9
     )  # to the left of up
@@ -134,10 +132,10 @@ def test_key_r_rolls_the_camera_clockwise_and_stars_counterclockwise() -> None:
 
 def test_a_tilt_beyond_the_stop_and_angles_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match=r"tilt of 40\.0 deg: the bearing stops at 30 deg"):
-        geometry.from_angles(DOME, UPRIGHT, (40.0, 0.0, 0.0))
+        geometry.from_angles(DOME, (40.0, 0.0, 0.0))
     for angles in ((400.0, 0.0, 0.0), (10.0, 95.0, 0.0), (float("nan"), 0.0, 0.0)):
         with pytest.raises(InputError, match="allowed"):
-            geometry.from_angles(STARS, UPRIGHT, angles)
+            geometry.from_angles(STARS, angles)
 
 
 def test_every_key_of_the_2005_program_is_in_the_key_help() -> None:
@@ -311,7 +309,7 @@ def test_a_scene_s_file_outside_its_folder_is_refused(tmp_path: Path) -> None:
 def test_a_scene_is_saved_as_its_differences_without_overwriting(tmp_path: Path) -> None:
     path = forms.save(tmp_path, "mine", "shefex2", {"camera.f_number": "2"}, "Mine")
     assert loader.load(path).camera.f_number == 2
-    assert loader.load(path).light == STARS.light
+    assert loader.load(path).light == STARS.scene.light
     with pytest.raises(InputError, match="file exists"):
         forms.save(tmp_path, "mine", "shefex2", {}, "Mine")
     for name in ("../up", "a/b", "", ".hidden"):

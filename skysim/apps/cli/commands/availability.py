@@ -54,7 +54,7 @@ def availability(
     """
     import numpy as np
 
-    config = load(scene, None, None, overrides)
+    config = load(scene, overrides)
     exclusion = config.orbit.exclusion if config.orbit else None
     if exclusion is None:
         raise InputError(

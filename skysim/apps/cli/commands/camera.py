@@ -102,7 +102,7 @@ def preset_entry(path: Path) -> dict[str, str]:
 
 @app.command("show")
 def camera_show(
-    file: Annotated[str, Argument(metavar="FILE", autocompletion=complete_camera)],
+    file: Annotated[str, Argument(autocompletion=complete_camera)],
     out: Path | None = None,
     set_: Overrides = None,
     json: Json = False,
@@ -113,7 +113,7 @@ def camera_show(
 
     Parameters
     ----------
-    file
+    file : FILE
         Scene, camera file, preset (data/cameras) or OpenCV calibration (YAML): a file or a name.
     out
         Also write the calibration to this file, in OpenCV's YAML format.

@@ -2,10 +2,9 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
-from typer import Option
 
 from skysim.apps.cli.commands.study import (
     EngineName,
@@ -17,18 +16,15 @@ from skysim.apps.cli.commands.study import (
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed
 from skysim.apps.cli.terminal import print_error, print_json, trial_progress
 
-OutputUrl = Annotated[str, Option(metavar="URL")]
-Variations = Annotated[Path | None, Option(metavar="FILE")]
-
 
 def dataset(
     scene: SceneArg,
     frames: int,
-    out: OutputUrl,
-    vary: Variations = None,
+    out: str,
+    vary: Path | None = None,
     to: list[str] | None = None,
     shard_frames: int = 64,
-    compress: Annotated[bool, Option("--compress")] = False,
+    compress: bool = False,
     seed: Seed = None,
     set_: Overrides = None,
     workers: Workers = None,
@@ -44,9 +40,9 @@ def dataset(
     ----------
     frames
         Number of frames.
-    out
+    out : URL
         Output folder, or a URL such as s3://bucket/folder.
-    vary
+    vary : FILE
         Variations: YAML with the study's keys set, trial, factors, hardware.
     to
         Format: webdataset, zarr, coco; repeatable. Default: webdataset and coco.

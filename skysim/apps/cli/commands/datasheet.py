@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
-from typer import Option
 
 from skysim.apps.cli.commands.study import Workers
 from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
@@ -21,13 +20,9 @@ if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames
 
 
-Quick = Annotated[bool, Option("--quick")]
-AsFmu = Annotated[bool, Option("--fmu")]
-
-
 def datasheet(
     scene: SceneArg,
-    quick: Quick = False,
+    quick: bool = False,
     fields: int | None = None,
     rates: str | None = None,
     seed: Seed = None,
@@ -36,7 +31,7 @@ def datasheet(
     out: Path | None = None,
     markdown: Path | None = None,
     model: Path | None = None,
-    fmu: AsFmu = False,
+    fmu: bool = False,
     open_: OpenReport = False,
     json: Json = False,
 ) -> None:
@@ -67,7 +62,7 @@ def datasheet(
     from skysim.experiments.datasheet.statement import state
 
     require_outputs(markdown, model, fmu)
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     folder = out or Path("out") / f"{loaded.name}_datasheet"
     title = f"datasheet of {loaded.name}"
     with ExitStack() as stack:

@@ -15,6 +15,7 @@ from skysim.apps.cli.options import (
     SceneArg,
     Seed,
     command_line,
+    given_options,
     load,
     output_folder,
 )
@@ -30,25 +31,17 @@ if TYPE_CHECKING:
     from skysim.scene.scene import Scene
 
 
-EstimateOnly = Annotated[bool, Option("--estimate-only")]
-Tilt = Annotated[float, Option(min=0.1, max=60)]
-Longer = Annotated[float, Option(min=0.1, max=100)]
-Flights = Annotated[int | None, Option(min=1, max=50)]
-InertiaBar = Annotated[float, Option(min=0.01)]
-InFlight = Annotated[bool, Option("--in-flight")]
-
-
 def balance(
     scene: SceneArg,
     excite: Literal["wheels", "swing"] = "wheels",
-    estimate_only: EstimateOnly = False,
-    tilt: Tilt = 8.0,
-    longer: Longer = 1.0,
+    estimate_only: bool = False,
+    tilt: Annotated[float, Option(min=0.1, max=60)] = 8.0,
+    longer: Annotated[float, Option(min=0.1, max=100)] = 1.0,
     torque: str = "5e-5 N m",
-    flights: Flights = None,
-    inertia_bar: InertiaBar = 1.0,
+    flights: Annotated[int | None, Option(min=1, max=50)] = None,
+    inertia_bar: Annotated[float, Option(min=0.01)] = 1.0,
     offset_bar: str | None = None,
-    in_flight: InFlight = False,
+    in_flight: bool = False,
     # The errors of the onboard model before the first flight.
     inertia_sigma: str = "10%",
     offset_sigma: str = "500 um",
@@ -103,7 +96,7 @@ def balance(
         inertia_sigma, offset_sigma, wheel_sigma, mount_sigma, tacho_sigma
     )
     bars = balance_procedure.parse_bars(torque, inertia_bar, offset_bar)
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     plan = balance_procedure.BalancePlan(
         excite, tilt, bars.torque_nm, flights or 6, not estimate_only, longer
     )
@@ -183,7 +176,7 @@ def calibrate(
     """
     from skysim.experiments import home_calibration
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     with progress_callback(loaded.title) as watch:
         known, frames = (
             home_calibration.measure_folder(images, loaded)
@@ -234,12 +227,10 @@ def characterize(
 
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
-        given = {"darks": darks, "flats": flats, "night": night, "out": out}
-        for option, value in given.items():
-            if value is not None:
-                raise InputError(
-                    f"--{option}", "has no effect with --frames-to", "one of the two"
-                )
+        for option in given_options(darks=darks, flats=flats, night=night, out=out):
+            raise InputError(
+                f"--{option}", "has no effect with --frames-to", "one of the two"
+            )
         write_simulated(config, frames_to, seed, json)
         return
     folders = characterize_camera.check_folders(darks, flats)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from skysim.apps.cli.options import Json, OpenReport
 from skysim.apps.cli.terminal import print_json, print_list, progress_callback
@@ -13,10 +13,10 @@ from skysim.results.report import page_path, print_blocks
 
 
 def reproduce(
-    ids: Annotated[list[str] | None, Argument(metavar="ID|all")] = None,
-    quick: Annotated[bool, Option("--quick")] = False,
+    ids: Annotated[list[str] | None, Argument()] = None,
+    quick: bool = False,
     seed: int = 1,
-    report: Annotated[bool, Option("--report")] = False,
+    report: bool = False,
     out: Path = Path("out/reproduce"),
     markdown: Path | None = None,
     open_: OpenReport = False,
@@ -26,7 +26,7 @@ def reproduce(
 
     Parameters
     ----------
-    ids
+    ids : ID|all
         Experiments, or all; default: list them.
     quick
         Run fewer trials; the intervals are wider.

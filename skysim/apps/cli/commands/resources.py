@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
 from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
 from skysim.apps.cli.terminal import print_json, print_titles, progress
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name
 from skysim.core.paths import DATA, SCENES
 from skysim.results.report import print_table
 from skysim.results.report_blocks import Column, Table
@@ -71,7 +71,7 @@ def scenes_export(
     from skysim.simulation.lab import build_lab
     from skysim.sources.dome.layouts.led_list import led_list
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     path = out or Path("out") / f"{loaded.name}.xml"
     ending = path.suffix.lower()
     if ending == ".fmu":
@@ -102,7 +102,7 @@ def scenes_export(
 @scenes_app.command("parts")
 def scenes_parts(
     scene: SceneArg,
-    prices: Annotated[str, Option(metavar="FILE")] = "assumed",
+    prices: str = "assumed",
     out: Path | None = None,
     seed: Seed = None,
     set_: Overrides = None,
@@ -112,14 +112,14 @@ def scenes_parts(
 
     Parameters
     ----------
-    prices
+    prices : FILE
         Table of prices (.csv); `assumed` is the one that comes along.
     out
         Also write the list as CSV.
     """
     from skysim.results.files import parts
 
-    loaded = load(scene, None, seed, set_)
+    loaded = load(scene, set_, seed)
     found = parts.parts_list(loaded, parts.read_prices(parts.find_prices(prices)))
     if out:
         write_file(out, parts.to_csv(found, loaded.name))
@@ -148,7 +148,7 @@ def new(
             autocompletion=lambda: list(KINDS),
         ),
     ],
-    name: Annotated[str, Argument(metavar="NAME")],
+    name: Annotated[str, Argument()],
     out: Path = Path(),
 ) -> None:
     """Begin a scene, vehicle, camera, study, controller or tracker: write a commented file that runs as it is.
@@ -157,13 +157,12 @@ def new(
 
     Parameters
     ----------
-    name
+    name : NAME
         Name of the new file, without its ending.
     out
         Folder of the new file.
     """
-    if kind not in KINDS:
-        raise InputError("", *unknown_name("kind", kind, KINDS))
+    check_name("", "kind", kind, KINDS)
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise InputError(
             "NAME", f"{name!r} is no name", "a letter, then letters, digits and _"
@@ -185,8 +184,8 @@ def new(
 
 
 def export(
-    folder: Annotated[Path, Argument(metavar="FOLDER")],
-    to: Annotated[list[str], Option(metavar="FORMAT")],
+    folder: Annotated[Path, Argument()],
+    to: list[str],
     out: Path | None = None,
     json: Json = False,
 ) -> None:
@@ -194,9 +193,9 @@ def export(
 
     Parameters
     ----------
-    folder
+    folder : FOLDER
         Output folder of `skysim run` or `render`.
-    to
+    to : FORMAT
         aem, ecsv, parquet, tiff, zarr or video; repeatable.
     out
         Output folder; default: FOLDER.

@@ -25,10 +25,10 @@ from skysim.apps.cli.options import (
     Seed,
     SolverName,
     command_line,
+    given_options,
     load,
     output_folder,
     scene_names,
-    selected_stages,
     used_programs,
     with_location,
 )
@@ -62,19 +62,15 @@ def run(
     from skysim.simulation.compilation import on_two_processes
     from skysim.simulation.flight import open_flight
 
-    stages = selected_stages(
+    stages = given_options(
         detector=detector,
         centroider=centroider,
         identifier=identifier,
         solver=solver,
         name=tracker,
     )
-    loaded = load(
-        scene,
-        frames,
-        seed,
-        [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())],
-    )
+    overrides = [*(set_ or []), *(f"tracker.{key}={name}" for key, name in stages.items())]
+    loaded = load(scene, overrides, seed, frames)
     with open_flight(loaded, programs=used_programs(program, scene_names(loaded))) as flight:
         plan = check(flight.lab)
         for finding in plan.findings:
@@ -127,7 +123,7 @@ def render(
     seed: Seed = None,
     out: Out = None,
     set_: Overrides = None,
-    preview: Annotated[bool, typer.Option("--preview")] = False,
+    preview: bool = False,
     json: Json = False,
 ) -> None:
     """Simulate a scene and write its frames with their truth, without solving them.
@@ -141,7 +137,7 @@ def render(
     from skysim.simulation.checks import dome_warnings
     from skysim.simulation.flight import open_flight
 
-    loaded = load(scene, frames, seed, set_)
+    loaded = load(scene, set_, seed, frames)
     folder = output_folder(out, loaded.name)
     with open_flight(loaded) as flight:
         if warning := dome_warnings.camera_outside_warning(flight.lab):
@@ -176,7 +172,7 @@ def compare(
     from skysim.simulation.flight import Flight
     from skysim.simulation.lab import UserParts, build_lab
 
-    loaded = load(scene, frames, seed, set_, tracker)
+    loaded = load(scene, set_, seed, frames, tracker)
     programs = used_programs(program, [*tracker, *scene_names(loaded)])
     lab = build_lab(loaded, UserParts(programs))
     entrants = tracker_comparison.build_trackers(lab, tracker, programs)

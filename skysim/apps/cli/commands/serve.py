@@ -26,116 +26,73 @@ PORTS = {"min": 0, "max": 65535}
 
 def live(
     scene: SceneArg,
-    tcp: Annotated[
-        int | None,
-        Option(
-            **PORTS,
-            help="Send packets to clients on this port, and take their commands; 0: any free port.",
-        ),
-    ] = None,
-    http: Annotated[
-        int | None,
-        Option(**PORTS, help="Serve MJPEG on this port; 0: any free port."),
-    ] = None,
-    gige: Annotated[
-        bool | None,
-        Option("--gige", help="Be a GigE Vision camera, which GenICam clients control."),
-    ] = None,
-    folder: Annotated[
-        Path | None,
-        Option(help="Write frames to a folder: a 16-bit PNG and a JSON file per frame."),
-    ] = None,
-    display: Annotated[
-        str | None,
-        Option(
-            metavar="BENCH",
-            help="Serve /display by --http: the sky for the display of this scene, before a real camera.",
-        ),
-    ] = None,
-    indi: Annotated[
-        int | None,
-        Option(
-            **PORTS,
-            help="Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.",
-        ),
-    ] = None,
-    pipe: Annotated[
-        str | None,
-        Option(
-            help="Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output."
-        ),
-    ] = None,
-    mcap: Annotated[
-        Path | None,
-        Option(help="Record ROS 2 messages to a new MCAP file (extra `ros`)."),
-    ] = None,
-    foxglove: Annotated[
-        int | None,
-        Option(
-            **PORTS,
-            help="Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).",
-        ),
-    ] = None,
-    host: Annotated[
-        str, Option(help="Address to serve on; other than loopback with a token.")
-    ] = HOST,
-    token: Annotated[
-        str,
-        Option(
-            help="Token that clients must send; default: none on loopback, else a random one, which is printed."
-        ),
-    ] = "",
-    truth: Annotated[
-        bool,
-        Option("--truth", help="Let clients, files and /truth.json have the truth."),
-    ] = False,
-    trigger: Annotated[
-        bool,
-        Option("--trigger", help="Expose frames when a client triggers, not by the scene."),
-    ] = False,
-    poses: Annotated[
-        bool,
-        Option(
-            "--poses",
-            help="A client simulates the motion: expose a frame for each of its poses.",
-        ),
-    ] = False,
-    client_tracker: Annotated[
-        bool,
-        Option(
-            "--client-tracker",
-            help="The filter takes attitudes of clients, not of the scene's tracker.",
-        ),
-    ] = False,
-    command_timeout: Annotated[
-        float,
-        Option(
-            min=0,
-            metavar="SECONDS",
-            help="Time of the simulator after which a client's command of actuators ends.",
-        ),
-    ] = 0.5,
-    wait: Annotated[
-        bool,
-        Option(
-            "--wait",
-            help="Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.",
-        ),
-    ] = False,
+    tcp: Annotated[int | None, Option(**PORTS)] = None,
+    http: Annotated[int | None, Option(**PORTS)] = None,
+    gige: bool | None = None,
+    folder: Path | None = None,
+    display: str | None = None,
+    indi: Annotated[int | None, Option(**PORTS)] = None,
+    pipe: str | None = None,
+    mcap: Path | None = None,
+    foxglove: Annotated[int | None, Option(**PORTS)] = None,
+    host: str = HOST,
+    token: str = "",
+    truth: bool = False,
+    trigger: bool = False,
+    poses: bool = False,
+    client_tracker: bool = False,
+    command_timeout: Annotated[float, Option(min=0)] = 0.5,
+    wait: bool = False,
     frames: Frames = None,
-    endless: Annotated[
-        bool,
-        Option("--endless", help="Fly until Ctrl-C. Otherwise one day at most."),
-    ] = False,
-    speed: Annotated[
-        float,
-        Option(min=0, max=1000, help="Multiple of real time; 0: as fast as possible."),
-    ] = 1.0,
+    endless: bool = False,
+    speed: Annotated[float, Option(min=0, max=1000)] = 1.0,
     seed: Seed = None,
     set_: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle."""
+    """Fly a scene in real time: frames, IMU and encoders to other programs, their commands to the vehicle.
+
+    Parameters
+    ----------
+    tcp
+        Send packets to clients on this port, and take their commands; 0: any free port.
+    http
+        Serve MJPEG on this port; 0: any free port.
+    gige
+        Be a GigE Vision camera, which GenICam clients control.
+    folder
+        Write frames to a folder: a 16-bit PNG and a JSON file per frame.
+    display : BENCH
+        Serve /display by --http: the sky for the display of this scene, before a real camera.
+    indi
+        Be an INDI camera on this port of this machine, which exposes at command; INDI's own is 7624.
+    pipe
+        Write packets (a line of JSON, then pixels) to a named pipe; -: to standard output.
+    mcap
+        Record ROS 2 messages to a new MCAP file (extra `ros`).
+    foxglove
+        Serve ROS 2 messages to Foxglove on this port, on loopback alone; its own is 8765 (extra `ros`).
+    host
+        Address to serve on; other than loopback with a token.
+    token
+        Token that clients must send; default: none on loopback, else a random one, which is printed.
+    truth
+        Let clients, files and /truth.json have the truth.
+    trigger
+        Expose frames when a client triggers, not by the scene.
+    poses
+        A client simulates the motion: expose a frame for each of its poses.
+    client_tracker
+        The filter takes attitudes of clients, not of the scene's tracker.
+    command_timeout : SECONDS
+        Time of the simulator after which a client's command of actuators ends.
+    wait
+        Start when the first client of --tcp takes channels, or one of --gige starts the acquisition.
+    endless
+        Fly until Ctrl-C. Otherwise one day at most.
+    speed
+        Multiple of real time; 0: as fast as possible.
+    """
     options = locals()
     from skysim.apps.access import LOOPBACK
     from skysim.apps.live.commands import CommandState
@@ -167,7 +124,7 @@ def live(
         )
     if endless and frames is not None:
         raise InputError("--endless", "has no effect with --frames", "one of the two")
-    loaded = load(scene, frames, seed, set_)
+    loaded = load(scene, set_, seed, frames)
     if client_tracker and not loaded.filter:
         raise InputError("--client-tracker", "the scene has no filter", "a scene with one")
     flight = open_flight(loaded, endless=endless, keeps_history=False)
@@ -378,32 +335,36 @@ def counts(receiver: str, counters: dict[str, Any]) -> str:
 
 def gui(
     scene: SceneArg = "shefex2",
-    host: Annotated[
-        str, Option(help="Address to serve on; 0.0.0.0 serves other machines too.")
-    ] = "127.0.0.1",
-    port: Annotated[int, Option(min=1, max=65535, help="Port to serve on.")] = 8080,
-    token: Annotated[
-        str,
-        Option(
-            help="Access token that browsers must send; default: a random one, in the printed link."
-        ),
-    ] = "",
-    folder: Annotated[Path, Option(help="Folder in which new scenes are saved.")] = Path("."),
-    out: Annotated[Path, Option(help="Folder of studies and their reports.")] = Path("out"),
-    camera: Annotated[
-        list[str] | None,
-        Option(
-            metavar="SOURCE",
-            help="Live camera that the page may watch: index, file or address; repeatable.",
-        ),
-    ] = None,
-    workers: Annotated[
-        int,
-        Option(min=1, help="Most worker processes, one for each page; further pages wait."),
-    ] = 12,
-    show: Annotated[bool, Option("--open/--no-open", help="Open a browser.")] = True,
+    host: str = HOST,
+    port: Annotated[int, Option(min=1, max=65535)] = 8080,
+    token: str = "",
+    folder: Path = Path("."),
+    out: Path = Path("out"),
+    camera: list[str] | None = None,
+    workers: Annotated[int, Option(min=1)] = 12,
+    show: Annotated[bool, Option("--open/--no-open")] = True,
 ) -> None:
-    """Open the interactive simulator in the browser (extra `gui`)."""
+    """Open the interactive simulator in the browser (extra `gui`).
+
+    Parameters
+    ----------
+    host
+        Address to serve on; 0.0.0.0 serves other machines too.
+    port
+        Port to serve on.
+    token
+        Access token that browsers must send; default: a random one, in the printed link.
+    folder
+        Folder in which new scenes are saved.
+    out
+        Folder of studies and their reports.
+    camera : SOURCE
+        Live camera that the page may watch: index, file or address; repeatable.
+    workers
+        Most worker processes, one for each page; further pages wait.
+    show
+        Open a browser.
+    """
     from skysim.scene.loader import load
 
     load(scene)

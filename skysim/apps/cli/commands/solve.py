@@ -17,7 +17,7 @@ from skysim.apps.cli.options import (
     Identifier,
     Json,
     SolverName,
-    selected_stages,
+    given_options,
 )
 from skysim.apps.cli.terminal import print_error, print_json, print_solutions, progress
 from skysim.core.errors import InputError
@@ -30,18 +30,12 @@ if TYPE_CHECKING:
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4")
 
 
-Images = Annotated[list[Path] | None, Argument(metavar="IMAGES")]
-MapFile = Annotated[Path | None, Option("--map")]
-Near = Annotated[str | None, Option(metavar="RA,DEC,DEG")]
-Size = Annotated[str | None, Option(metavar="WxH")]
-
-
 def solve(
-    images: Images = None,
+    images: Annotated[list[Path] | None, Argument()] = None,
     fov: float | None = None,
     camera: Path | None = None,
     dome: str | None = None,
-    map_: MapFile = None,
+    map_: Path | None = None,
     live: str | None = None,
     time: str | None = None,
     catalog: str | None = None,
@@ -49,12 +43,12 @@ def solve(
     centroider: Centroider = None,
     identifier: Identifier = None,
     solver: SolverName = None,
-    near: Near = None,
-    size: Size = None,
+    near: str | None = None,
+    size: str | None = None,
     wcs: Path | None = None,
     table: Path | None = None,
     annotate: Path | None = None,
-    sequence: bool = False,
+    sequence: Annotated[bool, Option()] = False,
     rate: float | None = None,
     out: Path = Path("out/solve"),
     json: Json = False,
@@ -65,7 +59,7 @@ def solve(
 
     Parameters
     ----------
-    images
+    images : IMAGES
         Images (FITS, TIFF, PNG, JPEG, NPY, camera raw and others), folders, or lists of lights (CSV or ECSV:
         x_px, y_px, flux).
     fov
@@ -82,9 +76,9 @@ def solve(
         UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.
     catalog
         Star catalog: a name in data/catalogs or a file; a deep one for fields of a few degrees.
-    near
+    near : RA,DEC,DEG
         Circle of the sky in which the image center is sought, in degrees.
-    size
+    size : WxH
         Size of the picture of a list of lights, in pixels.
     wcs
         Also write the FITS header (TAN-SIP) of one image here.
@@ -104,7 +98,7 @@ def solve(
     from skysim.core import files
 
     sky = {"fov": fov, "time": time, "catalog": catalog, "near": near, "size": size}
-    stages = selected_stages(
+    stages = given_options(
         detector=detector, centroider=centroider, identifier=identifier, solver=solver
     )
     settings = solver_of(sky | {"camera": camera, "wcs": wcs}, dome, map_, stages)
@@ -136,9 +130,8 @@ def solver_of(
     from skysim.apps import plate_solver
 
     if dome is not None:
-        for name, value in sky.items():
-            if value is not None:
-                raise InputError(f"--{name}", "has no effect with --dome", "without it")
+        for name in given_options(**sky):
+            raise InputError(f"--{name}", "has no effect with --dome", "without it")
         return plate_solver.make_dome_solver(dome, map_, stages)
     if map_ is not None:
         raise InputError("--map", "has no effect without --dome", "with --dome SCENE")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from typer import Argument, Option
 
-from skysim.apps.cli.options import Json, write_file
+from skysim.apps.cli.options import Json, given_options, write_file
 from skysim.apps.cli.terminal import print_catalog, print_json
 from skysim.core.errors import InputError
 
@@ -55,14 +55,14 @@ def catalog_build(
 
 @app.command("info")
 def catalog_info(
-    name: Annotated[str, Argument(metavar="NAME")] = "gaia_v8.0",
+    name: Annotated[str, Argument()] = "gaia_v8.0",
     json: Json = False,
 ) -> None:
     """Show star counts and provenance of a star catalog.
 
     Parameters
     ----------
-    name
+    name : NAME
         Name or file of a catalog.
     """
     from skysim.sources import catalog
@@ -106,14 +106,13 @@ def catalog_select(
     from skysim.sources import catalog
     from skysim.tracking.onboard_model import onboard_catalog
 
-    options = {
-        "bright_mag": bright,
-        "faintest_mag": faintest,
-        "north_mag": north,
-        "south_mag": south,
-        "count": count,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
+    given = given_options(
+        bright_mag=bright,
+        faintest_mag=faintest,
+        north_mag=north,
+        south_mag=south,
+        count=count,
+    )
     known = list(inspect.signature(CATALOGS[rule]).parameters)[1:]
     if useless := [name for name in given if name not in known]:
         key, *allowed = (f"--{name.removesuffix('_mag')}" for name in (useless[0], *known))
@@ -135,20 +134,20 @@ def catalog_select(
 def catalog_readcat(
     source: Source,
     out: CatFile,
-    limit: Annotated[float, Option(metavar="V")] = 6.0,
-    epoch: Annotated[float | None, Option(metavar="YEAR")] = None,
-    color: Annotated[tuple[float, float, float] | None, Option(metavar="C BV VI")] = None,
+    limit: float = 6.0,
+    epoch: float | None = None,
+    color: tuple[float, float, float] | None = None,
     json: Json = False,
 ) -> None:
     """Make a .cat file of the stars to a magnitude, in the catalog's order: PTASE's READCAT.
 
     Parameters
     ----------
-    limit
+    limit : V
         Faintest visual magnitude.
-    epoch
+    epoch : YEAR
         Mean epoch of the mission; the file's if left out.
-    color
+    color : C BV VI
         Instrumental magnitude: V + C + BV (B-V) + VI (V-I).
     """
     from estimator.catalog.published_catalogs import Color, read_cat
@@ -162,18 +161,18 @@ def catalog_readcat(
 
 @app.command("proc-cat")
 def catalog_proc_cat(
-    source: Annotated[Path, Argument(metavar="FILE")],
+    source: Annotated[Path, Argument()],
     out: CatFile,
-    closer: Annotated[float, Option(metavar="ARCSEC", min=0)] = 60.0,
+    closer: Annotated[float, Option(min=0)] = 60.0,
     json: Json = False,
 ) -> None:
     """Merge close stars of a .cat file and sort by magnitude, with a log beside it: PTASE's PROC_CAT.
 
     Parameters
     ----------
-    source
+    source : FILE
         A file of readcat.
-    closer
+    closer : ARCSEC
         Merge stars closer than this.
     """
     from estimator.catalog import cat_file, published_catalogs

@@ -33,7 +33,7 @@ from skysim.apps.cli.terminal import (
     trial_progress,
     write_3d_views,
 )
-from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.errors import InputError, check_name, printable
 
 if TYPE_CHECKING:
     from skysim.core.types import Record
@@ -111,7 +111,7 @@ def resume(
     workers: Workers = None,
     engine: EngineName = "pool",
     scheduler: Scheduler = "",
-    failed: Annotated[bool, Option("--failed")] = False,
+    failed: bool = False,
     set_: Overrides = None,
     program: Programs = None,
     open_: OpenReport = False,
@@ -163,14 +163,14 @@ def report(
 @app.command()
 def export(
     study: StudyArg,
-    to: Annotated[list[Path], Argument(metavar="FILES")],
+    to: Annotated[list[Path], Argument()],
     out: Out = None,
 ) -> None:
     """Write a study's results for other tools.
 
     Parameters
     ----------
-    to
+    to : FILES
         Output files: .csv or .parquet (a row per trial), .zarr (the responses).
     """
     from skysim.experiments.study.report import study_export
@@ -185,7 +185,7 @@ def export(
 @app.command()
 def replay(
     study: StudyArg,
-    trial: Annotated[int, Argument(metavar="TRIAL")],
+    trial: Annotated[int, Argument()],
     out: Out = None,
     show: Annotated[bool, Option("--open/--no-open")] = False,
     scene_3d: Scene3d = False,
@@ -196,7 +196,7 @@ def replay(
 
     Parameters
     ----------
-    trial
+    trial : TRIAL
         Number of the trial, as in the report and in `status`.
     show
         Open the first image.
@@ -233,7 +233,7 @@ def replay(
 def worst(
     study: StudyArg,
     response: str = "",
-    where: Annotated[list[str] | None, Option(metavar="FACTOR=LEVEL")] = None,
+    where: list[str] | None = None,
     count: Annotated[int, Option(min=1, max=100)] = 3,
     out: Out = None,
     json: Json = False,
@@ -244,7 +244,7 @@ def worst(
     ----------
     response
         Response or quantity (roll_arcsec) that ranks the trials; default: the study's first response.
-    where
+    where : FACTOR=LEVEL
         Only points at this level; may be given several times.
     count
         Number of attitudes.
@@ -475,8 +475,7 @@ def create_engine(name: str, workers: int | None, scheduler: str) -> Engine:
     """Create the engine that runs the trials. Raises InputError for an unknown name or a missing scheduler."""
     from skysim.experiments.study.execution.runner import ENGINES
 
-    if name not in ENGINES:
-        raise InputError("--engine", *unknown_name("engine", name, ENGINES))
+    check_name("--engine", "engine", name, ENGINES)
     if workers is not None and name != "pool":
         raise InputError(
             f"--workers {workers}", f"has no effect with --engine {name}", "--engine pool"

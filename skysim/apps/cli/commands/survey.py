@@ -1,11 +1,21 @@
 """Command `skysim survey`: plan the survey of a dome, simulate it, or make it from images."""
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
 
 from typer import Option
 
-from skysim.apps.cli.options import Json, Out, Overrides, SceneArg, Seed, load, output_folder
+from skysim.apps.cli.options import (
+    Json,
+    Out,
+    Overrides,
+    SceneArg,
+    Seed,
+    given_options,
+    load,
+    output_folder,
+)
 from skysim.apps.cli.terminal import print_json
 from skysim.core.errors import InputError
 
@@ -21,14 +31,10 @@ FrameCount = Annotated[
         help=f"Number of attitudes, with one frame at each; of images with --watch. Default: {FRAMES}.",
     ),
 ]
-PlanOnly = Annotated[bool, Option("--plan")]
-Watch = Annotated[bool, Option("--watch")]
-Repeat = Annotated[int | None, Option(min=2)]
 Next = Annotated[
     int | None,
     Option("--next", min=1, help=f"Number of attitudes to propose next; default: {NEXT}."),
 ]
-Distortion = Annotated[bool, Option("--distortion")]
 Checks = Annotated[
     int | None,
     Option(
@@ -41,11 +47,11 @@ Checks = Annotated[
 def survey(
     scene: SceneArg,
     frames: FrameCount = None,
-    plan: PlanOnly = False,
+    plan: bool = False,
     images: Path | None = None,
     camera: Path | None = None,
-    watch: Watch = False,
-    repeat: Repeat = None,
+    watch: bool = False,
+    repeat: Annotated[int | None, Option(min=2)] = None,
     attitudes: Literal["plan", "random"] | None = None,
     next_: Next = None,
     frames_to: Path | None = None,
@@ -57,7 +63,7 @@ def survey(
     led_sigma: str = "2 mm",
     lever_sigma: str = "5 mm",
     focal_error: str = "1%",
-    distortion: Distortion = False,
+    distortion: bool = False,
     checks: Checks = None,
     json: Json = False,
 ) -> None:
@@ -100,10 +106,11 @@ def survey(
     from skysim.experiments.dome_survey.survey_prior import survey_uncertainty
     from skysim.experiments.tracker_comparison import with_config
 
-    given = dict(zip(LIMITED, (frames, attitudes, next_, frames_to, checks), strict=True))
-    chosen = {name for name, value in given.items() if value is not None}
-    check_mode(plan, images, camera, watch, repeat, chosen)
-    loaded = load(scene, None, seed, set_)
+    limited = given_options(
+        frames=frames, attitudes=attitudes, next=next_, frames_to=frames_to, checks=checks
+    )
+    check_mode(plan, images, camera, watch, repeat, limited)
+    loaded = load(scene, set_, seed)
     if seed is not None:
         # The list, the lever and the focal length before a survey are drawn by the command, not by the scene.
         loaded = with_config(loaded, "tracker.survey", seed=seed)
@@ -129,13 +136,12 @@ def survey(
         print_json(statistics)
 
 
-# Options that have no effect in some modes, and those without effect by mode.
-LIMITED = ("frames", "attitudes", "next", "frames-to", "checks")
+# Options that have no effect, by mode.
 UNUSED = {
-    "images": ("frames", "attitudes", "frames-to", "checks"),
-    "watch": ("attitudes", "frames-to", "checks"),
-    "plan": ("next", "frames-to", "checks"),
-    "repeat": ("next", "frames-to", "checks"),
+    "images": ("frames", "attitudes", "frames_to", "checks"),
+    "watch": ("attitudes", "frames_to", "checks"),
+    "plan": ("next", "frames_to", "checks"),
+    "repeat": ("next", "frames_to", "checks"),
     "simulate": (),
 }
 
@@ -146,9 +152,15 @@ def check_mode(
     camera: Path | None,
     watch: bool,
     repeat: int | None,
-    given: set[str],
+    limited: Collection[str],
 ) -> None:
-    """Raise InputError for options that exclude one another or have no effect."""
+    """Raise InputError for options that exclude one another or have no effect.
+
+    Parameters
+    ----------
+    limited
+        Those of `UNUSED` that are given
+    """
     modes = [
         name for name, on in (("images", images), ("plan", plan), ("repeat", repeat)) if on
     ]
@@ -168,5 +180,6 @@ def check_mode(
         raise InputError("--watch", "has no effect without --images", "with --images FOLDER")
     mode = "watch" if watch else modes[0] if modes else "simulate"
     for name in UNUSED[mode]:
-        if name in given:
-            raise InputError(f"--{name}", f"has no effect with --{mode}", "none")
+        if name in limited:
+            option = name.replace("_", "-")
+            raise InputError(f"--{option}", f"has no effect with --{mode}", "none")

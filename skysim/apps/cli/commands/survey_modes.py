@@ -1,6 +1,6 @@
 """The modes of `skysim survey`: plan, repeat, simulate, and survey from images."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,10 +161,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> Record:
     first_tracker = build_tracker(lab.camera)
     taken = survey_procedure.simulated_frames(lab, uncertainty, plan.lab_from_body, frames_to)
     observations = list(progress(taken, len(plan.shown), "rendering"))
-    with (
-        progress_callback("adjusting") as update,
-        coverage_shown(request, observations, before, plan.model.sigma_px),
-    ):
+    with adjusting(request, observations, before, plan.model.sigma_px) as update:
         run = adjust.run_survey(observations, before, uncertainty, update)
     names = survey_images.frame_names(len(observations))
     statistics = write_results(request, run, before, lab, names)
@@ -205,10 +202,7 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
             progress(survey_images.read_images(images, camera, stages), total, "reading")
         )
     found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
-    with (
-        progress_callback("adjusting") as update,
-        coverage_shown(request, found, before, None),
-    ):
+    with adjusting(request, found, before, None) as update:
         run = survey_procedure.survey_images(
             pictures, found, before, request.uncertainty, stages, update
         )
@@ -241,16 +235,17 @@ def followed(
 
 
 @contextmanager
-def coverage_shown(
+def adjusting(
     request: Request,
     frames: list[SurveyFrame],
     prior: CalibrationPrior,
     noise_px: float | None,
-) -> Iterator[None]:
-    """If the frames are too few for a survey, print the LEDs that they show and the attitudes to hold next."""
+) -> Iterator[Callable[[float, float], None]]:
+    """Show progress; if the frames are too few, print the LEDs that they show and the attitudes to hold next."""
 
     try:
-        yield
+        with progress_callback("adjusting") as update:
+            yield update
     except InputError:
         if frames:
             print_coverage(request, frames, prior, noise_px)

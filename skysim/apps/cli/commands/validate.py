@@ -36,7 +36,7 @@ class FileVerdict(NamedTuple):
 
 
 def validate(
-    files: Annotated[list[Path] | None, typer.Argument(metavar="FILES")] = None,
+    files: Annotated[list[Path] | None, typer.Argument()] = None,
     program: Programs = None,
     schema: str | None = None,
     json: Json = False,
@@ -45,7 +45,7 @@ def validate(
 
     Parameters
     ----------
-    files
+    files : FILES
         Scenes, studies and cameras (YAML files or names), calibrations of OpenCV (YAML), vehicles (MJCF),
         catalogs and LED maps (ECSV).
     schema
@@ -87,7 +87,7 @@ def check(
     from skysim.simulation.checks import check as check_plan
     from skysim.simulation.lab import UserParts, build_lab
 
-    loaded = load(scene, None, None, set_)
+    loaded = load(scene, set_)
     result = check_plan(
         build_lab(loaded, UserParts(used_programs(program, scene_names(loaded))))
     )

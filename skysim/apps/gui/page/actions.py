@@ -193,7 +193,7 @@ class Actions:
             while self.steps.any():
                 steps = self.steps.tolist()
                 self.steps = np.zeros(3)
-                await self.page.show_live("move", *steps, self.page.solving)
+                await self.page.show_live("move", *steps)
                 await self.page.sensor.wait_drawn()
         finally:
             self.moving = False

@@ -12,17 +12,10 @@ from skysim.core.paths import SCENES, shipped_files
 
 
 class Head:
-    """The elements of the head and their actions.
+    """The elements of the head and their actions."""
 
-    Attributes
-    ----------
-    folder
-        Folder in which scenes are saved
-    """
-
-    def __init__(self, page: context.PageContext, folder: Path) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.folder = folder
         with widgets.div("lab-head"):
             ui.label("skysim gui").classes("lab-name")
             self.picker = widgets.select(
@@ -60,7 +53,9 @@ class Head:
     def scenes(self) -> dict[str, str]:
         """Scenes to choose from, with labels: shipped ones, those saved in the folder, and the current one."""
         current = self.page.state.scene
-        own = [path for path in sorted(self.folder.glob("*.yaml")) if forms.is_scene(path)]
+        own = [
+            path for path in sorted(self.page.folder.glob("*.yaml")) if forms.is_scene(path)
+        ]
         return (
             {name: name for name in shipped_files(SCENES)}
             | {str(path): path.name for path in own}
@@ -95,7 +90,7 @@ class Head:
     async def go_live(self) -> None:
         """Return to the live scene at the newest attitude."""
         self.page.stop_playback()
-        await self.page.show_live("render", self.page.solving)
+        await self.page.show_live("render")
 
     def toggle_noise(self) -> None:
         self.noise.set_value(not self.noise.value)

@@ -76,12 +76,11 @@ class History:
     def __init__(
         self,
         page: context.PageContext,
-        home: str,
         show_query: Callable[[str], Awaitable[None]],
         is_settling: Callable[[], bool],
     ) -> None:
         self.page = page
-        self.home = home
+        self.home = page.state.scene
         self.show_query = show_query
         self.is_settling = is_settling
         ui.add_body_html(f"<script>{JS}</script>")

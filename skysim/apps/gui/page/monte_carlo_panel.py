@@ -41,10 +41,6 @@ class MonteCarloPanel:
 
     Attributes
     ----------
-    out
-        Folder of the studies
-    user, tab
-        The browser and its tab, which are part of the names of the studies' folders
     process
         Process of the study
     run_number
@@ -61,11 +57,8 @@ class MonteCarloPanel:
     stopped = False
     starting = False
 
-    def __init__(self, page: context.PageContext, out: Path, user: str, tab: str) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.out = out
-        self.user = user
-        self.tab = tab
         self.process = StudyProcess(Path())
         self.failed: tuple[tuple[int, str], ...] = ()
         with widgets.row():
@@ -199,7 +192,7 @@ class MonteCarloPanel:
             return False
         path, study = found
         self.process = StudyProcess(
-            self.out / path.stem if self.study_select.value else path.parent
+            self.page.out / path.stem if self.study_select.value else path.parent
         )
         self.process.total = study.trials
         self.bar.set_value(0)
@@ -245,7 +238,7 @@ class MonteCarloPanel:
                 for name, field in noise.items()
             }
             trial |= {"false_lights": int(self.false_lights.value or 0)}
-        if not (self.count.value and 1 <= self.count.value <= 100_000):
+        if not 1 <= (self.count.value or 0) <= 100_000:
             raise InputError("runs", "", "1 to 100000")
         scene = forms.absolute_path(self.page.state.scene)
         # A study with changes of the scene that have no effect on a trial would be refused.
@@ -267,7 +260,8 @@ class MonteCarloPanel:
             return before
         self.run_number += 1
         folder = files.make_folder(
-            self.out / f"{PAGE_STUDY}{self.user}_{self.tab}_{self.run_number}"
+            # Browser and tab, so that each has studies of its own.
+            self.page.out / f"{PAGE_STUDY}{self.page.user}_{self.page.id}_{self.run_number}"
         )
         path = folder / "monte_carlo.yaml"
         files.write_text(path, monte_carlo(*settings, self.run_number))
@@ -277,8 +271,8 @@ class MonteCarloPanel:
         """Show the results of a study of the page's folder, as after a reload; a stopped one can be continued."""
         if self.process.running or self.starting:
             return
-        folder = self.out / name
-        is_here = name and folder.parent == self.out and is_shown(name, self.user)
+        folder = self.page.out / name
+        is_here = name and folder.parent == self.page.out and is_shown(name, self.page.user)
         found = await run.io_bound(stored_study, folder) if is_here else None
         if found is None:
             self.page.set_state(study="")
@@ -372,7 +366,7 @@ class MonteCarloPanel:
     def list_reports(self) -> None:
         self.reports.clear()
         with self.reports:
-            folders = finished(self.out, self.user)
+            folders = finished(self.page.out, self.page.user)
             for folder in folders[:12]:
                 done = time.strftime(
                     "%d %b %H:%M", time.localtime((folder / "report.html").stat().st_mtime)

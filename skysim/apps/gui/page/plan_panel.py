@@ -256,7 +256,7 @@ class PlanPanel:
         """Show the frame at an attitude of the plan."""
         assert self.plan is not None
         self.page.stop_playback()
-        await self.page.show_live("point", self.plan.angles_deg[number], self.page.solving)
+        await self.page.show_live("point", self.plan.angles_deg[number])
 
     async def fly_plan(self) -> None:
         """Change the scene's maneuver to the plan's attitudes, in order, and compute this flight."""

@@ -74,7 +74,7 @@ class AttitudeCard:
         except (TypeError, ValueError):
             self.page.show_message("an angle is not a number; allowed: degrees, e.g. 83.6")
             return
-        if await self.page.show_live("point", angles, self.page.solving):
+        if await self.page.show_live("point", angles):
             for field in self.inputs:
                 field.run_method("blur")  # so that the arrow keys move the camera again
 

@@ -110,12 +110,17 @@ class RunPanel:
         )
         return button.mark(label.lower())
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether there are frames to show, all of them computed."""
+        return bool(self.rows) and not self.computing
+
     def enable(self) -> None:
         """Enable the controls if there are frames; without frames, show what to do."""
         for item in (self.back, self.play, self.forward, self.csv_button):
-            item.set_enabled(bool(self.rows) and not self.computing)
+            item.set_enabled(self.is_ready)
         self.seek.props(f"max={max(len(self.rows) - 1, 1)}")
-        self.seek.props["disabled"] = not self.rows or self.computing
+        self.seek.props["disabled"] = not self.is_ready
         if self.rows or self.computing:
             return
         info = self.page.scene_info
@@ -247,7 +252,7 @@ class RunPanel:
         when_shown
             Called after this computation
         """
-        if self.rows and not self.computing:
+        if self.is_ready:
             await self.show_moment(t_s)
             return
         self.wanted_s = t_s
@@ -270,7 +275,7 @@ class RunPanel:
         """Play or pause; at the end, play again from the start."""
         if self.playing:
             self.pause()
-        elif self.rows and not self.computing:
+        elif self.is_ready:
             is_over = self.index >= len(self.rows) - 1
             self.from_s = 0.0 if is_over else self.rows[self.index].t_s
             self.start()
@@ -295,7 +300,7 @@ class RunPanel:
 
     async def step(self, frames: int) -> None:
         """Show the next or the previous frame."""
-        if self.rows and not self.computing:
+        if self.is_ready:
             self.pause()
             await self.show_index(min(max(self.index + frames, 0), len(self.rows) - 1))
 
@@ -305,7 +310,7 @@ class RunPanel:
 
     async def show_moment(self, t_s: float) -> None:
         """Show the frame nearest to a time of the flight."""
-        if self.rows and not self.computing:
+        if self.is_ready:
             self.pause()
             await self.show_index(
                 min(range(len(self.rows)), key=lambda n: abs(self.rows[n].t_s - t_s))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from nicegui import run, ui
 
@@ -220,16 +219,11 @@ class ScenePanel(KeyForm):
 
     Attributes
     ----------
-    folder
-        Folder of the saved scenes
     saved
         Function that is called when a scene has been saved
     """
 
-    def __init__(
-        self, page: context.PageContext, folder: Path, saved: Callable[[], None]
-    ) -> None:
-        self.folder = folder
+    def __init__(self, page: context.PageContext, saved: Callable[[], None]) -> None:
         self.saved = saved
         with widgets.row().style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=self.search)
@@ -281,7 +275,7 @@ class ScenePanel(KeyForm):
         title_before = info.scene.title.removesuffix(", changed") if info else ""
         title = f"{title_before}, changed" if title_before else name
         path = await self.page.run_here(
-            forms.save, self.folder, name, *self.page.state.opened, title
+            forms.save, self.page.folder, name, *self.page.state.opened, title
         )
         if path is None:
             return

@@ -52,14 +52,8 @@ class Tab(context.PageContext):
     ----------
     new_session
         Function that returns another worker, None if there are too many
-    folder
-        Folder in which scenes are saved
-    out
-        Folder of the studies
     cameras
         Live cameras that it may watch
-    user
-        Its browser, by `server.user_of`
     filling
         Lock that is held while a form of the scene's keys is filled
     """
@@ -121,7 +115,7 @@ class Tab(context.PageContext):
             dark_page=style.DARK["ground"],
         )
         with widgets.div("lab"):
-            self.head = head.Head(self, self.folder)
+            self.head = head.Head(self)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
             await asyncio.sleep(PAUSE_S)
@@ -137,9 +131,7 @@ class Tab(context.PageContext):
                             sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
-        self.history = history.History(
-            self, self.state.scene, self.show_query, self.is_settling
-        )
+        self.history = history.History(self, self.show_query, self.is_settling)
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
         )
@@ -166,9 +158,7 @@ class Tab(context.PageContext):
                 with ui.tab_panel("Lights"):
                     self.lights = readouts.LightsPanel(self)
                 with ui.tab_panel("Scene"):
-                    scene_panel = settings_panel.ScenePanel(
-                        self, self.folder, self.head.update_scenes
-                    )
+                    scene_panel = settings_panel.ScenePanel(self, self.head.update_scenes)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = run_panel.RunPanel(self)
@@ -178,9 +168,7 @@ class Tab(context.PageContext):
                     )
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Monte Carlo"):
-                    self.study_panel = monte_carlo_panel.MonteCarloPanel(
-                        self, self.out, self.user, self.id
-                    )
+                    self.study_panel = monte_carlo_panel.MonteCarloPanel(self)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Tracker"):
                     self.tracker_panel = settings_panel.TrackerPanel(self)
@@ -240,7 +228,7 @@ class Tab(context.PageContext):
     async def identify(self) -> None:
         """Render a new frame of the live scene, solve it, and log the result."""
         self.stop_playback()
-        await self.show_live("render", True)
+        await self.show_live("render", solve=True)
         if self.view and self.view.result and self.scene_info:
             self.log_panel.identified(self.view, self.scene_info)
 
@@ -295,7 +283,7 @@ class Tab(context.PageContext):
             now.kind != "live" or now.angles_deg != wanted.angles_deg
         ):
             self.stop_playback()
-            await self.show_live("point", wanted.angles_deg, self.solving)
+            await self.show_live("point", wanted.angles_deg)
         if wanted.study != self.state.study:
             await self.study_panel.show_study(wanted.study)
         if wanted.kind == "flight":

@@ -6,6 +6,7 @@
 import asyncio
 import time
 from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any
 
 from nicegui import run, ui
@@ -27,6 +28,10 @@ class PageContext:
 
     Attributes
     ----------
+    id, user
+        The browser's tab, and the browser, by `server.user_of`
+    folder, out
+        Folder in which scenes are saved, and that of the studies
     session
         Its worker, once it has one
     editing
@@ -52,6 +57,10 @@ class PageContext:
         Function that adds a line to the log
     """
 
+    id: str
+    user: str
+    folder: Path
+    out: Path
     session: Session
     editing: asyncio.Lock
     state: PageView
@@ -121,10 +130,18 @@ class PageContext:
                 if activity and self.message_text == activity:
                     self.show_message("")
 
-    async def show_live(self, task: str, *arguments: Any) -> FrameView | None:
-        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab."""
+    async def show_live(
+        self, task: str, *arguments: Any, solve: bool = False
+    ) -> FrameView | None:
+        """Show the frame of the live scene that a task renders, and return it; None after an error or a closed tab.
+
+        Parameters
+        ----------
+        solve
+            Whether it is solved even if not every frame is
+        """
         begin = time.perf_counter()
-        view = await self.ask(task, *arguments)
+        view = await self.ask(task, *arguments, solve or self.solving)
         if view is not None:
             self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
             self.show_frame(view, kind="live", angles_deg=view.angles_deg)

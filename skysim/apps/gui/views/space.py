@@ -184,4 +184,4 @@ class PushControl:
         before = self.before
         self.stop()
         if before:
-            await self.page.show_live("point", before, self.page.solving)
+            await self.page.show_live("point", before)

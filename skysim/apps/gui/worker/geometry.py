@@ -10,9 +10,9 @@ from estimator.core.camera import Camera
 from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints, Mount, Record, Sources, Trajectory, Truth
+from skysim.core.types import Bools, Floats, Ints, Record, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
-from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, LED_RADIUS_M, SKY_RADIUS_M
+from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
 from skysim.results import scoring
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig
@@ -61,17 +61,10 @@ def lights(sources: Sources) -> tuple[Ints, Floats, Floats, Bools]:
     The radius of an LED grows with the time-averaged power to the power of 0.3, so that faint ones remain visible; that
     of a star grows with the square root of its light, as in the MJCF file.
     """
-    power = sources.strength * np.minimum(sources.on_s / sources.period_s, 1.0)
-    stars = bool((sources.place[:, 3] == 0).any())
-    rows = np.argsort(-power, kind="stable")[: MAX_STARS if stars else MAX_LEDS]
-    fraction = power[rows] / power.max(initial=1e-300)
-    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
-    radius_m = (
-        0.006 + 0.04 * np.sqrt(fraction)
-        if stars
-        else LED_RADIUS_M * np.clip(fraction**0.3, 0.3, 1.0)
-    )
-    return sources.id[rows], position_m, radius_m, power[rows] > 0
+    stars, rows, fraction, position_m, radius_m = brightest(sources, MAX_STARS, MAX_LEDS)
+    if not stars:
+        radius_m *= np.clip(fraction**0.3, 0.3, 1.0)
+    return sources.id[rows], position_m, radius_m, fraction > 0
 
 
 def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
@@ -150,7 +143,7 @@ RANGES = {  # degrees
 }
 
 
-def from_angles(scene: Scene, mount: Mount, angles_deg: Triple) -> Rotation:
+def from_angles(lab: Lab, angles_deg: Triple) -> Rotation:
     """lab_from_body from RA, Dec, roll of the camera under stars, else from roll, pitch, yaw of the vehicle; degrees.
 
     Raises
@@ -158,37 +151,33 @@ def from_angles(scene: Scene, mount: Mount, angles_deg: Triple) -> Rotation:
     InputError
         For an angle out of range, or a tilt beyond the vehicle's stop.
     """
-    for name, angle in zip(scoring.angle_names(scene), angles_deg, strict=True):
+    for name, angle in zip(scoring.angle_names(lab.scene), angles_deg, strict=True):
         low, high = RANGES[name]
         if not (math.isfinite(angle) and low <= angle <= high):
             raise InputError(name, f"{angle:g} deg is not allowed", f"{low:g} to {high:g}")
-    if scene.stars:
-        return stars.cam_from_icrs(*angles_deg).inv() * mount.cam_from_body
+    if lab.scene.stars:
+        return stars.cam_from_icrs(*angles_deg).inv() * lab.camera.mount.cam_from_body
     roll, pitch, yaw = angles_deg
     start = AttitudeConfig.model_validate(
         {"roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
     )
-    return within_stop(scene, guidance.attitude(start))
+    return within_stop(lab.scene, guidance.attitude(start))
 
 
 def moved(
-    scene: Scene,
-    mount: Mount,
-    lab_from_body: Rotation,
-    right: float,
-    up: float,
-    roll_deg: float,
+    lab: Lab, lab_from_body: Rotation, right: float, up: float, roll_deg: float
 ) -> Rotation:
     """lab_from_body after moving the boresight right and up (in fields of view) and rolling the camera clockwise.
 
     The three form one rotation vector about the camera's axes (x right, y down, z boresight). Raises InputError
     beyond the tilt stop.
     """
-    field_deg = scene.camera.calibration().field_deg[0]
+    cam_from_body = lab.camera.mount.cam_from_body
+    field_deg = lab.scene.camera.calibration().field_deg[0]
     turn_deg = [up * field_deg, right * field_deg, roll_deg]
     new_from_cam = Rotation.from_rotvec(turn_deg, degrees=True).inv()
-    cam_from_lab = new_from_cam * mount.cam_from_body * lab_from_body.inv()
-    return within_stop(scene, cam_from_lab.inv() * mount.cam_from_body)
+    cam_from_lab = new_from_cam * cam_from_body * lab_from_body.inv()
+    return within_stop(lab.scene, cam_from_lab.inv() * cam_from_body)
 
 
 def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:

@@ -90,8 +90,8 @@ def photo_from_file(
         except InputError as error:
             raise InputError(Path(name).name, error.problem, error.allowed) from None
     date_utc, _ = plate_solver.validated_date(picture.date_utc)
-    outcome = plate_solver.solve_picture(picture, solver, date_utc)
-    hint = plate_solver.outcome_fields(outcome, date_utc)["hint"]
+    outcome = plate_solver.solve_picture(picture, replace(solver, time_utc=date_utc))
+    hint = plate_solver.outcome_fields(outcome)["hint"]
     photo, image = solved_photo(outcome.hypothesis.pixels, outcome.report, outcome.tracker)
     return replace(photo, hint=hint), image
 
@@ -131,9 +131,7 @@ def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> P
     check_size(image)
     return solved_photo(
         image,
-        *plate_solver.solve_array(
-            image, plate_solver.kept_solver(fov_deg, stages=stages), None
-        ),
+        *plate_solver.solve_array(image, plate_solver.kept_solver(fov_deg, stages=stages)),
     )
 
 

@@ -61,10 +61,9 @@ class Playback:
         self.bench = bench
         self.frames = list[KeptFrame]()
         self.file = tempfile.TemporaryFile()  # noqa: SIM115
-        self.flight = Flight(bench.lab)
+        flight = self.flight = Flight(bench.lab)
         self.shown: int | None = None
         self.reported = 0
-        flight = self.flight
         self.events = flight.events(
             flight.filter_schedules or flight.schedules[:1], solves=True
         )

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import (
     ALL_PIXELS,
@@ -28,8 +27,7 @@ from skysim.apps.gui.worker import (
     playback,
     survey_flight,
 )
-from skysim.apps.gui.worker import workbench as planning
-from skysim.apps.gui.worker.workbench import Workbench
+from skysim.apps.gui.worker.workbench import Workbench, ambiguity
 from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
@@ -55,8 +53,8 @@ class Worker:
         Motion of the pushed vehicle, as long as the workbench has its attitude
     surveyed
         Survey of the scene's dome, if one was planned
-    other, image
-        Image that is not of the scene, and its (H, W) pixels
+    other
+        Image that is not of the scene, if the page shows one, and its (H, W) pixels
     camera
         Open live camera
     """
@@ -68,10 +66,9 @@ class Worker:
     flight: playback.Playback | None = None
     pushed: geometry.Push | None = None
     surveyed: survey_flight.Survey | None = None
-    other: photo.Photo | None = None
-    image: NDArray | None = None
+    other: photo.PhotoPixels | None = None
     scene: str = ""
-    overrides: OverrideTexts | None = None
+    overrides: dict[str, str] = field(default_factory=dict)
     camera: images.LiveCamera | None = None
 
     @property
@@ -83,16 +80,14 @@ class Worker:
 
     def show_frame(self, view: FrameView, levels: pixels.PixelLevels) -> FrameView:
         """Return the view with its pixels, and drop the other image, because the page now shows the scene."""
-        self.other = self.image = None
+        self.other = None
         return view._replace(pixels=self.show(levels, view.saturation_dn))
 
     def show_photo(self, photo_pixels: photo.PhotoPixels) -> photo.Photo:
         """Keep an image that is not of the scene, and return its view."""
-        self.other, self.image = photo_pixels
-        return replace(
-            self.other,
-            pixels=self.show(pixels.levels_of(self.image), self.other.saturation_dn),
-        )
+        self.other = photo_pixels
+        other, image = photo_pixels
+        return replace(other, pixels=self.show(pixels.levels_of(image), other.saturation_dn))
 
     def show(self, levels: pixels.PixelLevels, saturation_dn: float) -> Pixels:
         """Keep an image for the page, and return its pixels for the browser's display."""
@@ -149,9 +144,7 @@ class Worker:
         """
         bench = Workbench.open(scene, overrides, self.current)
         if angles_deg is not None:
-            bench.lab_from_body = geometry.from_angles(
-                bench.scene, bench.lab.camera.mount, angles_deg
-            )
+            bench.lab_from_body = geometry.from_angles(bench.lab, angles_deg)
         self.current = bench
         self.scene = scene
         self.overrides = dict(overrides)
@@ -166,15 +159,13 @@ class Worker:
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
-        bench.lab_from_body = geometry.from_angles(
-            bench.scene, bench.lab.camera.mount, angles_deg
-        )
+        bench.lab_from_body = geometry.from_angles(bench.lab, angles_deg)
         return self.render(solve)
 
     def move(self, right: float, up: float, roll_deg: float, solve: bool) -> FrameView:
         bench = self.workbench
         bench.lab_from_body = geometry.moved(
-            bench.scene, bench.lab.camera.mount, bench.lab_from_body, right, up, roll_deg
+            bench.lab, bench.lab_from_body, right, up, roll_deg
         )
         return self.render(solve)
 
@@ -200,7 +191,7 @@ class Worker:
         return checks.check(self.workbench.lab)
 
     def ambiguity(self) -> AmbiguityMap:
-        return planning.ambiguity(self.workbench.lab)
+        return ambiguity(self.workbench.lab)
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
@@ -241,13 +232,11 @@ class Worker:
 
     def export(self) -> dict[str, bytes]:
         """The files of the image on the page."""
-        if self.other is not None and self.image is not None:
-            return image_export.photo_files(self.other, self.image)
+        if self.other:
+            return image_export.photo_files(*self.other)
         if self.flight:
             self.flight.render()
-        return image_export.frame_files(
-            self.workbench, self.scene, dict(self.overrides or {})
-        )
+        return image_export.frame_files(self.workbench, self.scene, self.overrides)
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

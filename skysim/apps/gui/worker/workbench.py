@@ -37,7 +37,6 @@ from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
 from skysim.simulation.timing import frame_end_s
 from skysim.tracking import factory, onboard_model
 
-STAGES = ("detector", "centroider", "identifier", "solver")
 MAX_WINDOWS = 200
 
 
@@ -118,7 +117,7 @@ class Workbench:
             id_prefix(self.lab),
             lens.field_deg[0],
             lens.arcsec_px,
-            {name: getattr(settings, name) for name in STAGES},
+            {name: getattr(settings, name) for name in factory.STAR_ALGORITHMS},
             self.lab.duration_s,
             scene.camera.detector.noise,
             self.geometry,
