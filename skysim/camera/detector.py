@@ -17,7 +17,7 @@ the last term that of rounding to whole numbers of gain e-/DN.
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import hypot
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from skysim.camera import charge_transfer, cosmic_rays, noise
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Singles, SourceTruth
+from skysim.core.types import Bools, Singles, SourceTruth, frozen
 from skysim.scene.sections.camera import (
     CameraConfig,
     DetectorConfig,
@@ -70,7 +70,7 @@ class AddedCharge:
 ROWS = 16  # rows that share one buffer for their random numbers
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Detector:
     """One chip: its parameters and its fixed pattern, drawn from its hardware seed.
 

@@ -4,12 +4,11 @@ This is the hardware as it is; what a tracker believes about its camera is separ
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from skysim.core.types import Floats
+from skysim.core.types import Floats, frozen
 from skysim.scene.sections.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
 
 
@@ -39,7 +38,7 @@ VIGNETTING: dict[str, Callable[[Any, Floats], Floats]] = {
 PUPIL_ROUNDS = 4
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Optics:
     """Lens and image geometry of a camera, in camera axes +x right, +y down, +z boresight.
 

@@ -1,14 +1,13 @@
 """World coordinate system of the frames for FITS: gnomonic projection, lens distortion as SIP polynomials."""
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import distort, field_rad, fold_r
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Bools, Floats, Record, frozen
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.sources.stars import sky_axes
 
@@ -22,7 +21,7 @@ MARGIN = 0.02  # the fit extends beyond the chip's edges by this fraction of its
 Coefficients = dict[tuple[int, int], float]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sip:
     """Distortion as polynomials about the principal point (Shupe et al. 2005), coefficients by powers (p, q).
 

@@ -12,7 +12,7 @@ docs/howto/controller.md has examples.
 import json
 import shlex
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +30,7 @@ from skysim.core.plugins import (
     host_command,
     to_lists,
 )
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, frozen
 from skysim.dynamics.guidance import Reference
 from skysim.scene.sections.motion import BUILT_IN_LAWS, PRESCRIBED, ControlConfig
 
@@ -44,7 +44,7 @@ PROTOCOL = 1  # version of the protocol, the first key of the set-up
 MAX_AUTHORITIES = 1000.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ControllerSetup:
     """The data that a controller gets before the first control period.
 
@@ -88,7 +88,7 @@ class ControllerSetup:
         return cls(**values)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ControllerInput:
     """The data that a controller gets at the start of a control period.
 

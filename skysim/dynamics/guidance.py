@@ -14,7 +14,6 @@ import bisect
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core import quaternion
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats
+from skysim.core.types import Floats, frozen
 from skysim.dynamics.reference_curves import (
     AngleProfile,
     AttitudeSpline,
@@ -137,7 +136,7 @@ class Leg(NamedTuple):
     state_at: Callable[[float], State]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ProfileLeg:
     """A profile of attitude samples, beginning at its time begin_s."""
 
@@ -394,7 +393,7 @@ LEGS: dict[str, Callable[[Any, LegStart], AnyLeg]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Reference:
     """The commanded attitude over time: a sequence of legs, the last of which has no end.
 
@@ -485,7 +484,7 @@ def plan(
 # Impulses of the list.
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Impulse:
     """A half-sine of torque that alone would change the vehicle's rate by rate_rad_s, (3,) in body axes.
 

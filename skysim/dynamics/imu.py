@@ -11,7 +11,6 @@ unit. They contain all motion between two samples; only its order within the int
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.random import Generator
@@ -29,7 +28,7 @@ from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, frozen
 from skysim.scene.sections.vehicle import (
     AccelerometerConfig,
     GyroConfig,
@@ -45,7 +44,7 @@ TIME_TOLERANCE_S = 1e-9  # tolerance for rounding of sample times
 NO_RATE = np.zeros(3)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Increments:
     """Integrals of angular rate and of specific force over sample intervals, in body axes.
 

@@ -11,7 +11,6 @@ images.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -21,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Bools, Floats, Ints, Trajectory, joined
+from skysim.core.types import Bools, Floats, Ints, Trajectory, frozen, joined
 from skysim.dynamics.guidance import Reference, plan
 from skysim.dynamics.reference_curves import envelope
 from skysim.scene.sections.motion import (
@@ -39,7 +38,7 @@ RISE_FRACTION = 0.1
 MAX_RISE_S = 1.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sines:
     """A rotation vector in body axes: phi(t) = sum_k sine_k sin(omega_k t) + cosine_k cos(omega_k t).
 
@@ -112,7 +111,7 @@ def with_phases(
 SPECTRA: dict[str, Callable[[Any, Generator], Sines]] = {"line": line, "band": band}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class VibrationComponent:
     """Sines within an interval: phi(t) = envelope(t) sines(t) from begin_s to end_s.
 

@@ -1,7 +1,7 @@
 """Attitude samples as read from a file or a table, and their checks. An error message names the line of the fault."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where
 from skysim.core.text import excerpt
 from skysim.core.time import J2000_JD
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, frozen
 
 MIN_SAMPLES = 4  # a not-a-knot cubic needs four
 MAX_SAMPLES = 1_000_000
@@ -22,7 +22,7 @@ MIN_STEP_S = 1e-6
 MAX_STEP_DEG = 10.0
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Samples:
     """N attitudes over time.
 

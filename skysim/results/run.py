@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from skysim.core.files import make_folder, write_image, write_table
-from skysim.core.types import Frame, FrameRow, Record, Telemetry, Truth
+from skysim.core.types import Frame, FrameRow, Record, Telemetry, Truth, frozen
 from skysim.dynamics import imu
 from skysim.results import requirements, run_report, scoring, telemetry_report
 from skysim.results.files.recording import remove_results, write_frame
@@ -146,7 +146,7 @@ class Recorder:
         return statistics, report
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Run(Sequence[Score]):
     """The result of one camera in a flight: a sequence of scored shots.
 

@@ -10,7 +10,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Self
 
 from scipy.spatial.transform import Rotation
@@ -20,7 +19,7 @@ from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
-from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth, frozen
 from skysim.dynamics import imu
 from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
 from skysim.scene.scene import Scene
@@ -46,7 +45,7 @@ Progress = Callable[[float, float], None]
 FrameSelector = Callable[[int, float], bool]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Shot:
     """One exposure: its frame and truth, and the solution of the star tracker.
 
@@ -76,7 +75,7 @@ class Shot:
     seconds: dict[str, float]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class State:
     """The true state of the vehicle.
 

@@ -9,7 +9,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Mount, Sources
+from skysim.core.types import Mount, Sources, frozen
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.controllers import CONTROLLERS
@@ -55,7 +55,7 @@ from skysim.tracking.tracker_interface import TRACKERS
 GIVEN_TABLE = "(table)"  # stands for the file of a profile that is given as a table
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class UserParts:
     """User's parts that replace those of the scene.
 
@@ -176,7 +176,7 @@ class ColorChannel(NamedTuple):
     lights: tuple[Light, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class StarCamera:
     """A camera of the lab: its hardware and the light that reaches it, without time, motion or results.
 
@@ -239,7 +239,7 @@ class StarCamera:
         return self.known.sources
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Lab:
     """The laboratory: the vehicle and its cameras. It has no time and no results; a `Flight` moves it.
 

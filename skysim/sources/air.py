@@ -2,7 +2,7 @@
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import erfa
@@ -12,7 +12,7 @@ from scipy import special
 from scipy.interpolate import RectBivariateSpline
 
 from skysim.core.time import tt_jd, ut1_jd
-from skysim.core.types import Bools, Floats, Ints, Sources
+from skysim.core.types import Bools, Floats, Ints, Sources, frozen
 from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.bodies import BODIES, BodyLight
@@ -168,7 +168,7 @@ def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
     return 10 ** (-0.4 * extinction_mag * air_masses)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Air:
     """The air of a scene.
 
@@ -230,7 +230,7 @@ class Air:
         return self.config.extinction_mag + self.config.color_extinction_mag * b_v
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Sky:
     """The air at a time.
 

@@ -1,12 +1,11 @@
 """The bodies of a scene at a time, as light sources: points, or discs of many points."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import BodyTruth, Bools, Floats, normalized
+from skysim.core.types import BodyTruth, Bools, Floats, frozen, normalized
 from skysim.scene.sections.light import BodiesConfig
 from skysim.sources.body_discs import (
     LAMBERT,
@@ -118,7 +117,7 @@ BODIES = {
 NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class BodyLight:
     """One body in the sky, in the lab's axes (the ICRS).
 

@@ -2,7 +2,6 @@
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import erfa
@@ -17,7 +16,7 @@ from skysim.core.constants import (
 )
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
-from skysim.core.types import Bools, Floats, taken
+from skysim.core.types import Bools, Floats, frozen, taken
 from skysim.scene.sections.surroundings import (
     CircularOrbitConfig,
     TleOrbitConfig,
@@ -54,7 +53,7 @@ def state_at(orbit: CameraOrbit, after_s: float) -> GcrsState:
     return taken(orbit.states(np.array([after_s])), 0)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class CircularOrbit:
     """A circular orbit under gravity and J2, averaged over a revolution.
 
@@ -97,7 +96,7 @@ class CircularOrbit:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TleOrbit:
     """The orbit of a satellite by SGP4."""
 
@@ -163,7 +162,7 @@ def build_orbit(config: Any, start: datetime.datetime) -> CameraOrbit | None:
 # Viewpoint: the place of a scene's camera at any time, on the turning Earth or in its orbit.
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Viewpoint:
     """The camera's place from the scene's start on.
 

@@ -7,7 +7,7 @@ per star, sorted by number. Directions are in the ICRS.
 import csv
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
-from skysim.core.types import Floats, Ints, Record
+from skysim.core.types import Floats, Ints, Record, frozen
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
 
 EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
@@ -54,7 +54,7 @@ NUMBERS = tuple(column.name for column in star_columns(""))
 SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Catalog:
     """Stars at an epoch, ICRS axes; all arrays (N,).
 

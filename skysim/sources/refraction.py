@@ -9,7 +9,6 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from skysim.core.constants import (
     STANDARD_TEMPERATURE_K,
     ZERO_CELSIUS_K,
 )
-from skysim.core.types import Floats
+from skysim.core.types import Floats, frozen
 
 # The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
 GAS_J_KMOL_K = 8314.32
@@ -67,7 +66,7 @@ def refractivity(wavelength_m: float | Floats) -> Floats:
     return 1e-6 * (287.6155 + (1.62887 + 0.0136 / um2) / um2)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Atmosphere:
     """A troposphere with a constant lapse rate and water vapor, and an isothermal stratosphere.
 

@@ -1,6 +1,5 @@
 """Read and write the dome map that `skysim survey` measures."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +7,10 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.files import header_numbers, read_table, write_table
-from skysim.core.types import Floats, Ints, Record
+from skysim.core.types import Floats, Ints, Record, frozen
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeMap:
     """A surveyed dome and its camera; `tracker.map` names its file.
 

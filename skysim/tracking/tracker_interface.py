@@ -10,7 +10,7 @@ import re
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, field, fields, replace
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,7 +30,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats, Ints, Record
+from skysim.core.types import Floats, Ints, Record, frozen
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.scene.sections.tracker import OWN
 
@@ -49,7 +49,7 @@ MAX_CENTROID_PX = 1e6  # distance from the first pixel along x and y
 EXTRAS = {"skysim.tracking.tetra3rs:Tetra3rs": ("tetra3rs", "oracle")}
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Stars:
     """The star catalog given to the tracker, brightest first.
 
@@ -68,7 +68,7 @@ class Stars:
     magnitude: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Leds:
     """The surveyed dome. The vehicle rotates about the lab's origin; the camera is offset from it.
 
@@ -90,7 +90,7 @@ class Leds:
     cam_from_body_xyzw: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Setup:
     """The data that a tracker gets before the first frame: the hardware that the scene's tracker assumes.
 
@@ -146,7 +146,7 @@ class Setup:
         return cls(**values)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Picture:
     """One frame that a tracker gets.
 
@@ -171,7 +171,7 @@ class Picture:
     streak_px: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Answer:
     """A tracker's solution of a frame.
 

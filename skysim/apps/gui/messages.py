@@ -3,12 +3,11 @@
 NiceGUI writes arrays as JSON, with null for NaN."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Floats, Ints, Record
+from skysim.core.types import Floats, Ints, Record, frozen
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
@@ -77,7 +76,7 @@ LIGHT = np.dtype(
 NO_LIGHTS: Lights = np.recarray(0, LIGHT)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Detection:
     """A detection: pixel, standard error, flux; id of the matched light (-1: none) and its residual in pixels."""
 
@@ -94,7 +93,7 @@ def places_px(detections: Collection[Detection]) -> Floats:
     return np.array([(one.x, one.y) for one in detections], float).reshape(-1, 2)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TrackerResult:
     """The tracker's solution of a frame, and its error if the truth is known.
 
@@ -129,7 +128,7 @@ class TrackerResult:
         return sum(detection.id >= 0 for detection in self.detections)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Lens:
     """Directions of a camera's pixels in camera axes, between which the browser interpolates.
 
@@ -142,7 +141,7 @@ class Lens:
     y: Floats
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Pose:
     """Attitude of a frame's camera: reference_from_cam by rows; the reference is ICRS or the lab.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,7 +27,7 @@ from skysim.apps.plate_solver.solver import KnownCamera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 
 if TYPE_CHECKING:
     from estimator.trackers.dome_tracker import DomeTracker
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 LED_KEYS = ("x_m", "y_m", "z_m", *PIXEL_KEYS)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class DomeSolution:
     """Attitude of a picture of LEDs; the angles are None unless `status` is solved.
 

@@ -1,7 +1,6 @@
 """What a solved plate says: pointing, attitude, lens, matched stars; as fields, as a table, and as a FITS header."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -15,14 +14,14 @@ from estimator.core.types import Attitude, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, frozen
 
 NOTED_STRETCH = 0.002  # relative to square pixels
 PIXEL_KEYS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
 STAR_KEYS = ("ra_deg", "dec_deg", "v_mag", *PIXEL_KEYS)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PlateSolution:
     """Pointing of a picture in the orientation in which it is viewed; the angles are None unless `status` is solved.
 

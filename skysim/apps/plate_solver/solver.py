@@ -19,7 +19,7 @@ import os
 from collections import deque
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -42,7 +42,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, check_name
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
-from skysim.core.types import Bools
+from skysim.core.types import Bools, frozen
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -128,7 +128,7 @@ class KnownCamera(NamedTuple):
     dome: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Solver:
     """Settings of the plate solver.
 

@@ -10,7 +10,6 @@ Extended light varies smoothly over the frame:
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -22,7 +21,7 @@ from scipy.special import erfc
 
 from skysim.camera.optics import Optics, radial, tangential
 from skysim.core.jit import jit
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Floats, frozen, normalized
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -90,7 +89,7 @@ MOON_RADIUS_DEG = 0.26
 MIN_PST = 1e-30  # replaces a transmittance of 0 in the logarithm; gives no electrons
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ViewingGeometry:
     """Viewing directions of M nodes of the chip.
 

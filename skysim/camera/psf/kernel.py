@@ -14,7 +14,6 @@ sub-pixel position. There are three forms (`build_kernel` chooses):
    (`grid_kernel`).
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -34,7 +33,7 @@ from skysim.camera.psf.otf import (
     uniform_disk,
 )
 from skysim.camera.psf.splat import PER_PX, REACH_SIGMA, cubic
-from skysim.core.types import Floats, Singles
+from skysim.core.types import Floats, Singles, frozen
 from skysim.scene.sections.camera import CameraConfig, Psf
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.dome.surface import perpendicular
@@ -145,7 +144,7 @@ def reach_px(
     return radius + fade_px + radius_px + cut_sigma * np.hypot(sigma, sigma_px) + np.sqrt(0.5)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PsfModel:
     """The factors of the image's convolution: a lens, an extra Gaussian, and disks."""
 
@@ -201,7 +200,7 @@ def softening_sigma_px(bandwidth: float, highest: float) -> float:
     return float(np.sqrt(-np.log(OTF_FLOOR) / 2) / (np.pi * highest))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class FourierBesselSeries:
     """Fourier-Bessel series of the HARMONICS on a circle of radius B.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, frozen
 
 # Directions whose singular value is a smaller fraction of the largest get no torque.
 RANK_TOLERANCE = 1e-6
@@ -109,7 +109,7 @@ def nothing(*_: Any) -> None:
     """Do nothing: the default of functions that a kind does not need."""
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class ActuatorKind:
     """A kind of actuator.
 

@@ -8,7 +8,6 @@
    joint, and the joint is removed unless `vehicle.trims` moves it in flight.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, frozen
 from skysim.dynamics.multibody.actuator_kind import Hinges, at_zero, named
 from skysim.dynamics.multibody.trims import TRIM
 from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
@@ -26,7 +25,7 @@ from skysim.scene.sections.vehicle import VehicleConfig, WheelsConfig
 CAMERA = "star_camera"
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class MassProperties:
     """Mass properties of the vehicle, in body axes.
 
@@ -207,7 +206,7 @@ def set_inertial(
     body.fullinertia = np.full(6, np.nan)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Trims:
     """Trim masses, in the order of their joints' names.
 

@@ -15,7 +15,6 @@ angular rate in body axes.
 """
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Ints, Mount
+from skysim.core.types import Floats, Ints, Mount, frozen
 from skysim.dynamics.multibody.actuator_kind import Hinges, all_names, at_zero, named
 from skysim.dynamics.multibody.actuators import (
     KINDS,
@@ -67,7 +66,7 @@ STOP_LAB_M = 1.0
 STOP_BODY_M = 0.5
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class VehicleModel:
     """A vehicle on its bearing, ready to simulate. Simulation does not change the model.
 

@@ -31,7 +31,7 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats, Ints, Singles
+from skysim.core.types import Bools, Floats, Ints, Singles, frozen
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -132,7 +132,7 @@ TRIM = 5.0  # interquartile ranges from the median within which pixels are avera
 SAMPLES = 100_000  # number of pixels from which the quartiles are computed
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TransferPoints:
     """L levels as input of the fit, (L,) each: mean and temporal variance over the pixels with their standard errors.
 
@@ -156,7 +156,7 @@ class TransferPoints:
     difference_dn2: Floats
 
     def take(self, which: Bools | Ints) -> TransferPoints:
-        return TransferPoints(*(getattr(self, name)[which] for name in self.__slots__))
+        return TransferPoints(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
 
 @dataclass(eq=False)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Bools, Floats, Record, frozen
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
@@ -42,7 +42,7 @@ STRAY_SIGMA_PX = 0.3  # error of a ray to a stray light, from the attitude and f
 STRAY_REACH_M = 0.005
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SurveyRun:
     """A survey with the frames and correspondences of its last round.
 

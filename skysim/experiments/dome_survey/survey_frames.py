@@ -1,7 +1,6 @@
 """Frames of a survey: the lights of each and the IMU's attitude, rendered at planned stops or read from files."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Frame, Ints, Truth, around_z
+from skysim.core.types import Bools, Floats, Frame, Ints, Truth, around_z, frozen
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
@@ -122,7 +121,7 @@ LEAST_NOISE_PX = 1e-4
 SAME_LIGHT_PX = 2.0  # greatest distance of a centroid from the true image
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SurveyFrame:
     """One frame of a survey: its detections, and the vehicle's attitude from the IMU or a previous adjustment.
 

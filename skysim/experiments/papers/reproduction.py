@@ -23,14 +23,14 @@ import shlex
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 from skysim.experiments import home_calibration
 from skysim.experiments.papers.published import Experiment, PublishedRow, experiments
 from skysim.experiments.study.api import run_study
@@ -101,7 +101,7 @@ class Comparison(NamedTuple):
         }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Reproduction:
     """A repeated experiment: the published data, the commands, the comparison of each row, and the time in seconds."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,6 +22,7 @@ from pydantic import (
 
 from skysim.core.errors import InputError
 from skysim.core.plugins import Programs
+from skysim.core.types import frozen
 from skysim.core.units import (
     ConfigModel,
     Declination,
@@ -473,7 +474,7 @@ class Study(ConfigModel):
         return (self.optimize.candidates if self.optimize else points) * self.replicates
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class TrialSpec:
     """The part of a study that a worker needs to run any of its trials.
 
@@ -513,7 +514,7 @@ class TrialSpec:
         return settings | dict(zip(self.hardware, seeds.tolist(), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Plan:
     """A study with its design points. Trial number = point * replicates + replicate.
 

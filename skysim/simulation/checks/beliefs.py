@@ -5,7 +5,7 @@ the star's image, which displace its centroid (`response_px`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Ints, Sources, normalized
+from skysim.core.types import Floats, Ints, Sources, frozen, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.views import CameraModel
@@ -36,7 +36,7 @@ FAULT_SIGMAS = 5.0  # difference of a map from its scene that its survey cannot 
 WINDOW_PX = 3  # half side of the fit's window
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Beliefs:
     """The beliefs of a tracker. Standard deviations are over surveys, of which a run draws one.
 

@@ -25,7 +25,15 @@ from skysim.camera.glow.background import PointedCamera
 from skysim.camera.optics import Optics
 from skysim.camera.projection import Poses
 from skysim.camera.render import OcclusionTest, Window
-from skysim.core.types import Bools, Floats, Mount, SatelliteTruth, Sources, Trajectory
+from skysim.core.types import (
+    Bools,
+    Floats,
+    Mount,
+    SatelliteTruth,
+    Sources,
+    Trajectory,
+    frozen,
+)
 from skysim.dynamics.multibody.model import VehicleModel
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import GlareConfig
@@ -346,7 +354,7 @@ def beam_of(lights: Iterable[Light], exposure: Exposure) -> Beam:
     return beam
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LightPlan:
     """The input from which the lights of a camera are built.
 

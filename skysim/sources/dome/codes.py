@@ -7,14 +7,14 @@ it. The drive's pulses are much faster than a bit; the code scales their light.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from skysim.core.constants import HOUR_S, PPM
 from skysim.core.random_streams import LED_CLOCKS, LED_CODE, LED_CODE_CLOCK, random_stream
 from skysim.core.tolerance import scaled_errors
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, frozen
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, Code, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig
@@ -35,7 +35,7 @@ LONGEST_ON_S = HOUR_S
 FILTER_STREAM = 4  # spawn key, under the hardware's seed, of the filters' errors
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Clocks:
     """The oscillators of C controllers, (C,) each.
 
@@ -155,7 +155,7 @@ def hardware_seed(layout: Layout) -> int:
     )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class LedCodes:
     """The code of a dome's LEDs in one run.
 

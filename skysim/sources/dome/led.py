@@ -5,7 +5,7 @@ exposure.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from math import ceil, exp, floor, log, sqrt
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from numpy.random import Generator
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.tolerance import Tolerance, scaled_errors
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, frozen
 from skysim.scene.sections.leds import (
     AgingConfig,
     CosineLobeConfig,
@@ -68,7 +68,7 @@ LOBES: dict[str, Callable[[Any, Floats], Floats]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Emitter:
     """Emission of a dome's LEDs: falloff with distance and lobe over angle. The default is a Lambertian disk.
 

@@ -9,7 +9,6 @@ The points are those of a measuring arm.
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ import scipy
 
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, around_z
+from skysim.core.types import Floats, around_z, frozen
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -164,7 +163,7 @@ def zernike(degree: int, disk: Floats) -> tuple[Floats, Floats]:
     return np.stack(values, axis=1), np.stack(slopes, axis=1)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Zernike:
     """Radius over a cap of directions about +z: Zernike polynomials in the cap's equal-area disk.
 
@@ -218,7 +217,7 @@ def to_disk(unit: Floats, half_rad: float) -> tuple[Floats, Floats, Floats]:
     return unit[:, :2] * stretch[:, None], stretch, -0.5 / up
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class SurfaceFit:
     """Measured points and the smooth surface fitted to them.
 

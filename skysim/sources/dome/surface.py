@@ -9,7 +9,7 @@ direction (`Radial`). SURFACES maps the scene's `light.surface.kind` to the func
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Record, around_z, normalized
+from skysim.core.types import Bools, Floats, Record, around_z, frozen, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -30,7 +30,7 @@ MAX_STEPS = 200  # of the ray intersection
 SLACK_M = 1e-12  # rounding tolerance that keeps points on the rim within it
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Rim:
     """The end of a surface, in its own frame.
 
@@ -61,7 +61,7 @@ class Rim:
         return (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Surface(ABC):
     """A surface seen from inside: a level set, negative inside, in its own displaced and tilted frame.
 
@@ -178,7 +178,7 @@ def exit_distance(start: Floats, along: Floats) -> Floats:
     return np.where(root > 0, root, np.nan)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Ellipsoid(Surface):
     """An ellipsoid: sum((x / semi_axes)^2) = 1 in its own frame. A sphere has equal semi-axes."""
 
@@ -201,7 +201,7 @@ class Ellipsoid(Surface):
         return FittedEllipsoid(self.center_m, semi_axes_m, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Plane(Surface):
     """A panel at z = 0 in its own frame, seen from below.
 
@@ -238,7 +238,7 @@ class Plane(Surface):
         )
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Cylinder(Ellipsoid):
     """A cylinder: an ellipsoid with an infinite semi-axis along an axis of its own frame.
 
@@ -255,7 +255,7 @@ class Cylinder(Ellipsoid):
         return self.rim.contains(own_m) & (np.abs(along_m) <= self.half_length_m + SLACK_M)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Shell:
     """Inner radius of a formed wall: r = R - f t(angle), with t linear from apex to base and constant beyond.
 
@@ -300,7 +300,7 @@ class Shell:
         return radius, np.where(angle < self.base_rad, slope, 0.0)[:, None] * tangent
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Radial(Surface):
     """|x| = r(x / |x|) in its own frame: one radius in every direction from its center.
 

@@ -214,7 +214,7 @@ def replay(
         "point": row.point,
         "replicate": row.replicate,
         "seed": row.seed,
-        **{name: getattr(row.outcome, name) for name in row.outcome.__slots__},
+        **{name: getattr(row.outcome, name) for name in row.outcome.__dataclass_fields__},
         "changed": repeated.changed,
         "error": row.error,
         "reasons": repeated.reasons,

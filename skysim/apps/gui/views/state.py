@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Literal, get_args
 from urllib.parse import parse_qsl, urlencode
 
 from skysim.apps.gui.messages import Triple
 from skysim.core.errors import InputError
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 
 Kind = Literal["live", "flight", "replay", "photo"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class PageView:
     """The view of a page.
 

@@ -2,7 +2,7 @@
 
 import math
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +26,13 @@ from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, setups, store, trials
 from skysim.results import plots, scoring
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Photo:
     """An image that is not of the current scene, and its solution.
 

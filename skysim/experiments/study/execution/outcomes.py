@@ -1,7 +1,7 @@
 """Outcome of a trial: errors of its solution, whether the right lights were identified, and the attitude it had."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from math import nan
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Telemetry, Truth
+from skysim.core.types import Floats, Telemetry, Truth, frozen
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.simulation.lab import Lab
@@ -29,7 +29,7 @@ SAME_LIGHT_PX = 3.0
 AMBIGUOUS = "ambiguous"  # beginning of the status of such a refusal
 
 
-@dataclass(frozen=True, slots=True)
+@frozen
 class Outcome:
     """Result of a trial. For a flight trial, errors are RMS over the solved frames and counts are sums unless noted.
 
