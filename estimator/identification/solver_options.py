@@ -6,8 +6,7 @@ keywords, of which each method uses some, so that one method can replace another
 
 import numpy as np
 
-from estimator.core.checks import Floats, Ints, frozen
-from estimator.core.errors import ImageError
+from estimator.core.checks import Floats, ImageError, Ints, frozen
 
 ACCEPTANCES = ("evidence", "thesis")
 
