@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 from stale import Stamp, make_stamp
 
 from skysim.core.paths import STUDIES
-from skysim.core.types import Floats
 from skysim.experiments.study import search
 from skysim.experiments.study import table as sensitivity
 from skysim.experiments.study.execution import store
@@ -32,7 +31,7 @@ from skysim.experiments.study.execution.store import STORE, Store
 from skysim.experiments.study.plan import Plan
 from skysim.experiments.study.report.study_report import Analysis, analyze, commands, compose
 from skysim.experiments.study.study_file import load
-from skysim.experiments.study.table import cells, format_summary
+from skysim.experiments.study.table import format_level, format_response, format_summary
 from skysim.results import metrics
 from skysim.results.report_blocks import figures
 
@@ -40,7 +39,6 @@ SITE = Path(__file__).parent
 PAGES = SITE.parent / "findings" / "studies"
 TEXTS = SITE / "studies.yaml"
 MAX_ROWS = 20  # of a page's table
-BESIDE = {"dome_for_the_money": "dome_without_codes"}  # searches drawn in one figure
 # What the numbers of a study depend on; drawing and the apps are left out.
 SIMULATOR = ("camera", "core", "dynamics", "experiments", "scene", "simulation", "sources")
 NEEDS = (*(f"skysim.{name}" for name in SIMULATOR), "skysim.tracking", "estimator")
@@ -103,21 +101,18 @@ def main(folder: Path) -> None:
                 print(f"{store_path}: not finished, or of another version; page not changed")
                 continue
             made = make_stamp([*NEEDS, f"scenes/studies/{path.name}"], plan.study.seed)
-            print(write_page(read_record(plan, kept, folder), made))
+            print(write_page(read_record(plan, kept), made))
 
 
 # The record of a study.
 
 
-def read_record(plan: Plan, kept: Store, folder: Path) -> Record:
-    """The record of a study from its store. folder : holds other studies' stores, for `BESIDE`"""
+def read_record(plan: Plan, kept: Store) -> Record:
+    """The record of a study from its store."""
     study = plan.study
     command = commands(plan, kept, plan.name)
     found = analyze(plan, kept, command)
-    also = None
-    if plan.name in BESIDE:
-        also = {f"front of {BESIDE[plan.name]}": read_front(BESIDE[plan.name], folder)}
-    report = compose(study, kept, found, command, also)
+    report = compose(kept, found, command)
     drawn = {one.name or str(n): one.image for n, one in enumerate(figures(report.blocks), 1)}
     counts, points = kept.counts(), len(kept.points())
     each = f"at each of {points} points" if points > 1 else ""
@@ -142,8 +137,12 @@ def read_rows(plan: Plan, found: Analysis) -> list[Row]:
         return [one | {"front": str(n)} for n, one in enumerate(named, 1)]
     if found.indices:
         return [index_row(one) for one in found.indices]
-    heads, rows = cells(found.lines)
-    return [dict(zip(heads, row, strict=True)) for row in rows]
+    return [
+        {"point": str(one.point)}
+        | {name: format_level(level) for name, level in one.levels.items()}
+        | {name: format_response(one, name) for name in one.responses}
+        for one in found.lines
+    ]
 
 
 def index_row(index: sensitivity.Index) -> Row:
@@ -155,13 +154,6 @@ def index_row(index: sensitivity.Index) -> Row:
         "first": format_summary(index.first),
         "total": format_summary(index.total),
     }
-
-
-def read_front(name: str, folder: Path) -> Floats:
-    """(K, 2) objectives of the front of another search."""
-    with store.open_store(folder / name / STORE) as kept:
-        found = search.collect_result(load(name), kept).front
-    return np.array([candidate.objectives for candidate in found])
 
 
 # Numbers of a record.

@@ -335,6 +335,12 @@ ADVICE: dict[str, tuple[str, Callable[[Any, float], str]]] = {
             f" {short(1e6 * scene.camera.shutter.row_time_s, 3)} us each, or turn {short(excess, 2)} times slower"
         ),
     ),
+    AS_BUILT: (
+        "tracker.map",
+        lambda scene, excess: (
+            "survey the dome by its camera at this temperature (`skysim survey`), which measures lights where they are"
+        ),
+    ),
     "survey set-up": (
         "tracker.survey.instrument",
         lambda scene, excess: (
