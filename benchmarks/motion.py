@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.rolling import Work, row
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude
 from estimator.trackers.tracking_mode import Health, TrackingMode
 from skysim.core.types import Truth

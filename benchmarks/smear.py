@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import figure
 from estimator.catalog import catalog, published_catalogs
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import INCH_M
+from estimator.core.errors import ImageError
 
 UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": INCH_M}
 SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one

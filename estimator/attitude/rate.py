@@ -30,7 +30,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, ImageError
+from estimator.core.checks import Bools, Floats
+from estimator.core.errors import ImageError
 from estimator.core.least_squares import misfit_factor
 from estimator.core.types import Centroids, RateEstimate
 

@@ -21,7 +21,8 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.bundle_adjustment import summed
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, ImageError, Ints, frozen
+from estimator.core.checks import Bools, Floats, Ints, frozen
+from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 
 

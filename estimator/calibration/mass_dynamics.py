@@ -34,7 +34,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.errors import ImageError
 
 # Measurements of a motion on an air bearing, assumptions, and the parameters that are estimated.
 

@@ -46,7 +46,8 @@ from estimator.calibration.mass_dynamics import (
     transition,
     turn,
 )
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 from estimator.filter.error_models import TrackerModel
 

@@ -39,7 +39,8 @@ from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3

@@ -7,8 +7,9 @@ point plus the star's color term, which is unknown but constant.
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Floats, ImageError, frozen
+from estimator.core.checks import Floats, frozen
 from estimator.core.constants import SIGMA_PER_MAD
+from estimator.core.errors import ImageError
 
 
 @frozen

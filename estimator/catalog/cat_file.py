@@ -17,7 +17,7 @@ import numpy as np
 
 from estimator.catalog.catalog import StarCatalog, from_angles
 from estimator.catalog.published_catalogs import BYTES_PER_ENTRY, OnBoard
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 HEADER = np.dtype([("magic", "S12"), ("epoch_milliyear", "<u4"), ("entries", "<u4")])
 ENTRY = np.dtype(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from estimator.core import checks
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import (
     DAY_S,
     J2000,
@@ -30,6 +30,7 @@ from estimator.core.constants import (
     SUN_DEFLECTION_RAD,
     TT_MINUS_UTC_S,
 )
+from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 

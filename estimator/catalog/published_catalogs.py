@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from estimator.catalog import catalog, sky_index
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import Cells, within
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.vectors import normalized
 

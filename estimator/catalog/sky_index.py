@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.vectors import row, squared_chord
 

@@ -18,7 +18,8 @@ from estimator.attitude.rate import OUTLIER_CHI2, covariance_of
 from estimator.centroiding import disk_fit, moments, streak_fit
 from estimator.centroiding import gaussian_fit as gaussian
 from estimator.core import checks
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Blobs, Centroids, FramePriors
 from estimator.detection.classify import VOTING_BLOBS, streaks_px
 from estimator.detection.detect import check_monochrome, to_native

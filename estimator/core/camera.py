@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 
 from estimator.core import checks
-from estimator.core.checks import Allowed, Floats, ImageError, frozen
+from estimator.core.checks import Allowed, Floats, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 Distortion = tuple[float, float, float, float, float]

@@ -15,23 +15,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.core.errors import ImageError
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Step = tuple[float, float]  # (dx, dy) in pixels
 Kind = TypeVar("Kind")
-
-
-class ImageError(ValueError):
-    """The image or the calibration cannot be used. The one printable line names the fault and what is allowed."""
-
-    def __init__(self, message: object) -> None:
-        line = " ".join(
-            str(message).split()
-        )  # it may quote a file, and a file may hold anything
-        super().__init__(
-            "".join(character if character.isprintable() else "?" for character in line)
-        )
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats, ImageError, Ints, Step, frozen
+from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
 THESIS_INTENSITY = 0.04  # Padro 2012, section 3.7

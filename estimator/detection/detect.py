@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from estimator.core.checks import Floats, ImageError, Ints, native, number, of_type
+from estimator.core.checks import Floats, Ints, native, number, of_type
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
 from estimator.detection.background import (

@@ -29,7 +29,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import on_sphere
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats, ImageError, Ints, frozen
+from estimator.core.checks import Allowed, Floats, Ints, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import Centroids
 from estimator.identification.direct_match import mutual_nearest

@@ -6,7 +6,8 @@ keywords, of which each method uses some, so that one method can replace another
 
 import numpy as np
 
-from estimator.core.checks import Floats, ImageError, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.errors import ImageError
 
 ACCEPTANCES = ("evidence", "thesis")
 

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Allowed, Floats, ImageError, frozen
+from estimator.core.checks import Allowed, Floats, frozen
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification import led_codes, led_naming
 from estimator.identification.led_codes import LedCode, LightTracks

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core import checks
-from estimator.core.checks import ImageError, Ints, frozen
+from estimator.core.checks import Ints, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.detection.detect import check_pixel_type, to_native
 

@@ -25,7 +25,8 @@ from estimator.attitude.rate import center_streak_px, image_paths
 from estimator.centroiding.centroid import CENTROIDERS, known_streaks
 from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
-from estimator.core.checks import Allowed, Floats, ImageError, Ints, Step, frozen
+from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
+from estimator.core.errors import ImageError
 from estimator.core.types import (
     THESIS_INTENSITY,
     Attitude,

@@ -29,7 +29,8 @@ from estimator.catalog import catalog, index_file, pair_index, quad_index, sky_i
 from estimator.catalog.refraction import SiteAir, solve_through_air
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.core.vectors import rotation_of

@@ -20,7 +20,8 @@ from estimator.attitude.rate import center_streak_px
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import checks
 from estimator.core.camera import check_frame
-from estimator.core.checks import Allowed, Floats, ImageError, Step, frozen
+from estimator.core.checks import Allowed, Floats, Step, frozen
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate, StarMatch
 from estimator.detection.background import cleaned
 from estimator.detection.classify import Flag

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError, Step
+from estimator.core.checks import Floats, Step
+from estimator.core.errors import ImageError
 from estimator.detection.detect import to_native
 
 SKY = 100.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from estimator.calibration.mass_dynamics import MOMENT, BearingRecord, MassEstimate
 from estimator.calibration.mass_properties import estimate_with_noise
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.core.units import quantity

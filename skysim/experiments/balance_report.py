@@ -14,7 +14,7 @@ from estimator.calibration.mass_dynamics import (
     inertia_six,
 )
 from estimator.calibration.mass_properties import filter_mass
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Record

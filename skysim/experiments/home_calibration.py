@@ -37,7 +37,7 @@ from estimator.calibration.home_position import (
     separation_rad,
 )
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError

@@ -14,7 +14,7 @@ import numpy as np
 from estimator.attitude.nearfield import SOLVERS as NEAR_SOLVERS
 from estimator.attitude.solvers import SOLVERS
 from estimator.centroiding.centroid import CENTROIDERS
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, FramePriors, RateEstimate
 from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS

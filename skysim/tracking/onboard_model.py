@@ -16,7 +16,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import cat_file, catalog
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude
 from estimator.identification.led_codes import LedCode
 from estimator.trackers.pipeline import Settings

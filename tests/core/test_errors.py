@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.core.errors import OVERRIDES, InputError, Where, check_name, unknown_name
 
 ROOT = Path(__file__).parents[2]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from estimator.catalog import cat_file, catalog, published_catalogs
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
 from skysim.apps.live import gvcp
 from skysim.apps.live.commands import CommandState, Inbox, parse

@@ -50,7 +50,7 @@ def compile_algorithms() -> None:
     from estimator import Camera, StarTracker
     from estimator.attitude.solvers import SOLVERS
     from estimator.centroiding.centroid import CENTROIDERS
-    from estimator.core.checks import ImageError
+    from estimator.core.errors import ImageError
     from estimator.detection.detect import DETECTORS
     from estimator.identification.registry import IDENTIFIERS
     from estimator.trackers.pipeline import Settings

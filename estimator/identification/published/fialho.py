@@ -37,7 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
-from estimator.core.checks import Floats, ImageError, frozen
+from estimator.core.checks import Floats, frozen
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import Vector, row, squared_chord

@@ -29,7 +29,8 @@ from estimator.attitude.solvers import quest
 from estimator.catalog.pair_index import PairIndex, pair_range
 from estimator.catalog.sky_index import within
 from estimator.core import vectors
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail

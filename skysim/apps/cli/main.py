@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import (
     availability,
     camera,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from estimator.attitude.rate import covariance_of
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.background import estimate_background
 from estimator.detection.classify import NO_STAR

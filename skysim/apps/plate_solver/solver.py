@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from estimator.catalog import catalog as star_catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.detection.classify import NO_STAR
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE

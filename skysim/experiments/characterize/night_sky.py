@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from estimator.calibration.star_field import Calibration, self_calibrate
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.calibration import survey_plan
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import rate, rolling, rotation_fit
 from estimator.attitude.rate import STARS, Sight
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids, RateEstimate
 from estimator.detection import classify
 from estimator.detection.detect import local

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import dome_map, nearfield, rotation_fit
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 # AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in (reference 1.1, 5).
 CAMERA = Camera(1600, 1200, 8750.0, (799.5, 599.5))

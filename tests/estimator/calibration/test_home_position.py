@@ -19,7 +19,8 @@ from estimator.calibration.home_position import (
     pooled,
 )
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 
 # AFIT's SimSat: 35 mm lens, 4 um pixels, camera 15 in above the bearing, apex at 48 in, LEDs 8 mm apart.

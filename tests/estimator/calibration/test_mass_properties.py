@@ -23,7 +23,8 @@ from estimator.calibration.mass_properties import (
     estimate_with_noise,
     filter_mass,
 )
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from tests.helpers.bearing_motion import GRAVITY_M_S2, INERTIA, SMALL, Vehicle, prior, record
 
 NINE = slice(0, 9)

@@ -7,7 +7,7 @@ import pytest
 
 from estimator.catalog import cat_file, catalog
 from estimator.catalog.published_catalogs import OnBoard, proc_cat, read_cat
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000

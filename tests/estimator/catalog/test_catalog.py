@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from estimator.catalog import catalog
 from estimator.catalog.catalog import Observer, StarCatalog
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 180 / 3600

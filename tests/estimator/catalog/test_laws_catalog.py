@@ -23,7 +23,7 @@ from estimator.catalog import (
 from estimator.catalog.catalog import StarCatalog
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from tests.helpers.laws import ANY, NUMBERS, SEEDS, answered, drawn, law, units
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from estimator.catalog import refraction
 from estimator.catalog.refraction import SiteAir
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from tests.helpers.laws import SEEDS, law, units
 

@@ -16,7 +16,7 @@ from estimator.catalog.published_catalogs import (
     proc_cat,
     read_cat,
 )
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 ARCSEC_RAD = np.pi / 648_000

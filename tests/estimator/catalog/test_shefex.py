@@ -17,7 +17,7 @@ from estimator.catalog.published_catalogs import (
     thin,
     uniform,
 )
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 FILE = Path(__file__).parents[3] / "data/catalogs/hipparcos_hp6.5.ecsv"
 

@@ -10,7 +10,7 @@ from hypothesis import given
 
 from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, Centroids
 from tests.helpers.laws import SEEDS, law
 

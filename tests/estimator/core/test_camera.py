@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from estimator.core.camera import Camera, check_frame, distorted, undistorted
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 
 LENS = (-0.12, 0.05, 0.001, -0.002, -0.01)
 DISTORTED = Camera(1600, 1200, 2000.0, (810.5, 590.25), LENS)

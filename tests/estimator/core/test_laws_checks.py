@@ -21,7 +21,7 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.core.vectors import rotation_of
 from estimator.detection import detect

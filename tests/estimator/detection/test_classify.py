@@ -8,7 +8,7 @@ from scipy.special import erf
 
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Blobs, Centroids, FramePriors, RateEstimate
 from estimator.detection import classify, detect
 from estimator.detection.classify import NO_STAR, Flag

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 from scipy.special import erf
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import FramePriors
 from estimator.detection import detect
 from estimator.detection.background import interpolate

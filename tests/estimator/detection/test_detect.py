@@ -9,7 +9,7 @@ from scipy import ndimage, stats
 from scipy.special import erf
 
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Background, FramePriors
 from estimator.detection import background as frame_background
 from estimator.detection import detect

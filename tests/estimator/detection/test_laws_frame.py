@@ -19,7 +19,8 @@ from estimator.centroiding import centroid
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core import camera
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import (
     NO_SPREAD,
     Attitude,

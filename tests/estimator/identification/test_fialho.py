@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import pair_index
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 from estimator.identification.published.fialho import (
     MAG_GATE_SIGMA,

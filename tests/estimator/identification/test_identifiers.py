@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import catalog, pair_index
-from estimator.core.checks import Floats, ImageError, Ints
+from estimator.core.checks import Floats, Ints
+from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification.registry import IDENTIFIERS

@@ -12,7 +12,8 @@ from scipy.stats import chi2
 
 from estimator.attitude.dome_map import Lever, project
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids, StarMatch
 from estimator.identification import led_codes, led_naming
 from estimator.identification.led_codes import GROSS, LedCode, LightTracks

@@ -11,7 +11,8 @@ from scipy.stats import norm
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.identification import led_detections
 from estimator.identification.led_detections import STRAY, STRAY_DENSITY

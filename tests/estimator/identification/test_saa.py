@@ -12,8 +12,9 @@ from estimator.calibration.home_position import Sighting, calibrate
 from estimator.catalog import pair_index
 from estimator.catalog.pair_index import PairIndex
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
 from estimator.core.constants import ARCSEC_RAD
+from estimator.core.errors import ImageError
 from estimator.core.types import StarMatch
 from estimator.core.vectors import normalized
 from estimator.identification.published.saa import saa

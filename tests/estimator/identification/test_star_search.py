@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.catalog import sky_index
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import NO_SPREAD
 from estimator.core.vectors import quaternion_xyzw
 from estimator.identification import star_detections as detections_module

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.exposure_control import (
     Control,

@@ -16,7 +16,7 @@ from estimator.attitude.solvers import SOLVERS, covariance
 from estimator.catalog import catalog
 from estimator.centroiding.centroid import CENTROIDERS
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids, FramePriors
 from estimator.detection.detect import DETECTORS
 from estimator.trackers.pipeline import Settings

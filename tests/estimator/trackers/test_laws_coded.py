@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids, RateEstimate
 from estimator.identification.led_codes import LedCode
 from estimator.trackers.coded_tracker import CodedTracker, DecoderSettings

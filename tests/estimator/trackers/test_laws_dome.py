@@ -19,7 +19,8 @@ from estimator.calibration import home_position
 from estimator.calibration.home_position import Sighting
 from estimator.catalog import pair_index
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.core.vectors import normalized
 from estimator.identification import led_detections, led_index, led_search

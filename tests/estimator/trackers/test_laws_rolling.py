@@ -15,7 +15,8 @@ from estimator.attitude.dome_map import LedMap, Lever
 from estimator.attitude.rate import Sight
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.trackers import rolling_shutter
 from estimator.trackers.dome_tracker import DomeTracker

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.calibration.zero_point import magnitude_zero
 from estimator.catalog import catalog, pair_index
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.identification.direct_match import to_star_match
 from estimator.identification.published import primary_pair, shefex

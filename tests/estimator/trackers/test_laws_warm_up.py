@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.detection.detect import to_native
 from estimator.trackers import warm_up
 from tests.helpers.laws import law

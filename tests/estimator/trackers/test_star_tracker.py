@@ -12,7 +12,8 @@ from estimator.attitude import dome_map
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats, ImageError
+from estimator.core.checks import Floats
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.refusals import (
     BUDGET,

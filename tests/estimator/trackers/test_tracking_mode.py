@@ -11,7 +11,7 @@ from scipy.special import erf
 
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.detection.windows import in_windows
 from estimator.trackers.pipeline import Clock, Settings

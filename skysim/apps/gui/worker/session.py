@@ -13,7 +13,7 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
 
 if TYPE_CHECKING:  # the template sets the environment of numba before it is imported

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from estimator.core.checks import ImageError
+from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.dome_tracker import DomeTracker
