@@ -1,6 +1,6 @@
 """Run a script on an untrusted file in a child process with limits, since C libraries may crash, hang or fill memory.
 
-The child is `python -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
+The child is `python -P -m skysim.core.guarded CPU_S MEMORY_BYTES SCRIPT ARGUMENTS`. It imports this module, then
 the script as a file, without the packages that contain it.
 """
 
@@ -13,6 +13,11 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
+# Python without the working directory on its import path: a stranger's folder may hold a module signal.py.
+PYTHON = (sys.executable, "-P")
+SAFE_PATH = "PYTHONSAFEPATH"  # environment variable that does the same
+# Value of MUJOCO_GL with which MuJoCo imports no OpenGL, whose library runs Python in the working directory.
+GL_OFF = "off"
 WALL_S = 15.0  # elapsed time, for a child that waits, or on a loaded machine
 MESSAGE_BYTES = 1000  # of the child's standard error that are read
 # One thread: the stacks and arenas of a pool for many cores would exceed the memory limit.
@@ -32,7 +37,7 @@ def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) ->
         Limit of address space, including libraries
     """
     limits = (str(cpu_s), str(memory_bytes))
-    command = [sys.executable, "-m", __name__, *limits, str(script), *arguments]
+    command = [*PYTHON, "-m", __name__, *limits, str(script), *arguments]
     with tempfile.TemporaryFile() as errors:
         try:
             code = subprocess.run(

@@ -33,6 +33,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from skysim.core.errors import InputError, printable, unknown_name
+from skysim.core.guarded import PYTHON
 from skysim.core.types import Floats, Record
 
 START_LIMIT_S = 120.0  # time limit for the program to report that it is ready
@@ -319,7 +320,7 @@ def host_command(module: str, name: str) -> tuple[list[str], dict[str, str]]:
     The child gets the import path of this process, so it finds the same entry points.
     """
     path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
-    return [sys.executable, "-m", module, name], {**os.environ, "PYTHONPATH": path}
+    return [*PYTHON, "-m", module, name], {**os.environ, "PYTHONPATH": path}
 
 
 def describe_error(error: Exception) -> str:

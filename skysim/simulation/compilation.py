@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.detector import saturation_dn
 from skysim.core.errors import InputError
+from skysim.core.guarded import PYTHON
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
 from skysim.core.yaml_reader import parse_overrides
@@ -40,7 +41,7 @@ class TrackerCompilation(event.Listener):
     """Listener to numba that starts the second process, and waits for it, as the module's docstring says."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
-        self.command = [sys.executable, "-m", __name__, *arguments]
+        self.command = [*PYTHON, "-m", __name__, *arguments]
         self.process: subprocess.Popen[bytes] | None = None
 
     def on_start(self, compilation: event.Event) -> None:

@@ -1,6 +1,7 @@
 """Entry point of the command line: registers the commands and turns user errors into one line on stderr."""
 
 import gc
+import os
 import sys
 from typing import Annotated
 
@@ -27,6 +28,7 @@ from skysim.apps.cli.examples import add_help
 from skysim.apps.cli.options import as_typed
 from skysim.apps.cli.terminal import print_error
 from skysim.core import __version__, errors
+from skysim.core.guarded import GL_OFF
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 # Commands by the job that they do, as `skysim --help` lists them.
@@ -92,6 +94,8 @@ def options(
 def main() -> None:
     """Run the command. A user error prints one line and exits with code 2; Ctrl-C and SIGTERM exit with 130."""
     errors.running_as_command = True
+    # Pictures of the lab are drawn by a process of their own.
+    os.environ.setdefault("MUJOCO_GL", GL_OFF)
     # Importing creates a hundred thousand objects; their collection takes 5 % of the time of a short command.
     gc.set_threshold(50_000)
     # Clean up after SIGTERM as after Ctrl-C.

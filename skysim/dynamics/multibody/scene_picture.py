@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
+from skysim.core.guarded import GL_OFF, PYTHON
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
@@ -68,12 +69,15 @@ def film(mjcf: str, qpos: Floats, size_px: tuple[int, int] = FILM_PX) -> Iterato
     with tempfile.TemporaryFile() as task, tempfile.TemporaryFile() as errors:
         np.savez(task, mjcf=np.array(mjcf), qpos=qpos, size_px=np.array(size_px))
         task.seek(0)
+        environment = dict(os.environ)
+        if environment.get("MUJOCO_GL") in (None, GL_OFF):
+            environment["MUJOCO_GL"] = "egl"
         with subprocess.Popen(
-            [sys.executable, "-m", "skysim.dynamics.multibody.scene_picture"],
+            [*PYTHON, "-m", "skysim.dynamics.multibody.scene_picture"],
             stdin=task,
             stdout=subprocess.PIPE,
             stderr=errors,
-            env={"MUJOCO_GL": "egl"} | dict(os.environ),
+            env=environment,
         ) as renderer:
             try:
                 for _ in range(len(qpos)):

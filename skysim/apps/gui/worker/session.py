@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from estimator.core.errors import ImageError
 from skysim.core.errors import InputError
+from skysim.core.guarded import SAFE_PATH
 
 if TYPE_CHECKING:  # the template sets the environment of numba before it is imported
     from skysim.apps.gui.messages import Display
@@ -139,7 +140,7 @@ class Workers:
         scene
             File of the scene that it sets up
         """
-        os.environ[SCENE] = scene
+        os.environ |= {SCENE: scene, SAFE_PATH: "1"}
         forkserver.ensure_running()
 
     def take(self) -> Session | None:

@@ -15,6 +15,7 @@ import yaml
 
 from skysim.core import errors
 from skysim.core.errors import InputError
+from skysim.core.guarded import PYTHON
 from skysim.experiments.study.api import run_study
 from skysim.experiments.study.execution import store
 from skysim.results import metrics
@@ -98,7 +99,7 @@ class StudyProcess:
     async def start(self, study: Path) -> None:
         """Start the process, which continues the study in the folder's store; its stderr is kept for `wait`."""
         self.process = await asyncio.create_subprocess_exec(
-            sys.executable,
+            *PYTHON,
             "-m",
             "skysim.apps.gui.worker.study_process",
             str(study),

@@ -7,12 +7,15 @@ from contextlib import contextmanager
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
 
+from skysim.core.guarded import SAFE_PATH
+
 ONE_THREAD = (
     "NUMBA_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "OMP_NUM_THREADS",
     "MKL_NUM_THREADS",
 )
+SETTINGS = dict.fromkeys((*ONE_THREAD, SAFE_PATH), "1")
 
 
 def start_fork_server() -> ForkServerContext:
@@ -28,10 +31,10 @@ def start_fork_server() -> ForkServerContext:
 def one_thread() -> Iterator[None]:
     """Context in which started processes use one numerical thread each; there is already one worker per core.
 
-    They inherit the environment variables.
+    They inherit the environment variables, also that the working directory is not on the import path.
     """
-    previous = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    previous = {name: os.environ.get(name) for name in SETTINGS}
+    os.environ.update(SETTINGS)
     try:
         yield
     finally:
