@@ -156,7 +156,9 @@ class TransferPoints:
     difference_dn2: Floats
 
     def take(self, which: Bools | Ints) -> TransferPoints:
-        return TransferPoints(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+        return TransferPoints(
+            *(getattr(self, name)[which] for name in self.__dataclass_fields__)
+        )
 
 
 @dataclass(eq=False)

@@ -28,8 +28,7 @@ from typer.testing import CliRunner
 from skysim.apps.cli import main
 from skysim.apps.live import gige, gvcp
 from skysim.apps.live.commands import CommandState
-from skysim.apps.live.gige import GigeCamera
-from skysim.apps.live.gvcp import GVCP_PORT, GvcpStatus
+from skysim.apps.live.gige import GVCP_PORT, GigeCamera, GvcpStatus
 from skysim.apps.live.pacing import Live, Pace
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
