@@ -19,7 +19,7 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
-from skysim.apps.live import gvcp
+from skysim.apps.live import gige
 from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.gige import GigeCamera
 from skysim.apps.live.pacing import Live, Pace
@@ -278,8 +278,8 @@ def datagrams(data: bytes) -> None:
             sent += len(one)
             answer = camera.answer(one, ("127.0.0.1", 1), 0.0)
             if answer is not None:
-                status, _, size, number = gvcp.ANSWER.unpack_from(answer)
-                gvcp.GvcpStatus(status)
+                status, _, size, number = gige.ANSWER.unpack_from(answer)
+                gige.GvcpStatus(status)
                 if size != len(answer) - 8 or number != int.from_bytes(one[6:8]):
                     raise AssertionError(f"a malformed answer: {answer!r}")
     finally:

@@ -105,7 +105,7 @@ OUT_OF_REACH = {
     "skysim.core.plugins.serve": OURS,
     "skysim.dynamics.controllers.ControllerInput.of_tree": OURS,
     "skysim.dynamics.controllers.ControllerSetup.of_tree": OURS,
-    "skysim.dynamics.multibody.scene_shapes.laboratory": "reads the MJCF text that we export",
+    "skysim.dynamics.multibody.scene_shapes.Laboratory.__init__": "reads the MJCF text that we export",
     "skysim.results.run_report.run_report": "takes a picture of ours into a page",
     "skysim.experiments.study.execution.setups.code_version": SOURCES,
     "skysim.experiments.study.execution.setups.scene_hash": SOURCES,

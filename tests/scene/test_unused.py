@@ -278,6 +278,7 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(SKY, {}, "camera.pupil_walk", "[10 mm, 0 mm]", {}),
     Case(SKY, WARMING, "thermal.dome_ppm_k", "70", {}),
     Case(DOME, WARMING, "thermal.anchor_height", "1 m", {"thermal.dome_ppm_k": "70"}),
     Case(DOME, WARMING | STEADY, "thermal.speed", "60", WARMING),

@@ -137,7 +137,10 @@ def test_an_option_without_effect_is_refused_in_a_head_too(tmp_path: Path) -> No
 
 def test_the_expected_roll_of_two_heads_is_from_the_other_s_boresight() -> None:
     """At a right angle the roll about one boresight is an angle across the other: 1 / roll^2 + 2 / cross^2."""
-    facts = check(two_heads()).as_dict()["facts"]
+    steady = {"kind": "steady", "temperature_c": 20.0}
+    aligned = [SIDE | {"mount_error_arcsec": [0, 0, 0]}]
+    lab = two_heads(thermal={"temperature": steady}, heads=aligned)
+    facts = check(lab).as_dict()["facts"]
     main = facts["expected_error"]["frames"]
     side = facts["heads"]["heads"][0]
     expected = (main["roll_arcsec"] ** -2 + 2 * side["cross_arcsec"] ** -2) ** -0.5

@@ -12,6 +12,7 @@ from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
 from skysim.simulation.checks.detection import context_of
+from skysim.simulation.checks.expected_error import as_built, believed_px2, gains
 from skysim.simulation.checks.plan_check import check
 from skysim.simulation.checks.sampling import Plan, sampled
 from skysim.simulation.flight import Flight
@@ -202,11 +203,13 @@ def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(
         "thermal_drift", **{f"thermal__{key}": value for key, value in keys.items()}
     )
     view = plan.frames.used[0]
-    at = plan.frames.attitudes
     distance_m, arm_m = (
         np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m)
     )
-    turn = findings.drift_rad(view, at.lab_from_body[0], 0.0, plan) / ARCSEC_RAD
+    moved_px = as_built(view, plan)
+    assert moved_px is not None
+    turn_rad = np.einsum("nij,njk->i", gains(view, believed_px2(view, plan)), moved_px)
+    turn = turn_rad / ARCSEC_RAD
     if any(mount):
         np.testing.assert_allclose(
             turn[:2], 25 * np.array(mount[:2]) * distance_m / arm_m, rtol=0.01

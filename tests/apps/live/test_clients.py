@@ -1,4 +1,7 @@
-"""The two clients of docs/howto/live.md close the attitude loop over the wire; its other blocks, and protocols.md's."""
+"""The two clients of docs/howto/live.md close the attitude loop over the wire, and the page's other blocks run.
+
+Those of docs/howto/protocols.md run here, in test_gige and in test_indi.
+"""
 
 import re
 import subprocess

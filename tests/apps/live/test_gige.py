@@ -26,7 +26,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.apps.live import gige, gvcp
+from skysim.apps.live import gige
 from skysim.apps.live.commands import CommandState
 from skysim.apps.live.gige import GVCP_PORT, GigeCamera, GvcpStatus
 from skysim.apps.live.pacing import Live, Pace
@@ -75,7 +75,7 @@ def camera() -> Iterator[GigeCamera]:
 class Client:
     """An application's datagrams, given to the camera without a network."""
 
-    def __init__(self, camera: GigeCamera, address: gvcp.Sender = CLIENT) -> None:
+    def __init__(self, camera: GigeCamera, address: gige.Sender = CLIENT) -> None:
         self.camera = camera
         self.address = address
         self.number = 0
@@ -102,23 +102,23 @@ class Client:
         return int.from_bytes(self.send(command, payload, length)[:2])
 
     def write(self, address: int, value: int) -> int:
-        return self.status(gvcp.WRITEREG, struct.pack(">II", address, value))
+        return self.status(gige.WRITEREG, struct.pack(">II", address, value))
 
     def write_exposure_us(self, value: float) -> int:
-        return self.status(gvcp.WRITEMEM, struct.pack(">Id", gige.EXPOSURE_US, value))
+        return self.status(gige.WRITEMEM, struct.pack(">Id", gige.EXPOSURE_US, value))
 
     def read(self, address: int) -> int:
-        answer = self.send(gvcp.READREG, struct.pack(">I", address))
+        answer = self.send(gige.READREG, struct.pack(">I", address))
         assert answer[:2] == b"\0\0"
         return int.from_bytes(answer[2:])
 
     def read_double(self, address: int) -> float:
-        answer = self.send(gvcp.READMEM, struct.pack(">II", address, 8))
+        answer = self.send(gige.READMEM, struct.pack(">II", address, 8))
         return float(struct.unpack(">d", answer[6:])[0])
 
     def control(self) -> Client:
-        assert self.write(gvcp.PRIVILEGE, gvcp.CONTROL) == 0
-        assert self.write(gvcp.HEARTBEAT, 600_000) == 0
+        assert self.write(gige.PRIVILEGE, gige.CONTROL) == 0
+        assert self.write(gige.HEARTBEAT, 600_000) == 0
         return self
 
 
@@ -146,17 +146,17 @@ def test_the_xml_is_well_formed_and_every_register_of_it_is_there(camera: GigeCa
 
 def test_discovery_tells_names_and_the_xml_where_it_is(camera: GigeCamera) -> None:
     client = Client(camera)
-    data = client.send(gvcp.DISCOVERY)[2:]
+    data = client.send(gige.DISCOVERY)[2:]
     assert len(data) == 248
     assert data[0x48:0x68].rstrip(b"\0") == b"skysim"
     assert data[0xE8:].rstrip(b"\0") == b"shefex2"
     assert socket.inet_ntoa(data[0x24:0x28]) == "127.0.0.1"
-    url = client.send(gvcp.READMEM, struct.pack(">II", 0x200, 512))[6:].rstrip(b"\0").decode()
+    url = client.send(gige.READMEM, struct.pack(">II", 0x200, 512))[6:].rstrip(b"\0").decode()
     place, name, first, size = url.replace(":", ";").split(";")
     assert (place, name) == ("Local", "gige_camera.xml")
     at, end = int(first, 16), int(first, 16) + int(size, 16)
     parts = [
-        client.send(gvcp.READMEM, struct.pack(">II", one, min(512, end - one)))[6:]
+        client.send(gige.READMEM, struct.pack(">II", one, min(512, end - one)))[6:]
         for one in range(at, end, 512)
     ]
     assert b"".join(parts).rstrip(b"\n") == (DATA / "gige_camera.xml").read_bytes().rstrip()
@@ -165,34 +165,34 @@ def test_discovery_tells_names_and_the_xml_where_it_is(camera: GigeCamera) -> No
 @pytest.mark.parametrize(
     ("command", "payload", "status"),
     [
-        (gvcp.READREG, struct.pack(">I", 0x0F00), GvcpStatus.INVALID_ADDRESS),
-        (gvcp.READREG, struct.pack(">I", 0xA04C), GvcpStatus.INVALID_ADDRESS),
-        (gvcp.READREG, struct.pack(">I", 0xA001), GvcpStatus.BAD_ALIGNMENT),
-        (gvcp.READREG, b"123", GvcpStatus.INVALID_HEADER),
-        (gvcp.READMEM, struct.pack(">II", 0x10000, 600), GvcpStatus.INVALID_PARAMETER),
-        (gvcp.READMEM, struct.pack(">II", 0, 250), GvcpStatus.BAD_ALIGNMENT),
-        (gvcp.READMEM, struct.pack(">II", 0xF4, 8), GvcpStatus.INVALID_ADDRESS),
-        (gvcp.WRITEREG, struct.pack(">II", 0x0F00, 1), GvcpStatus.INVALID_ADDRESS),
-        (gvcp.WRITEREG, struct.pack(">II", 0xA000, 9), GvcpStatus.WRITE_PROTECT),
+        (gige.READREG, struct.pack(">I", 0x0F00), GvcpStatus.INVALID_ADDRESS),
+        (gige.READREG, struct.pack(">I", 0xA04C), GvcpStatus.INVALID_ADDRESS),
+        (gige.READREG, struct.pack(">I", 0xA001), GvcpStatus.BAD_ALIGNMENT),
+        (gige.READREG, b"123", GvcpStatus.INVALID_HEADER),
+        (gige.READMEM, struct.pack(">II", 0x10000, 600), GvcpStatus.INVALID_PARAMETER),
+        (gige.READMEM, struct.pack(">II", 0, 250), GvcpStatus.BAD_ALIGNMENT),
+        (gige.READMEM, struct.pack(">II", 0xF4, 8), GvcpStatus.INVALID_ADDRESS),
+        (gige.WRITEREG, struct.pack(">II", 0x0F00, 1), GvcpStatus.INVALID_ADDRESS),
+        (gige.WRITEREG, struct.pack(">II", 0xA000, 9), GvcpStatus.WRITE_PROTECT),
         (
-            gvcp.WRITEREG,
+            gige.WRITEREG,
             struct.pack(">II", gige.PIXEL_FORMAT, 9),
             GvcpStatus.INVALID_PARAMETER,
         ),
         (
-            gvcp.WRITEREG,
+            gige.WRITEREG,
             struct.pack(">II", gige.ACQUISITION_MODE, 2),
             GvcpStatus.INVALID_PARAMETER,
         ),
-        (gvcp.WRITEREG, struct.pack(">II", gige.TRIGGER, 1), GvcpStatus.WRITE_PROTECT),
+        (gige.WRITEREG, struct.pack(">II", gige.TRIGGER, 1), GvcpStatus.WRITE_PROTECT),
         (
-            gvcp.WRITEREG,
+            gige.WRITEREG,
             struct.pack(">II", gige.PACKET_SIZE, 60),
             GvcpStatus.INVALID_PARAMETER,
         ),
-        (gvcp.WRITEREG, struct.pack(">II", 0xA010, 1), GvcpStatus.INVALID_HEADER),
-        (gvcp.WRITEMEM, struct.pack(">Id", 0xA020, 1.0), GvcpStatus.WRITE_PROTECT),
-        (gvcp.WRITEMEM, b"12", GvcpStatus.INVALID_HEADER),
+        (gige.WRITEREG, struct.pack(">II", 0xA010, 1), GvcpStatus.INVALID_HEADER),
+        (gige.WRITEMEM, struct.pack(">Id", 0xA020, 1.0), GvcpStatus.WRITE_PROTECT),
+        (gige.WRITEMEM, b"12", GvcpStatus.INVALID_HEADER),
         (0x0100, b"", GvcpStatus.NOT_IMPLEMENTED),
     ],
 )
@@ -221,8 +221,8 @@ def test_a_broadcast_only_finds_a_camera_and_only_from_where_it_can_be_reached(
 ) -> None:
     heard: list[bytes] = []
     monkeypatch.setattr(camera, "answer", lambda datagram, *_: heard.append(datagram))
-    discovery = struct.pack(">BBHHH", 0x42, 0x11, gvcp.DISCOVERY, 0, 1)
-    reading = struct.pack(">BBHHHI", 0x42, 1, gvcp.READREG, 4, 1, 0)
+    discovery = struct.pack(">BBHHH", 0x42, 0x11, gige.DISCOVERY, 0, 1)
+    reading = struct.pack(">BBHHHI", 0x42, 1, gige.READREG, 4, 1, 0)
     camera.reply(discovery, ("192.0.2.9", 1), True)
     camera.reply(reading, CLIENT, True)
     assert not heard
@@ -234,7 +234,7 @@ def test_a_broadcast_only_finds_a_camera_and_only_from_where_it_can_be_reached(
 
 def test_a_command_of_another_length_than_it_says_is_refused(camera: GigeCamera) -> None:
     client = Client(camera)
-    assert client.status(gvcp.READREG, bytes(4), 8) == GvcpStatus.INVALID_HEADER
+    assert client.status(gige.READREG, bytes(4), 8) == GvcpStatus.INVALID_HEADER
 
 
 @pytest.mark.parametrize("exposure_us", [-1.0, 0.0, 1e9, np.nan, np.inf])
@@ -290,24 +290,24 @@ def test_one_application_controls_until_it_leaves(camera: GigeCamera) -> None:
     client.control()
     assert client.write(gige.PACKET_SIZE, 1000) == 0
     assert other.write(gige.PACKET_SIZE, 2000) == GvcpStatus.ACCESS_DENIED
-    assert other.write(gvcp.PRIVILEGE, gvcp.CONTROL) == GvcpStatus.ACCESS_DENIED
-    assert other.write(gvcp.PRIVILEGE, 0) == GvcpStatus.ACCESS_DENIED
+    assert other.write(gige.PRIVILEGE, gige.CONTROL) == GvcpStatus.ACCESS_DENIED
+    assert other.write(gige.PRIVILEGE, 0) == GvcpStatus.ACCESS_DENIED
     assert other.read(gige.PACKET_SIZE) == 1000
-    assert client.write(gvcp.PRIVILEGE, gvcp.EXCLUSIVE) == 0
-    assert other.status(gvcp.READREG, bytes(4)) == GvcpStatus.ACCESS_DENIED
-    assert other.status(gvcp.DISCOVERY) == 0
-    assert client.write(gvcp.PRIVILEGE, 0) == 0
+    assert client.write(gige.PRIVILEGE, gige.EXCLUSIVE) == 0
+    assert other.status(gige.READREG, bytes(4)) == GvcpStatus.ACCESS_DENIED
+    assert other.status(gige.DISCOVERY) == 0
+    assert client.write(gige.PRIVILEGE, 0) == 0
     other.control()
 
 
 def test_an_application_that_is_not_heard_loses_the_control(camera: GigeCamera) -> None:
     client = Client(camera).control()
-    client.write(gvcp.HEARTBEAT, 500)
+    client.write(gige.HEARTBEAT, 500)
     client.write(gige.STREAM_PORT, 4000)
     client.write(gige.START, 1)
     for _ in range(3):
         client.now_s += 0.4
-        assert client.read(gvcp.PRIVILEGE) == gvcp.CONTROL
+        assert client.read(gige.PRIVILEGE) == gige.CONTROL
     assert camera.channels
     # The camera's own thread sees it, without a datagram. Its clock is that of the client's last one.
     camera.heard_s = time.monotonic() - 0.4
@@ -315,7 +315,7 @@ def test_an_application_that_is_not_heard_loses_the_control(camera: GigeCamera) 
     while camera.channels and time.monotonic() < deadline_s:
         time.sleep(0.02)
     assert not camera.channels
-    assert client.read(gvcp.PRIVILEGE) == 0
+    assert client.read(gige.PRIVILEGE) == 0
     assert client.read(gige.STREAM_PORT) == 0
 
 
@@ -433,10 +433,10 @@ def test_lost_packets_come_again_while_they_are_kept(camera: GigeCamera) -> None
             camera.live.advance()
         packets = [receiver.recv(2000) for _ in range(7)]
         assembled(packets)
-        resend = struct.pack(">BBHHHHHII", 0x42, 0, gvcp.PACKETRESEND, 12, 9, 0, 1, 2, 3)
+        resend = struct.pack(">BBHHHHHII", 0x42, 0, gige.PACKETRESEND, 12, 9, 0, 1, 2, 3)
         assert camera.answer(resend, OTHER, client.now_s) is None
         assert [receiver.recv(2000) for _ in range(2)] == packets[2:4]
-        resend = struct.pack(">BBHHHHHII", 0x42, 0, gvcp.PACKETRESEND, 12, 9, 0, 7, 2, 3)
+        resend = struct.pack(">BBHHHHHII", 0x42, 0, gige.PACKETRESEND, 12, 9, 0, 7, 2, 3)
         assert camera.answer(resend, OTHER, client.now_s) is None
         assert camera.answer(resend[:-1], OTHER, client.now_s) is None
         receiver.setblocking(False)
@@ -454,7 +454,7 @@ def test_any_datagram_is_answered_or_ignored(camera: GigeCamera) -> None:
             data = bytearray(rng.bytes(size))
             data[:1] = b"\x42"
             client.send(data)
-        client.send(struct.pack(">BBHHH", 0x42, 1, gvcp.DISCOVERY, 0, 0xFFFF))
+        client.send(struct.pack(">BBHHH", 0x42, 1, gige.DISCOVERY, 0, 0xFFFF))
         while client.recv(2000)[2:] != struct.pack(">HHH", 3, 248, 0xFFFF) + bytes(
             camera.memory[:248]
         ):
