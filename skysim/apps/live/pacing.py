@@ -2,7 +2,8 @@
 
 1. `CommandState.receive`: the clients' commands are taken; those of actuators are held until they time out.
 2. The motion is simulated for one control period with them.
-3. The clock is waited for; a period that ends late by a period or more is a missed deadline.
+3. The clock is waited for; a period that ends late by a period or more is a missed deadline. A frame that ends in the
+   first half of the period does not wait for its end, since no command changes the motion within it.
 4. IMU samples, encoders, telemetry and truth are sent, as far as a client takes them.
 5. Frames that are due are rendered, solved if a client takes the solutions, and sent. One that is late by a frame
    period or more before its rendering starts is dropped.
@@ -173,11 +174,15 @@ class Live:
         self.commands.receive(self.inbox)
         began_s = flight.now_s
         flight.motion.advance(flight.motion.period_steps, self.commands.in_force())
-        # 3. Clock.
+        # 3. A frame that ends in the first half of the period, and the clock.
         now_s = flight.now_s
+        period_s = flight.motion.flight_computer.period_s
+        main = flight.schedules[0]
+        if not main.is_over and began_s < main.window.close_s < began_s + period_s / 2:
+            self.pace.wait(main.window.close_s)
+            self.send_frames()
         self.pace.wait(now_s)
         self.periods += 1
-        period_s = flight.motion.flight_computer.period_s
         self.missed += self.pace.late_s(now_s) * self.pace.speed >= period_s
         # 4. Values.
         wanted = self.wanted

@@ -345,3 +345,39 @@ def test_late_periods_are_counted() -> None:
     time.sleep(0.05)
     live.advance()
     assert (live.periods, live.missed) == (2, 1)
+
+
+class Kept:
+    """An output that keeps the packets of two channels."""
+
+    name = "kept"
+    fault = ""
+    channels = ("frame", "state")
+
+    def __init__(self) -> None:
+        self.packets: list[Packet] = []
+
+    def offer(self, packet: Packet, patient: bool) -> None:
+        self.packets.append(packet)
+
+
+@pytest.mark.parametrize(("after_s", "is_first"), [(0.002, True), (0.008, False)])
+def test_a_frame_waits_for_half_a_control_period_at_most(
+    after_s: float, is_first: bool
+) -> None:
+    """One that ends early in a period comes before the values of the period's end, which take no time."""
+    exact = {"exposure.trigger_jitter": "0 s", "exposure.time_tag_jitter": "0 s"}
+    live = live_flight(**exact, **{"exposure.first": f"{0.19 + after_s} s"})
+    kept = Kept()
+    live.outputs.append(kept)  # type: ignore[arg-type]
+    period_s = live.flight.motion.flight_computer.period_s
+    assert period_s == pytest.approx(0.01)
+    while not any(one.channel == "frame" for one in kept.packets):
+        live.advance()
+    names = [one.channel for one in kept.packets]
+    (frame,) = (one.header for one in kept.packets if one.channel == "frame")
+    closed_s = frame["t_s"] + frame["exposure_s"] / 2
+    assert closed_s == pytest.approx(0.2 + after_s)
+    states_s = [one.header["t_s"] for one in kept.packets if one.channel == "state"]
+    assert states_s[-1] == pytest.approx(0.21)
+    assert names.index("frame") == len(states_s) - is_first
