@@ -30,6 +30,7 @@ from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.checks import attitudes
 from skysim.simulation.checks.expected_error import AS_BUILT, pixel_response
 from skysim.simulation.checks.plan_check import plan_of
+from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import build_lab
 from tests.helpers.splatting import add_kernel
@@ -319,3 +320,34 @@ def test_a_run_errs_as_check_forecasts(key: str, value: str) -> None:
     assert measured_arcsec == pytest.approx(forecast.rms_arcsec()[0], rel=0.05)
     share = forecast.rad2["cross"][AS_BUILT] / forecast.total("cross")
     assert share.min() > 0.5
+
+
+def test_flares_of_coma_point_outward_in_a_frame() -> None:
+    """The third moment of the light along the radius, in proportion to the distance from the principal point."""
+    scene = loader.load(
+        "shefex2", {"camera.psf.coma_px": "3", "camera.detector.noise": "false"}
+    )
+    lab = build_lab(scene)
+    frame, truth = render_at_rest(lab.camera, lab.start)
+    center = np.array(scene.camera.center_px)
+    sources = truth.sources
+    y, x = np.mgrid[-8:9, -8:9]
+    found = []
+    for n in np.argsort(-sources.electrons)[:40]:
+        place = sources.xy_px[n]
+        apart = np.linalg.norm(sources.xy_px - place, axis=1)
+        column, row = np.rint(place).astype(int)
+        window = frame.image_dn[row - 8 : row + 9, column - 8 : column + 9]
+        if window.shape != (17, 17) or np.sort(apart)[1] < 20:
+            continue
+        light = window - np.median(window)
+        radius = place - center
+        toward = radius / np.linalg.norm(radius)
+        along = (x + column - place[0]) * toward[0] + (y + row - place[1]) * toward[1]
+        skew = (light * along**3).sum() / light.sum()
+        found.append((np.linalg.norm(radius) / scene.camera.corner_px, skew))
+    # Faint neighbors hide the moment where there is little coma.
+    field, skew = np.array([one for one in found if one[0] > 0.5]).T
+    assert len(field) > 4
+    # Of Seidel's pattern: c^3 <(s (2 + cos 2 phi) - 1)^3> = c^3 / 4.
+    np.testing.assert_allclose(np.cbrt(4 * skew), 3 * field, rtol=0.2)

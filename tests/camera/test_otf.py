@@ -506,3 +506,40 @@ def test_an_image_on_pixels_with_a_response_is_its_integral(sigma_px: float) -> 
         expected = np.outer(along(4 + dy), along(4 + dx))
         drawn = draw(image, 4 + dx, 4 + dy, 9)
         np.testing.assert_allclose(drawn, expected, atol=1e-3)
+
+
+# Coma.
+
+
+@pytest.mark.parametrize("direction_deg", [0.0, 30.0, 250.0])
+def test_coma_is_where_rays_through_the_pupil_end(direction_deg: float) -> None:
+    """Rays of an even grid over the pupil, displaced by Seidel's law, blurred and summed over the pixels."""
+    sigma_px = 0.6
+    size_px = 2.0
+    angle = math.radians(direction_deg)
+    axis = np.array([math.cos(angle), math.sin(angle)])
+    lens = camera(psf={"kind": "gaussian", "sigma_px": sigma_px})
+    image = draw(build_kernel(lens.psf, lens, coma_px=tuple(size_px * axis)), 8.0, 8.0, 17)
+    side = np.linspace(-1, 1, 201)
+    px, py = (one.ravel() for one in np.meshgrid(side, side))
+    inside = px**2 + py**2 <= 1
+    radius2 = (px**2 + py**2)[inside]
+    turn = np.arctan2(py, px)[inside]
+    along = size_px * (radius2 * (2 + np.cos(2 * turn)) - 1)
+    across = size_px * radius2 * np.sin(2 * turn)
+    x = 8 + along * axis[0] - across * axis[1]
+    y = 8 + along * axis[1] + across * axis[0]
+    edges = np.arange(18) - 0.5
+
+    def shares(places: Floats) -> Floats:
+        """(rays, 17) shares of Gaussians in the pixels of one axis."""
+        return np.diff(special.ndtr((edges - places[:, None]) / sigma_px), axis=1)
+
+    expected = np.einsum("ni,nj->ij", shares(y), shares(x)) / len(x)
+    np.testing.assert_allclose(image, expected, atol=2e-3)
+    # The center of light stays, and the flare points outward, away from the bright tip.
+    pixels = np.arange(17)
+    center = np.array([image.sum(axis=0) @ pixels, image.sum(axis=1) @ pixels])
+    np.testing.assert_allclose(center / image.sum(), 8, atol=0.02)
+    tip = np.array(np.unravel_index(image.argmax(), image.shape))[::-1] - 8
+    assert tip @ axis < 0

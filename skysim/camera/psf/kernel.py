@@ -29,6 +29,7 @@ from skysim.camera.psf.otf import (
     WINGED,
     Otf,
     blur,
+    coma,
     pixel,
     uniform_disk,
 )
@@ -98,6 +99,7 @@ def build_kernel(
     extra_sigma_px: float = 0.0,
     emitter_radius_px: float = 0.0,
     blur_radius_px: float = 0.0,
+    coma_px: tuple[float, ...] = (),
 ) -> Kernel:
     """The kernel of a uniform disk (a star has radius 0) seen through this lens with this defocus.
 
@@ -114,6 +116,8 @@ def build_kernel(
         Radius of the emitting disk's geometric image
     blur_radius_px
         Radius of the defocus disk
+    coma_px
+        Coma in x and y
 
     Raises
     ------
@@ -124,7 +128,9 @@ def build_kernel(
         QUANTUM_PX * round(value / QUANTUM_PX)
         for value in (extra_sigma_px, emitter_radius_px, blur_radius_px)
     )
-    model = PsfModel(psf, camera, sigma_px, tuple(filter(None, radii_px)))
+    model = PsfModel(psf, camera, sigma_px, tuple(filter(None, radii_px)), coma_px)
+    if any(coma_px):
+        return grid_kernel(model)
     if psf.kind == "gaussian" and not (camera.detector.intrapixel or model.radii_px):
         return gaussian_kernel(float(np.hypot(psf.sigma_px, extra_sigma_px)))
     round_image = None if psf.kind in NOT_ROUND else round_kernel(model)
@@ -146,12 +152,13 @@ def reach_px(
 
 @frozen
 class PsfModel:
-    """The factors of the image's convolution: a lens, an extra Gaussian, and disks."""
+    """The factors of the image's convolution: a lens, an extra Gaussian, disks, and coma."""
 
     psf: Psf
     camera: CameraConfig
     sigma_px: float
     radii_px: tuple[float, ...]
+    coma_px: tuple[float, ...] = ()
 
     def otf(self, fx: Floats, fy: Floats, extra_sigma_px: float) -> Otf:
         """The product of the factors' transfer functions, without the pixel's, times that of an extra Gaussian."""
@@ -161,11 +168,11 @@ class PsfModel:
             product = product * blur(sigma_px, fx, fy)
         for radius in self.radii_px:
             product = product * uniform_disk(radius, fx, fy)
-        return product
+        return product * coma(self.coma_px, fx, fy) if any(self.coma_px) else product
 
     def reach_px(self) -> float:
         """Radius of a circle that holds the image, pixels' corners included."""
-        radius_px = sum(self.radii_px)
+        radius_px = sum(self.radii_px) + 2 * float(np.hypot(*(self.coma_px or (0, 0))))
         return float(reach_px(self.psf, self.camera, radius_px, self.sigma_px, CUT_SIGMA))
 
     def wing_margin_px(self) -> float:

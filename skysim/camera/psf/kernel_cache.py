@@ -90,6 +90,7 @@ class KernelCache(NamedTuple):
 CACHE_BYTES = 1 << 27  # the cache is emptied when it is larger than this
 # Largest radius of an image; tables of larger ones would take too much memory
 MAX_RADIUS_PX = 500.0
+COMA_PX = 0.1  # step of coma along x and y
 
 
 @lru_cache(maxsize=16)
@@ -173,9 +174,15 @@ def source_kernels(
     # 2. Ellipses.
     disk = ellipses(keys, camera, disks, axes_px, sizes)
     # 3. Gaussians need no shared table, so all have the key of sharp points.
-    gaussian = camera.psf.kind == "gaussian" and not camera.detector.intrapixel
+    gaussian = camera.psf.kind == "gaussian" and not (
+        camera.detector.intrapixel or camera.psf.coma_px
+    )
     if gaussian:
         keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
+    if camera.psf.coma_px:
+        coma_px = camera.psf.coma_px * (position - camera.center_px) / camera.corner_px
+        coma_px[disk.any(axis=1)] = 0
+        keys = np.column_stack([keys, np.rint(coma_px / COMA_PX).astype(np.int64)])
     kernels = look_up(camera, keys, disk)
     # 4. Widening.
     if gaussian and (optics.blur_px or camera.psf.corner_sigma_px or chromatic is not None):
@@ -222,14 +229,16 @@ def ellipses(
 
 
 def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
-    """The kernels of N keys (N, 3) in the camera's cache, with the ellipses `disk`; makes those that are missing."""
+    """The kernels of N keys (N, 3 or 5) in the camera's cache, with the ellipses `disk`; makes the missing ones."""
     cache = kernel_cache(camera)
-    codes = keys @ PACKING
+    codes = keys[:, :3] @ PACKING
     # Stars in focus share one key, which saves the sort.
     first = np.zeros(1, int)
     inverse = np.zeros(len(codes), int)
     if codes.any() or not codes.size:
         _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
+    if keys.shape[1] > 3:
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     used = [tuple(key) for key in keys[first].tolist()]
     add_kernels(cache, camera, used)
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
@@ -376,7 +385,9 @@ def make_kernel(
     if key[0] == BOX_KEY:
         box = ellipse.ellipse_box(camera.psf, camera, key[1])
         return (ELLIPSE, 0.0, key[1] + 0.5, 1.0), (box.waves, box.samples), box.table
-    kernel = build_kernel(camera.psf, camera, *(n * QUANTUM_PX for n in key))
+    sigma_px, emitter_px, defocus_px = (n * QUANTUM_PX for n in key[:3])
+    coma_px = tuple(n * COMA_PX for n in key[3:])
+    kernel = build_kernel(camera.psf, camera, sigma_px, emitter_px, defocus_px, coma_px)
     # A grid's first two sides are equal.
     sizes = kernel.table.shape[1:3] if kernel.kind == GRID else kernel.table.shape
     properties = (kernel.kind, kernel.sigma_px, kernel.reach_px, kernel.sharp_px)

@@ -31,6 +31,7 @@ from skysim.scene.sections.camera import (
 
 Otf = NDArray  # real, or complex where the PSF is not symmetric
 
+COMA_NODES = 32  # of the integral over the pupil's area
 WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak
 
 
@@ -91,6 +92,24 @@ def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:
     """Transfer function of a Gaussian: exp(-2 pi^2 sigma^2 f^2)."""
     return np.exp(-2 * (np.pi * sigma_px) ** 2 * (fx**2 + fy**2))
+
+
+def coma(coma_px: tuple[float, ...], fx: Floats, fy: Floats) -> Otf:
+    """Transfer function of coma c, a vector in px, without its shift of the center of light.
+
+    A ray through the pupil at the radius rho and the angle phi from c is displaced by |c| rho^2 (2 + cos 2 phi, sin 2
+    phi), along and across c (Born & Wolf, Principles of Optics, section 5.3), by c on the mean. Over phi and the area,
+    with s = rho^2,
+
+        int_0^1 exp(-2 pi i f c (2 s - 1)) J0(2 pi s |c| |f|) ds.
+    """
+    along = fx * coma_px[0] + fy * coma_px[1]
+    across = math.hypot(*coma_px) * np.hypot(fx, fy)
+    nodes, weights = np.polynomial.legendre.leggauss(COMA_NODES)
+    return sum(
+        weight / 2 * np.exp(-2j * np.pi * along * s) * special.j0(np.pi * (1 + s) * across)
+        for s, weight in zip(nodes, weights, strict=True)
+    )
 
 
 def uniform_disk(radius_px: float, fx: Floats, fy: Floats) -> Floats:

@@ -69,6 +69,7 @@ def causes(scene: Scene) -> Changes:
         "dies centered": ("light.led.die", die_m, 3 * ["0 mm"]),
         "no sag": ("vehicle.sag_arcsec", scene.vehicle.sag_arcsec, [0, 0]),
         "a round ball": ("vehicle.runout", scene.vehicle.runout_m, 3 * ["0 mm"]),
+        "no coma": ("camera.psf.coma_px", [camera.psf.coma_px], 0),
         "even pixels": ("camera.detector.intrapixel", [chip.intrapixel], 0),
         "straight edges": ("camera.detector.edge_px", [chip.edge_px], 0),
     }

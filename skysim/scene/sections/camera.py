@@ -70,9 +70,13 @@ class PsfConfig(ConfigModel):
     corner_sigma_px
         Standard deviation at the farthest corner of the detector, proportional to the field radius and added in
         quadrature (field curvature and coma, to first order)
+    coma_px
+        Seidel's coma at that corner, proportional to the field radius: rays through the pupil's rim end up to twice as
+        far outward from the center of the light
     """
 
     corner_sigma_px: Blur = 0.0
+    coma_px: Annotated[Number, Field(ge=-20, le=20)] = 0.0
 
 
 class GaussianPsfConfig(PsfConfig):
