@@ -300,6 +300,75 @@ def test_the_response_within_pixels_shifts_centers_as_check_counts() -> None:
     assert np.sqrt(counted_px2[0, 0, 0]) == pytest.approx(np.std(moved_px), rel=0.1)
 
 
+def ball_moved_m(q_m: np.ndarray) -> np.ndarray:
+    """Where a cup of 2 deg, an even foundation, carries a ball of the deviations q TURNED, beside it level; lab."""
+    cap = np.column_stack(
+        [np.mgrid[-20:21, -20:21].reshape(2, -1).T * 0.0017, -np.ones(1681)]
+    )
+    u = cap / np.linalg.norm(cap, axis=1, keepdims=True)
+    # The gap, deviation + u . x, has no resultant.
+    rest = [
+        -np.linalg.solve(u.T @ u, u.T @ (one.inv().apply(u) ** 2 @ q_m))
+        for one in (TURNED, Rotation.identity())
+    ]
+    return np.asarray(rest[0] - rest[1])
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("vehicle.sag_arcsec", "[90, 60]"),
+        ("vehicle.runout", "[60 um, -40 um, 20 um]"),
+        ("light.led.die", "[0.3 mm, -0.2 mm, 0.4 mm]"),
+        ("camera.pupil_walk", "[26 mm, 0 mm]"),
+    ],
+)
+def test_rendered_lights_are_where_a_pinhole_sees_them(key: str, value: str) -> None:
+    """Torque of the weight, a ball in a cup, dies along their axes, a ray through the pupil of its angle; to 0.5 %."""
+    images = []
+    for keys in ({}, {key: value}):
+        camera = build_lab(loader.load("afit_simsat", keys)).camera
+        images.append(render_at_rest(camera, TURNED)[1].sources)
+    _, before, after = np.intersect1d(images[0].id, images[1].id, return_indices=True)
+    camera = build_lab(loader.load("afit_simsat")).camera
+    order = np.argsort(camera.sources.id)
+    rows = np.searchsorted(camera.sources.id, images[0].id[before], sorter=order)
+    leds = camera.sources.take(order[rows])
+    focal_px = camera.scene.camera.focal_px
+    place = leds.place[:, :3]
+    lever_m = TURNED.apply(camera.mount.camera_body_m)
+    cam_from_lab = camera.mount.cam_from_body * TURNED.inv()
+    nominal = cam_from_lab.apply(place - lever_m)
+    seen = nominal
+    if key == "vehicle.sag_arcsec":
+        weight = cam_from_lab.apply([0, 0, -1.0])
+        torque = np.cross([0, 0, 1.0], weight)
+        seen = Rotation.from_rotvec(-np.array([90, 60, 0]) * ARCSEC_RAD * torque).apply(
+            nominal
+        )
+    if key == "vehicle.runout":
+        seen = nominal - cam_from_lab.apply(ball_moved_m(np.array([60e-6, -40e-6, 20e-6])))
+    if key == "light.led.die":
+        x = np.cross([0, 0, 1.0], leds.normal)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        die = 3e-4 * x - 2e-4 * np.cross(leds.normal, x) + 4e-4 * leds.normal
+        seen = nominal + cam_from_lab.apply(die)
+    tangent = seen[:, :2] / seen[:, 2:]
+    if key == "camera.pupil_walk":
+        across = np.hypot(*nominal[:, :2].T)
+        met = [
+            brentq(lambda t, r=r, z=z: t * (z - 0.026 * t**2) - r, 0, 1)
+            for r, z in zip(across, nominal[:, 2], strict=True)
+        ]
+        tangent = nominal[:, :2] * (np.array(met) / across)[:, None]
+    expected_px = focal_px * (tangent - nominal[:, :2] / nominal[:, 2:])
+    moved_px = images[1].xy_px[after] - images[0].xy_px[before]
+    assert len(moved_px) > 20
+    np.testing.assert_allclose(
+        moved_px, expected_px, rtol=0, atol=0.005 * np.abs(expected_px).max()
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "value"),

@@ -15,14 +15,17 @@ from astropy.time import Time
 from astropy.utils import iers
 
 from skysim.core.types import Floats
+from skysim.scene.loader import load
 from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
+from skysim.simulation.exposure import render_at_rest
+from skysim.simulation.lab import build_lab
 from skysim.sources import air as starlight
 from skysim.sources import catalog, stars
 from skysim.sources.air import Air, horizon_rad, mean_wavelength_m
 from skysim.sources.bodies import BODIES, bodies_from
 from skysim.sources.ephemeris import observe_from
-from skysim.sources.photometry import Band
+from skysim.sources.photometry import Band, temperature_k
 from skysim.sources.refraction import Atmosphere, Refraction, Weather, refraction_rad
 
 BAND = Band.from_efficiency(0.5)
@@ -284,3 +287,64 @@ def test_a_star_of_the_catalog_is_refracted_by_its_own_color() -> None:
             with_color.air.b_v_of(np.array([hip])), starlight.B_V, with_color.air.dispersion
         )
         assert raised[0] / raised[1] == pytest.approx(own[0], rel=1e-5)
+
+
+def test_rendered_stars_are_raised_by_the_colors_of_their_spectra() -> None:
+    """Edlen's dispersion (1966) over Planck's photons times ERFA's refraction, 45 deg high, to 3 % of the greatest."""
+    keys = {
+        "background": "[]",
+        "motion.rate_deg_s": "[0, 0, 0]",
+        "motion.start": "{ra_deg: 71, dec_deg: 15, roll_deg: 0}",
+        "site": "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}",
+        "start_time": "2012-12-29T22:00:00",
+    }
+    weather = "pressure_hpa: 1000, temperature_c: 10, humidity: 0, scintillation: false"
+    images = []
+    for color in ("false", "true"):
+        one = keys | {"light.air": f"{{{weather}, dispersion: {color}}}"}
+        lab = build_lab(load("shefex2", one))
+        camera = lab.camera
+        images.append(render_at_rest(camera, lab.start)[1])
+    plain, raised = (one.sources for one in images)
+    _, before, after = np.intersect1d(plain.id, raised.id, return_indices=True)
+    moved_px = raised.xy_px[after] - plain.xy_px[before]
+    sky = next(one.air for one in camera.lights if hasattr(one, "air")).at(
+        camera.scene.start_time
+    )
+    lens = camera.scene.camera
+    ray = np.column_stack(
+        [plain.xy_px[before] - lens.center_px, np.full(len(before), lens.focal_px)]
+    )
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    zenith = images[0].cam_from_lab.apply(sky.zenith)
+    along = zenith - (ray @ zenith)[:, None] * ray
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    upward_px = (
+        lens.focal_px
+        * (along[:, :2] * ray[:, 2:] - ray[:, :2] * along[:, 2:])
+        / ray[:, 2:] ** 2
+    )
+    found = (moved_px * upward_px).sum(axis=1) / (upward_px**2).sum(axis=1) / ARCSEC
+
+    nm = np.linspace(300, 1100, 1601)
+    response = np.interp(nm * 1e-9, camera.band.wavelength_m, camera.band.response, 0, 0)
+    b_v = sky.air.b_v_of(plain.id[before])
+    kelvin = temperature_k(b_v, np.nan)[:, None]
+
+    def edlen(nm: Floats) -> Floats:
+        s2 = (1e3 / nm) ** 2
+        return 8342.13 + 2406030 / (130 - s2) + 15997 / (38.9 - s2)
+
+    photons = response * nm**-4.0 / np.expm1(1.438777e7 / (nm * kelvin))
+    mean = (photons * edlen(nm)).sum(axis=1) / photons.sum(axis=1)
+    middle_nm = 1e9 * sky.air.wavelength_m
+    a, b = erfa.refco(1000.0, 10.0, 0.0, middle_nm / 1e3)
+    tangent = np.tan(np.arccos(ray @ zenith))
+    wanted = (a * tangent + b * tangent**3) * (mean / edlen(np.array(middle_nm)) - 1) / ARCSEC
+    # Beyond this B-V an M star's temperature changes within one step of the table.
+    known = b_v < 1.4
+    assert known.sum() > 10
+    assert np.abs(wanted).max() > 0.2
+    np.testing.assert_allclose(
+        found[known], wanted[known], rtol=0, atol=0.03 * np.abs(wanted).max()
+    )
