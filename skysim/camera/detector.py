@@ -256,7 +256,8 @@ def repel(light_e: NDArray, config: DetectorConfig) -> None:
 
     The boundary of pixels with q and p moves by a (q - p) into the brighter one, which so loses a (q - p) (q + p) / 2.
     Over the four boundaries q changes by (a / 2) times the discrete Laplacian of q^2, and no charge is lost (Antilogus
-    et al. 2014, JINST 9, C03048, with the nearest pixels alone).
+    et al. 2014, JINST 9, C03048, with the nearest pixels alone). It acts on the expected charge, so that counts stay
+    Poisson's; on real chips a bright flat varies less.
     """
     if config.brighter_fatter_per_e:
         held_e = np.minimum(light_e, config.full_well_e)

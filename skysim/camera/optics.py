@@ -98,7 +98,7 @@ class Optics:
 
         The entrance pupil of light at the field angle t is z = a tan^2 t + b tan^4 t farther along the boresight (pupil
         aberration; Kingslake & Johnson 2010, Lens Design Fundamentals, 2nd ed., ch. 8). So a light at d u is in the
-        direction u - (z / d) e_z, whose angle t decides z; a few rounds solve for it, each z / d times nearer.
+        direction u - (z / d) e_z, whose angle t decides z. Newton's method solves for its third component.
 
         Parameters
         ----------
@@ -110,7 +110,10 @@ class Optics:
         across2 = direction_cam[..., 0] ** 2 + direction_cam[..., 1] ** 2
         for _ in range(PUPIL_ROUNDS):
             tangent2 = across2 / seen[..., 2] ** 2
-            seen[..., 2] = direction_cam[..., 2] - nearness * tangent2 * (a + b * tangent2)
+            excess = seen[..., 2] - direction_cam[..., 2]
+            excess += nearness * tangent2 * (a + b * tangent2)
+            slope = 1 - 2 * nearness * tangent2 * (a + 2 * b * tangent2) / seen[..., 2]
+            seen[..., 2] -= excess / slope
         return seen
 
     def throughput(self, cos_field: Floats) -> Floats:

@@ -183,11 +183,13 @@ def _pixels(
         direction_cam = optics.from_pupil(direction_cam, sources.place[:, 3] / distance_m)
     xy_px = optics.project(direction_cam)
     if sources.chromatic is not None:
-        # Lateral color moves an image along its radius, in proportion to the distance from the
-        # center.
-        camera = optics.camera
-        xy_px += (xy_px - camera.center_px) * (sources.chromatic[:, 2:3] / camera.corner_px)
+        xy_px = lateral_color(optics.camera, xy_px, sources.chromatic)
     return beside_edges(optics.camera, xy_px)
+
+
+def lateral_color(camera: CameraConfig, xy_px: Floats, chromatic: Floats) -> Floats:
+    """Move images (..., N, 2) along their radii by their mean color (N, 4), as the distance from the center."""
+    return xy_px + (xy_px - camera.center_px) * (chromatic[:, 2:3] / camera.corner_px)
 
 
 def beside_edges(camera: CameraConfig, xy_px: Floats) -> Floats:

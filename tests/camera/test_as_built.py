@@ -282,7 +282,10 @@ def test_images_near_an_edge_are_displaced_outward_by_an_exponential() -> None:
 
 def test_the_response_within_pixels_shifts_centers_as_check_counts() -> None:
     """Against images that are drawn at even steps over a pixel."""
-    sharp = {"camera.psf": "{kind: gaussian, sigma_px: 0.4}"}
+    sharp = {
+        "camera.psf": "{kind: gaussian, sigma_px: 0.4}",
+        "motion.rate_deg_s": "[0, 0, 0]",
+    }
     even = loader.load("shefex2", sharp).camera
     scene = loader.load("shefex2", sharp | {"camera.detector.intrapixel": "0.1"})
     lab = build_lab(scene)

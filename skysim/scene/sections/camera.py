@@ -393,9 +393,11 @@ class DetectorConfig(ConfigModel):
     intrapixel
         Amplitude p of the response 1 + p cos 2 pi u along each axis of a pixel, whose center is at u = 0
     brighter_fatter_per_e
-        Displacement of the boundary of two pixels, in pixels, per electron of the difference of their charges
+        Displacement of the boundary of two pixels, in pixels, per electron of the difference of their charges: the mean
+        over an exposure, half of that at its end
     edge_px, edge_reach_px
-        Outward displacement of images at the chip's edge, which falls by e per edge_reach_px
+        Outward displacement of images at the chip's edge, which falls by e per edge_reach_px; of the centers of discs,
+        not of the sky
     noise
         False gives the expected value, not rounded, with fixed pattern and transfer loss, but without particles,
         full-well limit, nonlinearity and converter range
@@ -451,6 +453,8 @@ class DetectorConfig(ConfigModel):
                 f"{self.temperature_c:g} doubles the dark current {self.doublings:.0f} times",
                 "up to 40",
             )
+        if self.edge_px < -self.edge_reach_px:
+            raise InputError("edge_px", "the image folds at the edge", "from -edge_reach_px")
         if self.brighter_fatter_per_e * self.full_well_e > MOST_SHIFT_PX:
             raise InputError(
                 "brighter_fatter_per_e",

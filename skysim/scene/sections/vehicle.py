@@ -334,7 +334,8 @@ class VehicleConfig(ConfigModel):
         Rotation vector from the axes of the file's camera to those of the scene's, in the axes of the file's camera
         (+x right, +y down, +z boresight): [0, 0, 55] rolls it about its boresight
     sag_arcsec
-        Bending of mast and bracket by 1 g across the boresight, about the camera's x and y axes; aligned when level
+        Bending of a camera's bracket by 1 g across its boresight, about its x and y axes; aligned when level. The pupil
+        stays, unlike that of a mast which bends
     runout
         Deviations of the ball's radius along the body's axes, which displace the bearing's center as it turns
     torque_limit

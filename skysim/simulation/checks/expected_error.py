@@ -54,6 +54,7 @@ from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES
 from estimator.identification.star_search import WRONG_FOCAL
 from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
+from skysim.camera.projection import lateral_color
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
 from skysim.simulation.checks.detection import Context, centroid_variance
@@ -109,15 +110,20 @@ def pixel_response(view: View, context: Context) -> Floats | None:
     """Errors of centroids by the response within pixels, at random places in them.
 
     The response 1 + p cos 2 pi x moves the center of gravity of the pixels of a Gaussian of deviation s, to first order
-    in p, by p exp(-2 pi^2 s^2) (1 / 4 pi - 2 pi s^2) sin 2 pi x. A fit errs by between half of it and all.
+    in p, by p exp(-2 pi^2 s^2) (1 / 4 pi - 2 pi s^2) sin 2 pi x; along a path of length L this is, with sinc L =
+    sin(pi L) / pi L, multiplied by sinc L, and (sinc L - cos pi L) / 2 pi is subtracted within its last bracket. A fit
+    errs by between half of it and all.
     """
     depth = context.scene.camera.detector.intrapixel
     if not depth:
         return None
     # Without the pixel's own variance.
     s2 = np.maximum(view.sigma_px**2 - 1 / 12, 0)
-    moved_px = depth * np.exp(-2 * np.pi**2 * s2) * (1 / (4 * np.pi) - 2 * np.pi * s2)
-    return (moved_px**2 / 2)[:, None, None] * np.eye(2)
+    path = np.sinc(view.streak_px)
+    moved = (1 / (4 * np.pi) - 2 * np.pi * s2)[:, None] * path
+    moved -= (path - np.cos(np.pi * view.streak_px)) / (2 * np.pi)
+    moved_px = depth * np.exp(-2 * np.pi**2 * s2)[:, None] * moved
+    return (moved_px**2 / 2)[:, :, None] * np.eye(2)
 
 
 def survey_setup(view: View, context: Context) -> Floats | None:
@@ -242,7 +248,11 @@ def as_built(view: View, context: Context) -> Floats | None:
     mount = context.lab.camera.mount
     place = context.beliefs.lights.place[view.row]
     surveyed_m = mount.toward(place, view.lab_from_cam * mount.cam_from_body)
-    return (view.xy_px - context.camera.optics.project(surveyed_m))[:, :, None]
+    surveyed_px = context.camera.optics.project(surveyed_m)
+    chromatic = context.beliefs.lights.chromatic
+    if chromatic is not None:
+        surveyed_px = lateral_color(camera, surveyed_px, chromatic[view.row])
+    return (view.xy_px - surveyed_px)[:, :, None]
 
 
 def displacement(view: View, shift_lab: Floats) -> Floats:
