@@ -124,7 +124,7 @@ class IndiCamera(IPyDriver):
     async def expose(self, event: Any) -> None:
         """Trigger an exposure, in place of one that is under way."""
         if self.vectors["CONNECTION"]["CONNECT"] == "Off":
-            return self.refuse("not connected")
+            return self.refuse("not connected: set CONNECTION.CONNECT first")
         try:
             exposure_s = event.getfloatvalue(SECONDS)
         except TypeError:

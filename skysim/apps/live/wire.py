@@ -72,6 +72,8 @@ class WireClient(Sink):
             if server.token and not token_matches(token, server.token):
                 problem = "token missing or wrong; it is in the line that the server printed"
                 raise InputError("", problem)
+            if "take" not in command:
+                raise InputError("take", "missing in the first line", '["imu", "solution"]')
             self.is_known = True
             # From now on it may be silent, but must read: a flight as fast as possible waits for it.
             self.connection.settimeout(None)
@@ -141,9 +143,12 @@ class WireServer:
     def checked_channels(self, value: Any) -> frozenset[str]:
         """Channels that a client takes. Raises InputError for unknown ones, and for the truth where it is off."""
         has_truth = self.live.has_truth
-        allowed = [name for name in CHANNELS if name != "truth" or has_truth]
+        absent = set() if has_truth else {"truth"}
+        if self.live.flight.motion.navigation is None:
+            absent.add("imu")
+        allowed = [name for name in CHANNELS if name not in absent]
         if not isinstance(value, list) or any(name not in allowed for name in value):
-            hint = "" if has_truth else " (truth with --truth)"
+            hint = " (truth with --truth, imu with vehicle.imu)" if absent else ""
             raise InputError("take", repr(value)[:60], ", ".join(allowed) + hint)
         return frozenset(value)
 

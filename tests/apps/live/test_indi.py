@@ -205,7 +205,10 @@ def test_without_a_connection_nothing_is_exposed(session: Session) -> None:
     session.client.set("CONNECTION", DISCONNECT="On", CONNECT="Off")
     session.wait("CONNECTION", "Idle")
     session.client.set(EXPOSURE, **{SECONDS: 0.1})
-    assert session.wait(EXPOSURE, "Alert").message == "not connected"
+    assert (
+        session.wait(EXPOSURE, "Alert").message
+        == "not connected: set CONNECTION.CONNECT first"
+    )
     session.client.set("CONNECTION", CONNECT="On", DISCONNECT="Off")
     session.wait("CONNECTION", "Ok")
 

@@ -220,7 +220,7 @@ def test_the_truth_is_off_by_default(live: Live) -> None:
     client = Client(server_of(live), token="secret", take=["truth"])
     packet = client.receive()
     assert packet is not None
-    assert "(truth with --truth)" in packet["problem"]
+    assert "(truth with --truth, " in packet["problem"]
 
 
 def test_lines_and_commands_without_end_are_refused(live: Live) -> None:
@@ -381,3 +381,26 @@ def test_a_frame_waits_for_half_a_control_period_at_most(
     states_s = [one.header["t_s"] for one in kept.packets if one.channel == "state"]
     assert states_s[-1] == pytest.approx(0.21)
     assert names.index("frame") == len(states_s) - is_first
+
+
+def test_a_first_line_without_channels_is_answered(live: Live) -> None:
+    client = Client(server_of(live), token="secret", torque_nm=[0, 0, 0])
+    packet = client.receive()
+    assert packet is not None
+    assert (
+        packet["problem"] == 'take: missing in the first line; allowed: ["imu", "solution"]'
+    )
+    assert client.receive() is None
+
+
+def test_a_scene_without_gyros_has_no_samples_to_take() -> None:
+    live = live_flight("afit_simsat")
+    server = WireServer(live, "127.0.0.1", 0, "")
+    try:
+        client = Client(server, take=["imu"])
+        packet = client.receive()
+        assert packet is not None
+        assert packet["problem"].startswith("take: ['imu']; allowed: frame, solution, state")
+        assert "imu with vehicle.imu" in packet["problem"]
+    finally:
+        server.close()
