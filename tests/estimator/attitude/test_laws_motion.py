@@ -256,6 +256,41 @@ def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
     )
 
 
+def test_a_light_is_weighted_by_its_residual_s_own_change() -> None:
+    """An error of a centroid also moves the row at whose time it is predicted: by finite differences, at 40 deg/s."""
+    camera = replace(CAMERA, distortion=(0.0,) * 5)
+    for seed in range(4):
+        rng = np.random.default_rng([25, seed])
+        seen = replace(moving(rng, any_rate(rng, 40.0), 6), camera=camera)
+        found = seen.centroids()
+
+        def residual_px(
+            xy_px: Floats, seen: Moving = seen, found: Centroids = found
+        ) -> tuple[Floats, Floats]:
+            turn = Rotation.from_rotvec(
+                -camera.row_delays_s(xy_px)[:, None] * seen.rate_rad_s
+            )
+            place = turn.apply(seen.cam_from_ref.apply(seen.place_ref))
+            lights = replace(found, xy_px=xy_px)
+            rows = rolling._rows(
+                camera, lights, place, np.zeros(3), turn, seen.rate_rad_s, None
+            )
+            return camera.focal_px * rows[0].residual, rows[0].information
+
+        still, information = residual_px(found.xy_px)
+        by_error = np.stack(
+            [
+                (residual_px(found.xy_px + step)[0] - still) / 1e-3
+                for step in 1e-3 * np.eye(2)
+            ],
+            axis=2,
+        )
+        expected = by_error @ by_error.mT * (found.sigma_px[0] / camera.focal_px) ** 2
+        assert np.abs(by_error - np.eye(2)).max() > 0.02
+        size = float(np.abs(expected).max())
+        assert_allclose(np.linalg.inv(information), expected, rtol=0, atol=2e-3 * size)
+
+
 @pytest.mark.parametrize("seed", range(230, 240))
 def test_a_light_at_the_outlier_limit_does_not_prevent_convergence(seed: int) -> None:
     """Errors with long tails: in 234 a light is an outlier with every second step, for ever."""
