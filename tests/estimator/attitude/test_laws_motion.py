@@ -394,6 +394,33 @@ def test_disks_of_a_rolling_shutter_determine_the_rate(rng: np.random.Generator)
     assert rate.from_moments(CAMERA, points, EXPOSURE_S, DOME) == []
 
 
+def test_the_covariance_of_a_rate_from_disks_is_that_of_one_error_of_all_moments() -> None:
+    """Moments that are wrong by 1 % of xx + yy in all lights move the rate by one standard deviation, to a tenth.
+
+    Twice as many lights have the same error, so they do not reduce it.
+    """
+    rng = np.random.default_rng(26)
+    seen = moving(rng, np.array([3.0, 4.0, 0.2]), 40, sight=DOME)
+    moments = moments_of(seen, 30.0)
+    disks = replace(
+        seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments
+    )
+
+    def nearest(found: Centroids) -> RateEstimate:
+        both = rate.from_moments(CAMERA, found, EXPOSURE_S, DOME)
+        return min(
+            both, key=lambda one: float(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s))
+        )
+
+    right = nearest(disks)
+    wrong = moments + 0.01 * moments[:, 2:] * [1.0, 0.0, 0.0]
+    change = nearest(replace(disks, moments_px2=wrong)).rate_rad_s - right.rate_rad_s
+    size = change @ np.linalg.solve(right.covariance_rad2_s2, change)
+    assert np.sqrt(size) == pytest.approx(1, abs=0.1)
+    doubled = nearest(disks.take(np.tile(np.arange(40), 2)))
+    assert_allclose(doubled.covariance_rad2_s2, right.covariance_rad2_s2, rtol=1e-6, atol=0)
+
+
 @law(classify.moments)
 @given(rng=SEEDS)
 def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generator) -> None:
