@@ -118,6 +118,21 @@ def test_image_grows_with_the_focal_length() -> None:
     np.testing.assert_allclose(after.project(rays), expected, rtol=0, atol=1e-9)
 
 
+def test_a_tilted_camera_turns_about_its_own_axes() -> None:
+    """A camera turned by 90 degrees about body x, and by the coefficient about camera z: its body y, downward."""
+    mounted = Mount(np.zeros(3), Rotation.from_euler("x", 90.0, degrees=True))
+    optics = Optics.from_camera(loader.load("afit_simsat").camera)
+    settings = config(LINEAR, mount_arcsec_k=[0.0, 0.0, 50.0])
+    mount, _ = camera_at(settings, mounted, optics, 2 * 3600.0)
+    boresight_body, right_body = (
+        mount.cam_from_body.inv().apply(axis) for axis in ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    )
+    # The boresight stays; a camera that turns clockwise by 200" sees a fixed light turn the other way.
+    np.testing.assert_allclose(boresight_body, [0.0, 1.0, 0.0], rtol=0, atol=1e-15)
+    expected = [1.0, 0.0, 200 * ARCSEC_RAD]
+    np.testing.assert_allclose(right_body, expected, rtol=0, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_boresight_drifts_by_its_coefficient_in_the_truth() -> None:
     """Every frame's camera is rotated by the coefficient times dT about its axes, and so are its stars."""

@@ -13,6 +13,7 @@ from astropy import units as u
 from astropy.coordinates import AltAz, EarthLocation, SkyCoord
 from astropy.time import Time
 from astropy.utils import iers
+from scipy.integrate import solve_ivp
 
 from skysim.core.types import Floats
 from skysim.scene.loader import load
@@ -26,7 +27,14 @@ from skysim.sources.air import Air, horizon_rad, mean_wavelength_m
 from skysim.sources.bodies import BODIES, bodies_from
 from skysim.sources.ephemeris import observe_from
 from skysim.sources.photometry import Band, temperature_k
-from skysim.sources.refraction import Atmosphere, Refraction, Weather, refraction_rad
+from skysim.sources.refraction import (
+    Atmosphere,
+    Refraction,
+    Weather,
+    refraction_rad,
+    standard_pressure_hpa,
+    standard_temperature_c,
+)
 
 BAND = Band.from_efficiency(0.5)
 ARCSEC = 1 / 206264.806
@@ -132,6 +140,119 @@ def test_refraction_on_the_horizon_is_half_a_degree() -> None:
     )
     none = Refraction(weather._replace(pressure_hpa=0.0))
     assert not none.bending_rad(zenith_rad).any()
+
+
+@pytest.mark.parametrize("height_m", [0.0, 4000.0])
+@pytest.mark.parametrize("latitude_deg", [0.0, 45.0, -90.0])
+def test_the_air_weighs_by_gravity_at_its_center_of_mass(
+    latitude_deg: float, height_m: float
+) -> None:
+    """Normal gravity of GRS 80 (Somigliana), less 3.086e-6 /s2 a meter up to 7.3 km + 0.9 h (Saastamoinen 1972)."""
+    air = Atmosphere.from_weather(
+        Weather(height_m, np.radians(latitude_deg), 1000.0, 10.0, 0.0, 574e-9)
+    )
+    sine2 = np.sin(np.radians(latitude_deg)) ** 2
+    at_sea = (
+        9.7803267715 * (1 + 0.001931851353 * sine2) / np.sqrt(1 - 0.0066943800229 * sine2)
+    )
+    at_center = at_sea - 3.086e-6 * (7300 + 0.9 * height_m)
+    assert air.scale_per_k * 8314.32 / 28.9644 == pytest.approx(at_center, rel=1e-4)
+
+
+@pytest.mark.parametrize("temperature_c", [-30.0, 0.0, 20.0, 40.0])
+def test_saturated_air_holds_the_water_of_erfa_and_of_magnus(temperature_c: float) -> None:
+    """ERFA's A is (dry - 11.2684e-6 p_w) / T times 1 - 4.4474e-6 T; Magnus's law by Alduchov & Eskridge (1996)."""
+    pressure_hpa = 1000.0
+    t_k = temperature_c + 273.15
+    wet, dry = (
+        Atmosphere.from_weather(
+            Weather(0.0, 0.8, pressure_hpa, temperature_c, humidity, 574e-9)
+        )
+        for humidity in (1.0, 0.0)
+    )
+    # What the vapor's lightness adds to the dry term is in the wet term too.
+    vapor_hpa = (wet.wet - (wet.dry - dry.dry)) * t_k / 1.12684e-5
+    theirs = [erfa.refco(pressure_hpa, temperature_c, one, 0.574)[0] for one in (0.0, 1.0)]
+    of_erfa = (theirs[0] - theirs[1]) * t_k / (1 - 4.4474e-6 * t_k) / 11.2684e-6
+    assert vapor_hpa == pytest.approx(of_erfa, rel=1e-4)
+    magnus = 6.1094 * np.exp(17.625 * temperature_c / (temperature_c + 243.04))
+    assert vapor_hpa == pytest.approx(magnus, rel=0.012)
+
+
+def test_the_air_thins_like_the_standard_atmosphere() -> None:
+    """Densities of the US Standard Atmosphere 1976 over those at the sea, in both layers; ISO 2533 at the site."""
+    air = Atmosphere.from_weather(Weather(0.0, np.radians(45), 1013.25, 15.0, 0.0, 574e-9))
+    at_site = air.troposphere(np.array(air.r0_m))[0] - 1
+    for height_m, density in ((5000.0, 0.6012), (10000.0, 0.3376)):
+        found = air.troposphere(np.array(air.r0_m + height_m))[0] - 1
+        assert found / at_site == pytest.approx(density, rel=0.01)
+    for height_m, density in ((11000.0, 0.2971), (20000.0, 0.07187)):
+        found = air.stratosphere(np.array(air.r0_m + height_m))[0] - 1
+        assert found / at_site == pytest.approx(density, rel=0.01)
+    for height_m, pressure_hpa, temperature_c in (
+        (1000.0, 898.75, 8.5),
+        (5000.0, 540.20, -17.5),
+        (8000.0, 356.00, -37.0),
+    ):
+        assert standard_pressure_hpa(height_m) == pytest.approx(pressure_hpa, abs=0.03)
+        assert standard_temperature_c(height_m) == pytest.approx(temperature_c)
+
+
+def test_moist_air_is_in_hydrostatic_balance() -> None:
+    """dp/dh = -(g / R T) (M_d (p - p_w) + M_w p_w), p_w as T^18.36, integrated; slopes are those of n."""
+    weather = Weather(0.0, np.radians(30), 1000.0, 30.0, 1.0, 574e-9)
+    air = Atmosphere.from_weather(weather)
+    dry = Atmosphere.from_weather(weather._replace(humidity=0.0))
+    vapor_hpa = (air.wet - (air.dry - dry.dry)) * air.t0_k / 1.12684e-5
+    per_hpa = dry.dry * air.t0_k / 1000.0
+
+    def fall(height_m: float, pressure_hpa: Floats) -> Floats:
+        t_k = air.t0_k - 0.0065 * height_m
+        lighter = (1 - 18.0152 / 28.9644) * vapor_hpa * (t_k / air.t0_k) ** 18.36
+        return -air.scale_per_k / t_k * (pressure_hpa - lighter)
+
+    height_m = np.array([2000.0, 6000.0, 10000.0])
+    solved = solve_ivp(fall, (0.0, 1e4), [1000.0], t_eval=height_m, rtol=1e-11, atol=1e-9)
+    t_k = air.t0_k - 0.0065 * height_m
+    vapor = vapor_hpa * (t_k / air.t0_k) ** 18.36
+    excess = (per_hpa * solved.y[0] - 1.12684e-5 * vapor) / t_k
+    r_m = air.r0_m + height_m
+    np.testing.assert_allclose(air.troposphere(r_m)[0] - 1, excess, rtol=1e-7)
+    for layer, at_m in ((air.troposphere, r_m), (air.stratosphere, r_m + 12e3)):
+        above, below = (layer(at_m + step)[0] for step in (1.0, -1.0))
+        np.testing.assert_allclose(layer(at_m)[1], at_m * (above - below) / 2, rtol=1e-4)
+
+
+def test_the_colors_of_stars_do_not_depend_on_the_catalog_s_order() -> None:
+    """Rigel -0.03, Betelgeuse 1.50, Sirius 0.01, Aldebaran 1.54 (Hipparcos, field H37), from a catalog backwards."""
+    stars_of = catalog.read_for("x", "hipparcos_hp6.5").to_limit(3.0)
+    backwards = stars_of.take(np.arange(len(stars_of))[::-1])
+    air = Air.from_config(AirConfig(), site_of(SITES[0]), backwards, BAND)
+    hip = np.array([24436, 27989, 32349, 21421])
+    np.testing.assert_allclose(air.b_v_of(hip), [-0.03, 1.50, 0.01, 1.54], atol=0.011)
+
+
+def test_bodies_are_extinct_by_their_own_colors() -> None:
+    """Mars, Uranus and Neptune by B-V of 1.36, 0.50 and 0.39 (Mallama, Krobusek & Pavlov 2017, table 3)."""
+    time = datetime.datetime(2012, 6, 24, 20, 0)
+    published = {"mars": 1.36, "uranus": 0.50, "neptune": 0.39}
+    air = air_at(SITES[0], extinction_mag=0.3, color_extinction_mag=-0.05)
+    sky = air.at(time)
+    for body in bodies_from(_bodies(), observe_from(time, air.site), BAND):
+        if body.name in published:
+            seen = sky.body_seen(body)
+            lost_mag = -2.5 * np.log10(seen.flux_e_s_m2 / body.flux_e_s_m2)
+            air_mass = float(sky.air_mass(seen.place.direction[None])[0])
+            expected = 0.3 - 0.05 * published[body.name]
+            assert lost_mag / air_mass == pytest.approx(expected, abs=1e-3)
+
+
+def test_seeing_grows_with_the_depth_of_the_turbulence() -> None:
+    """Fried's r0 = (0.423 k^2 sec z int Cn^2 dh)^(-3/5), the seeing as 1 / r0: at 60 degrees 2^(3/5) = 1.516."""
+    sky = air_at(SITES[0], seeing_arcsec=2.0).at(datetime.datetime(2012, 6, 24, 23))
+    tilted = (np.sqrt(3) * sky.axes[0] + sky.axes[2]) / 2
+    at_zenith_px, at_60_px = (sky.seeing_px(axis, 5000.0) for axis in (sky.zenith, tilted))
+    assert at_60_px / at_zenith_px == pytest.approx(1.516, rel=5e-3)
 
 
 def test_bodies_are_refracted_like_stars() -> None:

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import eval_legendre
+from sgp4.api import WGS72, Satrec
 
-from skysim.core.constants import EARTH_MU_M3_S2, EARTH_RADIUS_M
+from skysim.core.constants import EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.scene.sections.surroundings import (
@@ -106,6 +108,45 @@ def test_a_sun_synchronous_orbit_precesses_once_a_year() -> None:
     assert np.degrees(node_rate) * 86400 == pytest.approx(0.9856, rel=5e-3)
 
 
+@pytest.mark.parametrize("inclination_deg", [20.0, 51.6, 90.0, 140.0])
+def test_a_circular_orbit_drifts_at_sgp4_s_secular_rates(inclination_deg: float) -> None:
+    """Perigee and mean anomaly together, and the node, per mean motion; SGP4 has terms of J2 squared, 2e-6, too."""
+    rates = circular(altitude="700 km", inclination_deg=inclination_deg).rates_rad_s
+    radius = (EARTH_RADIUS_M + 700e3) / EARTH_RADIUS_M
+    mean_motion = np.sqrt(EARTH_MU_M3_S2 / (EARTH_RADIUS_M + 700e3) ** 3)
+    # SGP4's unit of time: 0.0743669161 radians a minute at the radius of the Earth of WGS 72.
+    of_sgp4 = 0.0743669161 * radius**-1.5
+    record = Satrec()
+    # Its mean motion is Kozai's: changed until the semi-major axis is the radius.
+    kozai = of_sgp4
+    for _ in range(5):
+        angles = 0.0, np.radians(inclination_deg), 0.0
+        record.sgp4init(WGS72, "i", 5, 27000.0, 0.0, 0.0, 0.0, 1e-6, *angles, kozai, 0.0)
+        kozai *= (record.a / radius) ** 1.5
+    expected = [record.mdot + record.argpdot, record.nodedot]
+    np.testing.assert_allclose(
+        np.array(rates) / mean_motion, np.array(expected) / of_sgp4, rtol=0, atol=2e-5
+    )
+
+
+def test_gravity_is_the_gradient_of_its_potential() -> None:
+    """mu / r (1 - J2 (R / r)^2 P2(z / r)), by central differences over 10 m."""
+
+    def potential(place_m: Floats) -> Floats:
+        r = np.linalg.norm(place_m, axis=-1)
+        flattened = EARTH_J2 * (EARTH_RADIUS_M / r) ** 2
+        return EARTH_MU_M3_S2 / r * (1 - flattened * eval_legendre(2, place_m[..., 2] / r))
+
+    rng = np.random.default_rng(6)
+    place_m = rng.normal(0, 1, (40, 3))
+    place_m *= rng.uniform(6.7e6, 4e7, (40, 1)) / np.linalg.norm(place_m, axis=1)[:, None]
+    step_m = 10 * np.eye(3)
+    rise = potential(place_m[:, None] + step_m) - potential(place_m[:, None] - step_m)
+    found = orbit_elements.gravity_m_s2(place_m)
+    size = np.linalg.norm(found, axis=1, keepdims=True)
+    np.testing.assert_allclose(found / size, rise / 20 / size, rtol=0, atol=2e-7)
+
+
 def test_an_oem_is_interpolated_between_its_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,6 +203,22 @@ def test_an_oem_in_eme2000_differs_by_the_frame_bias(tmp_path: Path) -> None:
             orbit_elements.read_oem(str(path), START).states(np.array([30.0]))[0][0]
         )
     assert 0.1 < np.linalg.norm(places[0] - places[1]) < 0.9
+
+
+def test_eme2000_has_the_published_pole_and_equinox(tmp_path: Path) -> None:
+    """IERS Conventions 2010, 5.4.4: the pole of J2000.0 at (-16.617, -6.819) mas in the ICRS, the equinox at -14.6."""
+    mas = np.radians(1 / 3.6e6)
+    for axis, expected in (
+        ([0.0, 0.0, 1.0], [-16.617 * mas, -6.819 * mas, 1.0]),
+        ([1.0, 0.0, 0.0], [1.0, -14.6 * mas, 16.617 * mas]),
+    ):
+        path = tmp_path / "orbit.oem"
+        t_s = np.array([0.0, 60.0])
+        text = oem_text(t_s, np.tile(7e6 * np.array(axis), (2, 1)), np.zeros((2, 3)))
+        path.write_text(text.replace("GCRF", "EME2000"), encoding="utf-8")
+        states = orbit_elements.read_oem(str(path), START).states(np.array([0.0]))
+        found = states.position_m[0] / 7e6
+        np.testing.assert_allclose(found, expected, rtol=0, atol=0.1 * mas)
 
 
 def test_a_tle_of_several_satellites_requires_a_number(tmp_path: Path) -> None:

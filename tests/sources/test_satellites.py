@@ -8,6 +8,7 @@ import io
 import json
 from pathlib import Path
 
+import erfa
 import numpy as np
 import pytest
 
@@ -248,6 +249,30 @@ def test_a_path_matches_positions_at_its_times(
             )
             off = np.linalg.norm(np.cross(then / np.linalg.norm(then), exact))
             assert np.degrees(off) * 3600 < 0.1
+
+
+def test_a_camera_in_orbit_sees_satellites_displaced_ahead(
+    low_orbits: list[orbit_elements.MeanElements],
+) -> None:
+    """By ERFA's aberration of the direction in which the light left: up to 5" at 7.5 km/s, to 1 mas."""
+    velocity_m_s = np.array([3000.0, -5000.0, 4700.0])
+
+    def observer_at(after_s: float) -> GcrsState:
+        return GcrsState(np.array([6.9e6, 1e6, -5e5]) + after_s * velocity_m_s, velocity_m_s)
+
+    beta = velocity_m_s / 299792458.0
+    for one in low_orbits[:10]:
+        seen, _ = satellites.path(one, DATE, 0.0, observer_at)
+        # Light time by another scheme: steps in the satellite's own time until it changes no more.
+        left_s = 0.0
+        for _ in range(20):
+            states = orbit_elements.gcrs_states([one], DATE, np.array([left_s]))
+            to_m = states[0][0, 0] - observer_at(0.0).position_m
+            left_s = -float(np.linalg.norm(to_m)) / 299792458.0
+        straight = to_m / np.linalg.norm(to_m)
+        expected = erfa.ab(straight, beta, 1.0, np.sqrt(1 - beta @ beta))
+        assert np.degrees(erfa.sepp(seen, expected)) * 3600 < 1e-3
+        assert np.degrees(erfa.sepp(seen, straight)) * 3600 > 0.1
 
 
 def test_satellites_of_the_field_are_those_that_cross_it(

@@ -11,6 +11,7 @@ from astropy import units as u
 from astropy.coordinates import EarthLocation
 from astropy.time import Time
 from astropy.utils import iers
+from scipy.optimize import brentq
 
 from skysim.core.time import J2000_JD, TT_MINUS_TAI_S, tai_minus_utc_s, tt_jd
 from skysim.scene.sections.light import BodiesConfig
@@ -132,6 +133,34 @@ def test_the_moon_is_displaced_by_its_parallax() -> None:
     assert np.degrees(furthest) > 0.9
 
 
+@pytest.mark.parametrize("name", ["moon", "mercury", "mars", "jupiter", "neptune"])
+def test_light_leaves_a_body_its_travel_time_earlier(name: str) -> None:
+    """By Brent's method: the time at which the body was as far as light has gone since; places agree to 0.1 km."""
+    shipped = ephemeris.load_ephemeris()
+    for jd in (2456100.5, 2458849.5, 2460600.5):
+        observer = ephemeris.ObserverPlace(
+            jd,
+            shipped.position_km("earth", jd),
+            np.zeros(3),
+            ephemeris.GcrsState(*np.zeros((2, 3))),
+        )
+
+        def to_body_km(
+            delay_s: float, seen: ephemeris.ObserverPlace = observer
+        ) -> np.ndarray:
+            left_jd = seen.tt_jd - delay_s / 86400
+            return shipped.barycentric_km(name, left_jd) - seen.position_km
+
+        delay_s = brentq(
+            lambda s, to=to_body_km: np.linalg.norm(to(s)) - 299792.458 * s,
+            0.0,
+            20000.0,
+            xtol=1e-9,
+        )
+        found_km = ephemeris.place(name, observer).to_body_km
+        assert np.linalg.norm(found_km - to_body_km(delay_s)) < 0.1
+
+
 # The authors' own test values, Mallama & Hilton 2018, file Ap_Mag_Output_V3: au from Sun and observer, degrees, V.
 PUBLISHED = [
     ("mercury", 0.310295423552, 1.32182643625754, 1.1677, -2.477),
@@ -195,6 +224,23 @@ def test_magnitudes_of_uranus_and_neptune_match_the_authors_examples() -> None:
         assert body_discs.magnitude("neptune", at, J2000_JD + years * year) == pytest.approx(
             v_mag, abs=1e-3
         )
+
+
+@pytest.mark.parametrize("latitude_deg", [10.0, 45.0, -70.0])
+def test_the_latitude_of_uranus_is_that_of_the_normal_to_its_ellipsoid(
+    latitude_deg: float,
+) -> None:
+    """ERFA's geodetic latitude of the point below the observer; 8.4e-4 mag a degree (Mallama & Hilton 2018)."""
+    at = lit("uranus", 1.0, 1.0, 0.0, latitude_deg)
+    level = lit("uranus", 1.0, 1.0, 0.0)
+    brighter = body_discs.uranus(0.0, level, J2000_JD) - body_discs.uranus(0.0, at, J2000_JD)
+    # Scaled from the center to the surface of the ellipsoid with the equatorial radius 1.
+    flattening = body_discs.URANUS_FLATTENING
+    b = np.radians(latitude_deg)
+    surface = np.array([np.cos(b), 0.0, np.sin(b)])
+    surface /= np.hypot(np.cos(b), np.sin(b) / (1 - flattening))
+    _, normal_rad, _ = erfa.gc2gde(1.0, flattening, surface)
+    assert brighter / 8.4e-4 == pytest.approx(abs(np.degrees(normal_rad)), abs=1e-6)
 
 
 def test_open_rings_make_saturn_brighter() -> None:

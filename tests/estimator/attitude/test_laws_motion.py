@@ -256,6 +256,41 @@ def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
     )
 
 
+def test_a_light_is_weighted_by_its_residual_s_own_change() -> None:
+    """An error of a centroid also moves the row at whose time it is predicted: by finite differences, at 40 deg/s."""
+    camera = replace(CAMERA, distortion=(0.0,) * 5)
+    for seed in range(4):
+        rng = np.random.default_rng([25, seed])
+        seen = replace(moving(rng, any_rate(rng, 40.0), 6), camera=camera)
+        found = seen.centroids()
+
+        def residual_px(
+            xy_px: Floats, seen: Moving = seen, found: Centroids = found
+        ) -> tuple[Floats, Floats]:
+            turn = Rotation.from_rotvec(
+                -camera.row_delays_s(xy_px)[:, None] * seen.rate_rad_s
+            )
+            place = turn.apply(seen.cam_from_ref.apply(seen.place_ref))
+            lights = replace(found, xy_px=xy_px)
+            rows = rolling._rows(
+                camera, lights, place, np.zeros(3), turn, seen.rate_rad_s, None
+            )
+            return camera.focal_px * rows[0].residual, rows[0].information
+
+        still, information = residual_px(found.xy_px)
+        by_error = np.stack(
+            [
+                (residual_px(found.xy_px + step)[0] - still) / 1e-3
+                for step in 1e-3 * np.eye(2)
+            ],
+            axis=2,
+        )
+        expected = by_error @ by_error.mT * (found.sigma_px[0] / camera.focal_px) ** 2
+        assert np.abs(by_error - np.eye(2)).max() > 0.02
+        size = float(np.abs(expected).max())
+        assert_allclose(np.linalg.inv(information), expected, rtol=0, atol=2e-3 * size)
+
+
 @pytest.mark.parametrize("seed", range(230, 240))
 def test_a_light_at_the_outlier_limit_does_not_prevent_convergence(seed: int) -> None:
     """Errors with long tails: in 234 a light is an outlier with every second step, for ever."""
@@ -357,6 +392,33 @@ def test_disks_of_a_rolling_shutter_determine_the_rate(rng: np.random.Generator)
     assert rate.from_moments(GLOBAL, disks, EXPOSURE_S, DOME) == []
     points = replace(disks, moments_px2=moments_of(seen, 0.1) * 0.01)
     assert rate.from_moments(CAMERA, points, EXPOSURE_S, DOME) == []
+
+
+def test_the_covariance_of_a_rate_from_disks_is_that_of_one_error_of_all_moments() -> None:
+    """Moments that are wrong by 1 % of xx + yy in all lights move the rate by one standard deviation, to a tenth.
+
+    Twice as many lights have the same error, so they do not reduce it.
+    """
+    rng = np.random.default_rng(26)
+    seen = moving(rng, np.array([3.0, 4.0, 0.2]), 40, sight=DOME)
+    moments = moments_of(seen, 30.0)
+    disks = replace(
+        seen.centroids(), xy_px=seen.still_px, streak_px=None, moments_px2=moments
+    )
+
+    def nearest(found: Centroids) -> RateEstimate:
+        both = rate.from_moments(CAMERA, found, EXPOSURE_S, DOME)
+        return min(
+            both, key=lambda one: float(np.linalg.norm(one.rate_rad_s - seen.rate_rad_s))
+        )
+
+    right = nearest(disks)
+    wrong = moments + 0.01 * moments[:, 2:] * [1.0, 0.0, 0.0]
+    change = nearest(replace(disks, moments_px2=wrong)).rate_rad_s - right.rate_rad_s
+    size = change @ np.linalg.solve(right.covariance_rad2_s2, change)
+    assert np.sqrt(size) == pytest.approx(1, abs=0.1)
+    doubled = nearest(disks.take(np.tile(np.arange(40), 2)))
+    assert_allclose(doubled.covariance_rad2_s2, right.covariance_rad2_s2, rtol=1e-6, atol=0)
 
 
 @law(classify.moments)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as some
+from scipy import linalg
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import mass_dynamics, mass_properties
@@ -20,6 +22,7 @@ from estimator.calibration.mass_dynamics import (
     inertia_matrix,
     inertia_six,
 )
+from estimator.filter.error_models import TrackerModel
 from tests.helpers.bearing_motion import SMALL, prior, record
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn
 
@@ -91,6 +94,97 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(
     np.testing.assert_allclose(
         np.sum(spin * states.quaternion, axis=0), 0, rtol=0, atol=1e-12
     )
+
+
+def test_a_free_body_turns_against_the_stars_and_not_with_the_earth() -> None:
+    """A sphere without torque: its momentum and its rate stay fixed among the stars, while the lab turns by exp([W] t).
+
+    On an Earth that turns once in 200 s, in closed form.
+    """
+    earth = np.array([0.01, -0.02, 0.022])
+    sphere = SMALL.truth.copy()
+    sphere[:6] = [0.1, 0.1, 0.1, 0.0, 0.0, 0.0]
+    sphere[6:] = 0.0
+    still = replace(RECORD, wheel_momentum_nms=0 * RECORD.wheel_momentum_nms)
+    lab = replace(SMALL.lab, earth_lab_rad_s=earth)
+    motion = EquationsOfMotion(still, lab, sphere[:, None], sphere)
+    states = drawn_states(np.random.default_rng(4), 1)._replace(torque=np.zeros((3, 1)))
+    duration_s = 20.0
+    after = motion.integrate(np.zeros(1), np.full(1, duration_s), states, 2.0)
+    lab_from_first = Rotation.from_rotvec(-earth * duration_s)
+    np.testing.assert_allclose(
+        after.momentum[:, 0], lab_from_first.apply(states.momentum[:, 0]), rtol=0, atol=1e-10
+    )
+    among_stars = Rotation.from_rotvec(states.momentum[:, 0] / 0.1 * duration_s)
+    expected = lab_from_first * among_stars * states.rotation[0]
+    assert (after.rotation[0] * expected.inv()).magnitude() < 1e-7
+
+
+AT_REST = States(np.array([[0.0], [0.0], [0.0], [1.0]]), np.zeros((3, 1)), np.zeros((3, 1)))
+
+
+def noise_after(duration_s: float) -> np.ndarray:
+    """(9, 9) covariance of the states after a time, from no attitude error, momentum and torque."""
+    values = SMALL.truth
+    return mass_dynamics.torque_noise(
+        np.array([duration_s]), RECORD, AT_REST, values, values, SMALL.lab
+    )[0]
+
+
+@pytest.mark.parametrize("duration_s", [0.5, 3.0])
+def test_the_random_torque_adds_the_variances_of_an_ornstein_uhlenbeck_process(
+    duration_s: float,
+) -> None:
+    """With r the rms and x = T / tau, torque and its integral: r^2 (1 - e^-2x), r^2 tau^2 (2 x - 3 + 4 e^-x - e^-2x).
+
+    Source: Gillespie 1996, Phys. Rev. E 54, 2084.
+    """
+    noise = noise_after(duration_s)
+    x = duration_s / SMALL.correlation_s
+    torque = SMALL.torque_rms_nm**2 * (1 - np.exp(-2 * x))
+    momentum = 2 * x - 3 + 4 * np.exp(-x) - np.exp(-2 * x)
+    momentum *= (SMALL.torque_rms_nm * SMALL.correlation_s) ** 2
+    np.testing.assert_allclose(noise[6:, 6:], torque * np.eye(3), rtol=1e-6, atol=1e-20)
+    np.testing.assert_allclose(noise[3:6, 3:6], momentum * np.eye(3), rtol=1e-6, atol=1e-20)
+
+
+@pytest.mark.parametrize("duration_s", [0.5, 3.0, 20.0])
+def test_the_random_torque_s_noise_is_van_loan_s(duration_s: float) -> None:
+    """Of angle, momentum and torque, a linear system at rest: J a' = h, h' = d, d' = -d / tau + noise.
+
+    By the exponential of one matrix of twice the size (Van Loan 1978, IEEE Trans. Automatic Control 23, 395).
+    """
+    tau = SMALL.correlation_s
+    system = np.zeros((STATE, STATE))
+    system[:3, 3:6] = np.linalg.inv(SMALL.inertia_kg_m2)
+    system[3:6, 6:] = np.eye(3)
+    system[6:, 6:] = -np.eye(3) / tau
+    white = np.zeros((STATE, STATE))
+    white[6:, 6:] = 2 * SMALL.torque_rms_nm**2 / tau * np.eye(3)
+    whole = np.block([[-system, white], [np.zeros((STATE, STATE)), system.T]])
+    exponential = linalg.expm(whole * duration_s)
+    expected = exponential[STATE:, STATE:].T @ exponential[:STATE, STATE:]
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(
+        noise_after(duration_s) / size, expected / size, rtol=0, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("sample_s", [0.1, 0.02])
+def test_the_noise_of_wheel_speeds_is_a_random_walk_of_the_attitude(sample_s: float) -> None:
+    """A sample's error of s stays for its time dt, so that n samples turn a body by J^-1 s dt sqrt(n)."""
+    sigma_nms = 3e-4
+    wheel_t_s = np.arange(0.0, 30.0, sample_s)
+    sampled = replace(
+        RECORD, wheel_t_s=wheel_t_s, wheel_momentum_nms=np.zeros((len(wheel_t_s), 3))
+    )
+    lab = replace(SMALL.lab, wheel_sigma_nms=sigma_nms, torque_rms_nm=np.full(3, 1e-15))
+    noise = mass_dynamics.torque_noise(
+        np.array([2.0]), sampled, AT_REST, SMALL.truth, SMALL.truth, lab
+    )[0]
+    inverse = np.linalg.inv(SMALL.inertia_kg_m2)
+    one = inverse * sigma_nms * sample_s
+    np.testing.assert_allclose(noise[:3, :3], 2.0 / sample_s * one @ one.T, rtol=1e-6)
 
 
 @law(mass_dynamics.difference_steps, mass_dynamics.transition, mass_dynamics.torque_noise)
@@ -204,6 +298,41 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
     np.testing.assert_allclose(
         added, np.outer(change, change), rtol=0.05, atol=0.12 * change @ change
     )
+
+
+@pytest.mark.parametrize("other", [7, 10, 26])
+def test_errors_are_shared_by_the_rotation_between_two_attitudes(other: int) -> None:
+    """By exp(-rotation / angle) of what two attitudes share that are from the same lights, 4 to 7 degrees apart."""
+    assumed, vehicle = prior(SMALL, np.random.default_rng(5))
+    error = np.array([1e-5, -6e-6, 2e-5])
+    systematic = np.zeros((len(RECORD.t_s), 3, 3))
+    systematic[[2, other]] = np.outer(error, error)
+    independent = replace(RECORD, covariance_rad2=RECORD.covariance_rad2 + systematic)
+    by_rotation = replace(independent, systematic_rad2=systematic)
+    by_lights = replace(by_rotation, lights=np.ones((len(RECORD.t_s), 4)))
+    apart, near, same = (
+        mass_properties.estimate_mass([one], vehicle.lab, assumed)
+        for one in (independent, by_rotation, by_lights)
+    )
+    scale = np.outer(apart.sigma, apart.sigma)
+    added = (near.covariance - apart.covariance) / scale
+    whole = (same.covariance - apart.covariance) / scale
+    between = RECORD.lab_from_body[2].inv() * RECORD.lab_from_body[other]
+    correlation = np.exp(-between.magnitude() / TrackerModel().systematic_angle_rad)
+    assert correlation < 0.8
+    size = float(np.abs(whole).max())
+    np.testing.assert_allclose(added, correlation * whole, rtol=0, atol=1e-5 * size)
+
+
+def test_the_first_momentum_of_a_filter_is_as_uncertain_as_its_rate() -> None:
+    """0.01 rad/s about any body axis, times the inertia, if the mass properties are known: over drawn rates."""
+    assumed, vehicle = prior(SMALL, np.random.default_rng(6))
+    known = MassEstimate(assumed.values, 1e-20 * np.eye(20), 1.0)
+    covariance = mass_properties.first_covariance(known, RECORD, vehicle.lab)[3:6, 3:6]
+    rates = 0.01 * np.random.default_rng(7).standard_normal((200_000, 3))
+    momenta = RECORD.lab_from_body[1].apply(rates @ inertia_matrix(assumed.values[:6]))
+    size = float(np.abs(covariance).max())
+    np.testing.assert_allclose(np.cov(momenta.T), covariance, rtol=0, atol=0.02 * size)
 
 
 @law(mass_properties.symmetric_root)

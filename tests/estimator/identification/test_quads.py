@@ -100,6 +100,38 @@ def test_a_code_is_the_same_in_every_order_and_at_every_scale() -> None:
             assert {order[quad[0]], order[quad[1]]} == {0, 1}
 
 
+@pytest.mark.parametrize("radius", [0.05, 0.3, 0.5])
+def test_the_gate_of_a_code_holds_a_wrong_focal_length_and_no_more(radius: float) -> None:
+    """Four stars within a radius through a lens that is 5 % too long: the worst moves by 0.6 to 0.7 of the gate."""
+    uncertainty = 0.05
+    worst = np.array([[0.076, 0.589], [0.604, 0.506], [0.518, 0.182], [0.669, 0.743]])
+    rng = np.random.default_rng(20)
+    fours = [worst, *(units(rng) for _ in range(300))]
+    shares = []
+    for tangent in radius * np.array(fours):
+        detections = detections_of(tangent, np.full(4, 5.0), sigma=1e-9, zoom=uncertainty)
+        quad = np.arange(4)
+        star_quads._longest_first(tangent, quad)
+        stars = rays_of(tangent)
+        length = np.linalg.norm(stars[quad[0]] - stars[quad[1]])
+        gate = star_quads._code_gate(detections, quad, length)
+        (code, order), (seen, again) = (
+            code_of(one) for one in (stars, rays_of(tangent / (1 + uncertainty)))
+        )
+        # Where both order the stars alike; elsewhere the codes are of other stars.
+        shares.append(np.abs(code - seen).max() / gate if order == again else 0.0)
+    assert 0.55 < shares[0] < 1
+    assert max(shares) < 1
+
+
+def units(rng):
+    """Four places within the unit circle."""
+    angle = rng.uniform(0, 2 * np.pi, 4)
+    return np.sqrt(rng.uniform(0, 1, (4, 1))) * np.column_stack(
+        [np.cos(angle), np.sin(angle)]
+    )
+
+
 def rays_of(tangent):
     rays = np.column_stack([tangent, np.ones(len(tangent))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)

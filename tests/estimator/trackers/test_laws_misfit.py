@@ -96,13 +96,20 @@ def test_a_drifted_lens_is_found_from_the_misfit(tracker: StarTracker, lens: Cam
     assert left_px < 0.5 * lost_px
 
 
-@pytest.mark.parametrize("claimed", [1.0, 0.8])
+@pytest.mark.parametrize(("claimed", "uncertainty"), [(1.0, 0.0), (0.8, 0.0), (0.65, 0.01)])
 def test_wider_errors_in_closed_form_match_the_full_evaluation(
-    tracker: StarTracker, claimed: float, monkeypatch: pytest.MonkeyPatch
+    tracker: StarTracker,
+    claimed: float,
+    uncertainty: float,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The closed form agrees with the evaluation of every factor, which an unmatched light beside a star asks for."""
+    """The closed form agrees with the evaluation of every factor, which an unmatched light beside a star asks for.
+
+    Also where the focal length is fitted, a fourth unknown, and the errors are wrong by a factor.
+    """
     _, centroids = field(tracker, 5, CAMERA, claimed)
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    detections = changed(detections, 1.0, uncertainty)
     wide = changed(detections, 25.0, 0.0)
     found = star_search.lost_in_space(wide, tracker.sky, 80, 100_000)
     R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
@@ -111,7 +118,7 @@ def test_wider_errors_in_closed_form_match_the_full_evaluation(
         detections, tracker.sky, R_cam_from_ref, 1.0, gates, -np.inf
     )
     kept = centroids.take(hypothesis.observed)
-    detections = tracker.detections(kept, tracker.sigma_px(kept))
+    detections = changed(tracker.detections(kept, tracker.sigma_px(kept)), 1.0, uncertainty)
     hypothesis = star_evidence.evaluate(
         detections, tracker.sky, hypothesis.R_cam_from_ref, 1.0, gates[: len(kept)], -np.inf
     )
@@ -145,18 +152,27 @@ def test_the_covariance_is_never_below_the_model_s(
         assert (np.diag(answer.covariance_rad2) > 0.8 * np.diag(model)).all()
 
 
-def test_the_floor_of_the_errors_has_the_restricted_likelihood(tracker: StarTracker) -> None:
-    """Against the density of error contrasts, which do not depend on the attitude, and a fit with each floor."""
+@pytest.mark.parametrize("uncertainty", [0.0, 0.02])
+def test_the_floor_of_the_errors_has_the_restricted_likelihood(
+    tracker: StarTracker, uncertainty: float
+) -> None:
+    """Against the density of error contrasts, which do not depend on the attitude, and a fit with each floor.
+
+    Nor do they depend on the focal length, where that is uncertain.
+    """
     _, centroids = field(tracker, 2, CAMERA, 0.5)
     detections = tracker.detections(centroids, tracker.sigma_px(centroids))
     found = star_search.lost_in_space(detections, tracker.sky, 80, 100_000)
     answer, floor_px2 = misfit.with_floor(
-        found, detections, tracker.sky, 0.0, CAMERA.focal_px
+        found, changed(detections, 1.0, uncertainty), tracker.sky, 0.0, CAMERA.focal_px
     )
     # Linear model of the matches, in pixels
     seen = Rotation.from_quat(found.cam_from_ref_xyzw).apply(tracker.sky.vectors[found.star])
     view = geometry(seen, seen)
-    design = CAMERA.focal_px * view.jacobian.reshape(-1, 3)
+    design = CAMERA.focal_px * np.column_stack(
+        [view.jacobian.reshape(-1, 3), view.tangent.ravel()]
+    )
+    design = design[:, : 4 if uncertainty else 3]
     tangents = CAMERA.tangents(centroids.xy_px[found.observed])
     error_px = CAMERA.focal_px * (tangents - view.tangent).ravel()
     own_px2 = np.repeat(tracker.sigma_px(centroids)[found.observed] ** 2, 2)
@@ -170,12 +186,12 @@ def test_the_floor_of_the_errors_has_the_restricted_likelihood(tracker: StarTrac
         weighted = np.linalg.inv(covariance_px2) @ design
         fits.append(
             np.linalg.inv(design.T @ weighted)
-            @ np.column_stack([weighted.T @ error_px, np.eye(3)])
+            @ np.column_stack([weighted.T @ error_px, np.eye(design.shape[1])])
         )
     share = np.exp(np.array(log_density) - max(log_density))
     share /= share.sum()
     assert floor_px2 == pytest.approx(share @ misfit.FLOORS_PX**2, rel=1e-4)
-    steps, inverses = np.array(fits)[:, :, 0], np.array(fits)[:, :, 1:]
+    steps, inverses = np.array(fits)[:, :3, 0], np.array(fits)[:, :3, 1:4]
     mean = share @ steps
     scatter = steps - mean
     wanted = np.einsum("f,fij->ij", share, inverses) + (share * scatter.T) @ scatter

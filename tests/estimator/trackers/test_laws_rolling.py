@@ -12,7 +12,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
-from estimator.attitude.rate import Sight
+from estimator.attitude.rate import STARS, Sight, tangent_motion
+from estimator.attitude.rotation_fit import tangent_jacobian
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
@@ -143,6 +144,64 @@ def test_row_times_alone_determine_a_slow_rate_with_its_sign(tracker: StarTracke
         assert attitude.rate is not None
         assert attitude.rate.sign_known
         assert_allclose(attitude.rate.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-5)
+
+
+def test_the_covariance_is_that_of_attitude_and_rate_together(tracker: StarTracker) -> None:
+    """Stars in the upper rows alone: the attitude at the middle row is extrapolated with the rate that they give.
+
+    The inverse of the six by six normal matrix of rotation and rate, from slopes J and -t J, against the tracker's.
+    """
+    for seed in range(3):
+        seen, _ = star_frame(tracker, seed, np.array([0.3, -0.2, 0.1]))
+        seen = replace(seen, still_px=seen.still_px[seen.still_px[:, 1] < 600.0])
+        found = replace(seen.centroids(), streak_px=None)
+        attitude = tracker.solve_centroids(found, exposure_s=EXPOSURE_S)
+        assert attitude.match is not None
+        assert attitude.covariance_rad2 is not None
+        used = tracker.with_errors(found.take(attitude.match.observed))
+        rays = WIDE.rays(used.xy_px)
+        by_rotation = tangent_jacobian(rays, rays).reshape(-1, 2, 3)
+        delay_s = WIDE.row_delays_s(used.xy_px)
+        assert (delay_s < 0).all()
+        slopes = np.concatenate([by_rotation, -delay_s[:, None, None] * by_rotation], axis=2)
+        weighted = slopes / (used.sigma_px / WIDE.focal_px)[:, None, None]
+        normal = np.einsum("nij,nik->jk", weighted, weighted)
+        joint = np.linalg.inv(normal)[:3, :3]
+        alone = np.linalg.inv(normal[:3, :3])
+        claimed, expected, fixed = (
+            np.sqrt(np.diag(one)) for one in (attitude.covariance_rad2, joint, alone)
+        )
+        assert (expected > 1.3 * fixed).all()
+        assert_allclose(claimed, expected, rtol=0.05, atol=0)
+
+
+@pytest.mark.parametrize("focal_px", [1500.0, 8000.0])
+def test_the_first_guess_of_a_slow_rate_shears_the_field_by_a_given_length(
+    focal_px: float,
+) -> None:
+    """By one standard deviation, from the middle row to the first. A streak at half the height has one length."""
+    camera = replace(WIDE, focal_px=focal_px, row_time_s=3e-4)
+    points = Centroids(np.full((3, 2), 100.0), np.full(3, 0.1), np.ones(3))
+    guesses = [
+        one.covariance_rad2_s2
+        for one, _ in rolling_shutter.candidates(camera, STARS, points, None, EXPOSURE_S)
+    ]
+    assert len(guesses) == 2
+    sheared_px = [
+        np.sqrt(guess[0, 0]) * focal_px * abs(camera.row_delays_s(np.zeros((1, 2)))[0])
+        for guess in guesses
+    ]
+    assert sheared_px[0] == pytest.approx(rolling_shutter.SMALL_SHEAR_PX, rel=2e-3)
+    assert sheared_px[1] > rolling_shutter.SMALL_SHEAR_PX
+    # At the edge of the chip's middle column, above the center by half the height.
+    above = np.array([[0.0, camera.height_px / 2 / focal_px, 1.0]])
+    about = tangent_motion(above)[0] @ [0.0, 0.0, 1.0]
+    across = tangent_motion(np.array([[0.0, 0.0, 1.0]]))[0] @ [0.0, 1.0, 0.0]
+    for guess in guesses:
+        sigma = np.sqrt(np.diag(guess))
+        assert sigma[2] * np.linalg.norm(about) == pytest.approx(
+            sigma[1] * np.linalg.norm(across)
+        )
 
 
 def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(

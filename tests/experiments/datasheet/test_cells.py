@@ -9,10 +9,12 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.experiments.datasheet.cells import (
+    BENDS_PX,
     FULL,
     MIN_FIELDS,
     MODEL_FIELDS,
     QUICK,
+    STREAKS_PX,
     DatasheetCell,
     Designer,
     check_scene,
@@ -171,6 +173,19 @@ def test_a_turn_about_the_boresight_smears_the_edge_as_far_as_the_streak_says():
         )
     cells = [one for one in designer.cells() if one.experiment == "boresight"]
     assert all(one.settings["trial.rate_axis"] == "boresight" for one in cells)
+
+
+@pytest.mark.parametrize("time_s", [0.02, 0.1])
+def test_streaks_and_bends_have_their_lengths_in_the_image(time_s):
+    """A star at the center runs by f tan(w T) at a rate w, by half of a bend in T from rest; rates have two digits."""
+    designer = Designer(load("shefex2", {"exposure.time": f"{time_s} s"}), QUICK)
+    camera = designer.scene.camera
+    rates = np.radians(designer.rates_deg_s(STREAKS_PX))
+    streaks_px = camera.focal_px * np.tan(rates * time_s)
+    np.testing.assert_allclose(streaks_px, STREAKS_PX, rtol=0.06)
+    accelerations = np.radians(designer.accelerations_deg_s2(BENDS_PX, time_s))
+    bends_px = 2 * camera.focal_px * np.tan(accelerations * time_s**2 / 2)
+    np.testing.assert_allclose(bends_px, BENDS_PX, rtol=0.06)
 
 
 def test_exclusion_angles_need_a_baffle():

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from skysim.experiments.datasheet.datasheet_report import failed_checks
 from skysim.experiments.datasheet.variance_components import (
@@ -154,6 +155,15 @@ def test_too_few_fields_have_no_interval():
     assert np.isnan(bounded(np.arange(9.0))[1:]).all()
     assert np.isfinite(bounded(np.arange(10.0))).all()
     assert bounded(np.ones(10)) == (1, 1, 1)
+
+
+@pytest.mark.parametrize("verdicts", [1, 2, 10])
+def test_an_interval_of_normal_shares_is_student_s_of_both_sides(verdicts: int) -> None:
+    """2.5 % beyond each end for one verdict; that of ten at once (Bonferroni) leaves 0.25 %."""
+    shares = np.random.default_rng(11).standard_normal(300)
+    found = bounded(shares, verdicts)
+    half = stats.t.ppf(1 - 0.05 / 2 / verdicts, 299) * shares.std(ddof=1) / np.sqrt(300)
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.08)
 
 
 def test_a_ratio_is_precise_if_both_terms_share_their_fields():

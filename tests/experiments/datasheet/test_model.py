@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -233,6 +234,19 @@ def test_the_scatter_of_fields_is_computed_from_two_estimates_of_each():
     assert model_fit.log_scale(np.ones(9), np.ones(9)) == 0
 
 
+def test_the_scatter_of_few_units_is_that_of_all_that_could_be_bought():
+    """Three units of a batch with 0.5, 0.5 and 4": the mean of many squares has no bias."""
+    rng = np.random.default_rng(13)
+    sigma = np.array([0.5, 0.5, 4.0])
+    squares = []
+    for _ in range(1500):
+        unit = sigma[:, None, None] * rng.standard_normal((3, 1, 3))
+        other = sigma[:, None, None] * rng.standard_normal((3, 12, 3))
+        squares.append(model_fit.unit_scatter((unit + other)[..., None, None, None]) ** 2)
+    # Squares below 0, which have no root, are left at 0: about one in four.
+    assert np.mean(squares, axis=0) == pytest.approx(sigma**2, rel=0.1)
+
+
 def drawn_sheet(model: ErrorModel, fields: int) -> MeasuredFrames:
     """A datasheet of shefex2 whose errors are drawn from a model: every cell of a field at its turn and rate."""
     scene = load("shefex2", {})
@@ -277,6 +291,19 @@ def turned(
     return state._replace(field=new[0], pixel=new[1], scale=float(new[2]))
 
 
+def test_errors_are_compared_by_the_turn_between_their_frames(model: ErrorModel):
+    """The differences of the turns at which the cells of each sequence look; at rest all are 0."""
+    sheet = drawn_sheet(model, 10)
+    angles_deg, _, _ = model_fit.lagged(sheet, np.zeros(3))
+    expected = []
+    for rate in sheet.levels("sequence", "rate_deg_s"):
+        rows = sheet.rows("sequence", rate_deg_s=rate)
+        turns_deg = [sheet.cells[row].settings.get("trial.turn_deg", 0.0) for row in rows]
+        expected += [late - early for early, late in combinations(turns_deg, 2)]
+    assert angles_deg == pytest.approx(expected, abs=1e-9)
+    assert angles_deg.max() > 0.1
+
+
 @pytest.mark.slow
 def test_a_model_agrees_with_new_fields_of_its_own_errors_and_not_with_others(
     monkeypatch: pytest.MonkeyPatch,
@@ -309,3 +336,23 @@ def test_a_model_agrees_with_new_fields_of_its_own_errors_and_not_with_others(
         ErrorModel(truth.constants | {"field_deg": 0.02}), sheet, 0.57, "even"
     )
     assert fleeting.correlation - fleeting.expected_correlation > 0.1
+
+
+@pytest.mark.slow
+def test_noise_at_a_rate_is_what_the_streak_and_the_slow_terms_leave(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """Of errors that a model drew: noise of 2" on every axis, and 4" more about the rate's axis from 0.3 deg/s on."""
+    rates = {"rates_deg_s": [0.0, 0.28, 2.3], "along": [0.0, 4.0, 4.0]}
+    slow = {name: [0.3, 0.3, 2.0] for name in ("field", "pixel")}
+    truth = ErrorModel(
+        CONSTANTS | rates | slow | {"noise": [[2.0, 2.0, 10.0]] * 3, "scale": [0.2] * 3}
+    )
+    sheet = drawn_sheet(truth, 300)
+    monkeypatch.setattr(
+        model_fit, "axes_rad", lambda sheet, rate: sheet.columns["axis_rad"][0]
+    )
+    found = model_fit.constants(sheet)
+    noise = np.array(found["noise"])[np.array(found["rates_deg_s"]) > 0.28]
+    assert len(noise) >= 2
+    assert np.sqrt(np.mean(noise**2, axis=0)) == pytest.approx([2.0, 2.0, 10.0], rel=0.12)

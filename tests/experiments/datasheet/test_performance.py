@@ -151,6 +151,20 @@ def test_a_covariance_is_judged_at_each_rate():
     assert few.high / few.low > 1.5 * rows[0]["nees"].high / rows[0]["nees"].low
 
 
+def test_the_interval_of_a_pair_s_noise_is_about_its_value():
+    """Errors of 2 about each axis, independent from frame to frame: noise and error are 2, within intervals."""
+    sheet = sky_sheet((2, 2, 2))
+    sheet = sheet._replace(
+        cells=[DatasheetCell("rate", {"rate_deg_s": n // 2}, {}) for n in range(10)]
+    )
+    for row in performance.by_level(sheet, "rate", "rate_deg_s"):
+        for name in ("nea_across", "nea_about", "rms_across", "rms_about"):
+            low, high = row["intervals"][name]
+            assert low < row[name] < high
+            assert row[name] == pytest.approx(2, rel=0.15)
+            assert high / low < 1.35
+
+
 def test_an_interval_covers_the_noise_of_pairs_and_shrinks_with_the_fields():
     """Noise of 2 in pairs with errors in common: its interval holds 2 in 19 of 20, here in most of 40 sheets."""
     rng = np.random.default_rng(8)

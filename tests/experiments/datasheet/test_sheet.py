@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from skysim.core.errors import InputError
-from skysim.experiments.datasheet import cells, datasheet_report, model_fit, performance
+from skysim.experiments.datasheet import (
+    cells,
+    datasheet_report,
+    model_fit,
+    performance,
+    statement,
+)
 from skysim.experiments.datasheet.cells import Designer, Size
 from skysim.experiments.datasheet.datasheet_report import numbers
 from skysim.experiments.datasheet.statement import Statement, sections, state
@@ -213,3 +222,14 @@ def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
         assert found.bias.mean() == pytest.approx(
             np.mean(effects) ** 2, rel=0.05, abs=2.0 if axis < 2 else 20.0
         )
+
+
+def test_the_text_on_accelerations_states_the_lag_of_the_mean(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From rest at mid-exposure the mean of a t^2 / 2 over the exposure, by quadrature, is that stated."""
+    monkeypatch.setattr(statement, "bracket_text", lambda *_: "")
+    texts = statement.acceleration_section(SimpleNamespace(accelerations=[])).texts
+    stated = re.findall(r"a T² / (\d+)", " ".join(texts))
+    mean, _ = quad(lambda t: t**2 / 2, -0.5, 0.5)
+    assert [float(one) for one in stated] == pytest.approx([1 / mean])
