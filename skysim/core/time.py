@@ -8,8 +8,10 @@ by 0.01 mm/s. Sources: IERS Conventions 2010, chapter 10; IS-GPS-200.
 
 import datetime
 from functools import lru_cache
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator
 
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
@@ -43,6 +45,23 @@ def check_year(value: datetime.datetime) -> datetime.datetime:
     if not 1900 <= value.year <= 2100:
         raise InputError("", f"{value.isoformat()} is outside 1900 to 2100")
     return in_utc(value)
+
+
+def date_of(value: Any) -> Any:
+    """A date from YAML or an ISO text. Raises InputError for others; pydantic takes a number for seconds since 1970."""
+    if isinstance(value, datetime.date):
+        return value
+    try:
+        return datetime.datetime.fromisoformat(value)
+    except (TypeError, ValueError):
+        raise InputError(
+            "",
+            f"{value!r} is not a date",
+            "an ISO date, or date and time: 2012-06-21 03:00:00",
+        ) from None
+
+
+Moment = Annotated[datetime.datetime, BeforeValidator(date_of), AfterValidator(check_year)]
 
 
 def tai_minus_utc_s(time: datetime.datetime) -> float:

@@ -24,7 +24,7 @@ from skysim.core.units import (
     ConfigModel,
     Duration,
     Length,
-    Number,
+    NotNegative,
     Positive,
     PositiveLength,
     Time,
@@ -153,10 +153,14 @@ class ToleranceConfig(ConfigModel):
 
 
 def without_sign(value: Any) -> Any:
-    """The text of a tolerance without its sign: "0.5 mm" for "±0.5 mm"."""
+    """A tolerance without its sign: "0.5 mm" for "±0.5 mm", and the number 0.1 for "±0.1"."""
     if not isinstance(value, str):
         return value
-    return value.strip().removeprefix("±").removeprefix("+/-").removeprefix("+-").strip()
+    text = value.strip().removeprefix("±").removeprefix("+/-").removeprefix("+-").strip()
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 SIGNED = r"^\s*(±|\+/-|\+-)?\s*[.]?\d"
@@ -168,7 +172,8 @@ SIGNED_QUANTITY = BeforeValidator(
 )
 SIGNED_NUMBER = BeforeValidator(
     without_sign,
-    json_schema_input_type=float | Annotated[str, Field(description="±0.1", pattern=SIGNED)],
+    json_schema_input_type=Positive
+    | Annotated[str, Field(description="±0.1", pattern=SIGNED)],
 )
 
 
@@ -246,4 +251,4 @@ class ErrorSchema:
 
 LengthError = Annotated[float, ErrorSchema(Length, LengthToleranceConfig), Field(ge=0)]
 TimeError = Annotated[float, ErrorSchema(Time, TimeToleranceConfig), Field(ge=0)]
-NumberError = Annotated[float, ErrorSchema(Number, NumberToleranceConfig), Field(ge=0)]
+NumberError = Annotated[float, ErrorSchema(NotNegative, NumberToleranceConfig)]

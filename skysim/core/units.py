@@ -13,7 +13,6 @@ from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -61,10 +60,12 @@ def si_unit(name: str) -> str:
     return SI_UNITS.get(match[1], "") if match else ""
 
 
-def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
+def quantity(
+    si_unit: str, what: str, examples: str, most: float = math.inf
+) -> Callable[[Any], float]:
     """A validator that converts a quantity such as "48 in" to a float in `si_unit`. It raises InputError.
 
-    0 needs no unit, as it is the same in all.
+    0 needs no unit, as it is the same in all. `most` is the greatest size that physics allows, in SI.
     """
 
     def parse(value: Any) -> float:
@@ -74,20 +75,23 @@ def quantity(si_unit: str, what: str, examples: str) -> Callable[[Any], float]:
         if not isinstance(value, str):
             raise InputError("", f"{value!r} has no unit", f"a {what} such as {examples}")
         try:
-            return in_si(value, si_unit)
+            number = in_si(value, si_unit)
         except InputError as error:
             raise InputError(
                 "", f"{value!r} is not a {what}", f"a {what} such as {examples}"
             ) from error
+        if abs(number) > most:
+            raise InputError("", repr(value), f"a {what} up to {most:g} {si_unit}")
+        return number
 
     return parse
 
 
-def with_unit(si_unit: str, what: str, examples: str) -> BeforeValidator:
+def with_unit(si_unit: str, what: str, examples: str, most: float = 1e6) -> BeforeValidator:
     """`quantity` as the validator of a key; the JSON schema declares the value as a string."""
     schema = Field(description=f"a {what} such as {examples}", pattern=QUANTITY_PATTERN)
     return BeforeValidator(
-        quantity(si_unit, what, examples), json_schema_input_type=Annotated[str, schema]
+        quantity(si_unit, what, examples, most), json_schema_input_type=Annotated[str, schema]
     )
 
 
@@ -131,13 +135,6 @@ def in_si(value: str, si_unit: str | None = None) -> float:
             raise InputError("", error) from None
 
 
-def finite(value: float) -> float:
-    """The value. Raises InputError if it is not finite."""
-    if not math.isfinite(value):
-        raise InputError("", f"{value} is not a finite number")
-    return value
-
-
 # Of any type: a value above zero, and one of zero or more; lists of one or more, two or more, three.
 Item = TypeVar("Item")
 AboveZero = Annotated[Item, Field(gt=0)]
@@ -145,11 +142,14 @@ ZeroOrMore = Annotated[Item, Field(ge=0)]
 NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
 Several = Annotated[tuple[Item, ...], Field(min_length=2)]
 Three = tuple[Item, Item, Item]
-Number = Annotated[float, AfterValidator(finite)]
-Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"')]
-Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"')]
+# Every number has a least and a greatest value. Those of quantities are beyond any laboratory that could be built: a
+# hall of 10 km, a vehicle of 1000 t, a run of a century. A section narrows them where it knows better.
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Length = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"', 1e4)]
+Distance = Annotated[Number, with_unit("m", "length", '"35 mm" or "48 in"', 1e12)]
+Time = Annotated[Number, with_unit("s", "time", '"40 ms" or "1000 us"', 3e9)]
 Mass = Annotated[Number, with_unit("kg", "mass", '"80 kg"')]
-Inertia = Annotated[Number, with_unit("kg m2", "moment of inertia", '"6.0 kg m2"')]
+Inertia = Annotated[Number, with_unit("kg m2", "moment of inertia", '"6.0 kg m2"', 1e9)]
 Intensity = Annotated[Number, with_unit("cd", "luminous intensity", '"7.7 mcd"')]
 RadiantIntensity = Annotated[Number, with_unit("W sr-1", "radiant intensity", '"3 mW/sr"')]
 Torque = Annotated[Number, with_unit("N m", "torque", '"0.5 N m"')]
@@ -173,19 +173,23 @@ Spin = Annotated[Number, Field(ge=-360, le=360)]
 Spins = Three[Spin]
 RightAscension = Annotated[Number, Field(ge=0, lt=360)]
 Declination = Annotated[Number, Field(ge=-90, le=90)]
-Triple = Three[Number]
-Angles = Triple
+AxisAngle = Annotated[Number, Field(ge=0, le=180)]
 Magnitude = Annotated[Number, Field(ge=-30, le=30)]
 Temperature = Annotated[Number, Field(ge=-150, le=150)]
-Seed = ZeroOrMore[int]
-PositiveInt = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, le=1e18)]
+Whole = Annotated[int, Field(ge=0, le=1_000_000_000)]
+PositiveInt = Annotated[Whole, Field(ge=1)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
 PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
-Positive = AboveZero[Number]
-NotNegative = ZeroOrMore[Number]
+WITHIN_BILLION = Field(ge=-1e9, le=1e9)
+# Of any unit: all parts (ppm), most of a turn in arcseconds, a clock of a THz in MHz.
+Positive = Annotated[Number, Field(gt=0, le=1e6)]
+NotNegative = Annotated[Number, Field(ge=0, le=1e6)]
+Signed = Annotated[Number, WITHIN_BILLION]
 Fractions = Several[Fraction]
-Ascending = Several[Number]
+# Options of a program of the user, which knows their meaning.
+Options = dict[str, bool | Annotated[int, WITHIN_BILLION] | Signed | str]
 # Chooses the class of a section by its key `kind`.
 BY_KIND = Field(discriminator="kind")
 
@@ -231,8 +235,20 @@ def quantities_within(
     return values
 
 
+def make_strict(schema: Any) -> None:
+    """Let a schema take neither text nor true for a number, nor a number for true or false, nor an empty text."""
+    if isinstance(schema, dict):
+        if schema.get("type") in ("bool", "float", "int"):
+            schema["strict"] = True
+        if schema.get("type") == "str":
+            schema.setdefault("min_length", 1)
+        schema = [*schema.values()]
+    for part in schema if isinstance(schema, list) else ():
+        make_strict(part)
+
+
 class ConfigModel(BaseModel):
-    """Base of every section: frozen, unknown keys are errors, YAML keys lack the SI suffix.
+    """Base of every section: frozen, strict, unknown keys are errors, YAML keys lack the SI suffix.
 
     `null` removes a key that a base has, so that its default holds, unless it is a value of the key itself.
     """
@@ -244,6 +260,12 @@ class ConfigModel(BaseModel):
         validate_by_name=False,
         alias_generator=lambda name: SI_SUFFIX.sub("", name),
     )
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> Any:
+        schema = handler(source)
+        make_strict(handler.resolve_ref_schema(schema))
+        return schema
 
     @model_validator(mode="before")
     @classmethod

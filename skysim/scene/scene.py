@@ -16,7 +16,7 @@ from pydantic._internal._model_construction import ModelMetaclass
 from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.random_streams import HEAD_SEED, derived_seed
-from skysim.core.time import check_year
+from skysim.core.time import Moment
 from skysim.core.tolerance import TimeError
 from skysim.core.units import (
     BY_KIND,
@@ -28,7 +28,6 @@ from skysim.core.units import (
     Seed,
     Spins,
     Time,
-    Triple,
 )
 from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
@@ -114,7 +113,7 @@ class HeadConfig(ConfigModel):
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
     position_m: Position
     rotation_deg: Spins
-    mount_error_arcsec: Triple = (0.0, 0.0, 0.0)
+    mount_error_arcsec: Coefficients = (0.0, 0.0, 0.0)
     mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
@@ -200,7 +199,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
     seed: Seed
-    start_time: Annotated[datetime.datetime, AfterValidator(check_year)]
+    start_time: Moment
     site: SiteConfig = SiteConfig()
     orbit: Orbit | None = None
     vehicle: VehicleConfig

@@ -123,7 +123,7 @@ def test_a_bare_number_takes_a_tolerance_too() -> None:
 @pytest.mark.parametrize(
     ("value", "complaint"),
     [
-        ({"tolerance": "0.5"}, "not a length"),
+        ({"tolerance": "0.5"}, "0.5 has no unit"),
         ({"tolerance": 0.5}, "has no unit"),
         ({"tolerance": "0 mm"}, "greater than 0"),
         ({"tolerance": "-1 mm"}, "greater than 0"),

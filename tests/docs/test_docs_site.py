@@ -85,12 +85,12 @@ def test_a_key_s_row_states_its_type_and_default() -> None:
     assert (
         '| `time` | a time such as "40 ms" or "1000 us", ≥ 1e-06 s | required |' in exposure
     )
-    assert "| `rate_hz` | number, > 0 | required |" in exposure
+    assert "| `rate_hz` | number, > 0, ≤ 1e+06 | required |" in exposure
     assert (
         '| `led_sigma` | a length such as "35 mm" or "48 in" or LengthToleranceConfig | `0 m` |'
         in survey
     )
-    assert "| `surface_seed` | whole number, ≥ 0 or null | `null` |" in survey
+    assert "| `surface_seed` | whole number, ≥ 0, ≤ 1e+18 or null | `null` |" in survey
 
 
 def test_every_generated_part_has_its_place_on_one_page() -> None:

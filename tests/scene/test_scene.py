@@ -390,9 +390,21 @@ def test_a_bad_override_is_refused_in_one_line_that_names_the_option(
             'time: "-10 ms"',
             "exposure.time: '-10 ms' is not allowed; allowed: greater than or equal to 0.000001",
         ),
-        ('time: "10 ms"', 'time: "nan ms"', "exposure.time: nan is not a finite number"),
-        ('time: "10 ms"', 'time: "1e400 ms"', "exposure.time: inf is not a finite number"),
-        ("f_number: 8", "f_number: .nan", "camera.f_number: nan is not a finite number"),
+        (
+            'time: "10 ms"',
+            'time: "nan ms"',
+            "exposure.time: nan is not allowed; allowed: a finite number",
+        ),
+        (
+            'time: "10 ms"',
+            'time: "1e400 ms"',
+            "exposure.time: '1e400 ms'; allowed: a time up to",
+        ),
+        (
+            "f_number: 8",
+            "f_number: .nan",
+            "camera.f_number: nan is not allowed; allowed: a finite",
+        ),
         (
             "preset: lu205c",
             "width_px: 1600.5\n  preset: lu205c",
@@ -427,7 +439,7 @@ def test_a_bad_override_is_refused_in_one_line_that_names_the_option(
         (
             "2012-03-01T12:00:00",
             "yesterday",
-            "start_time: 'yesterday' is not allowed; allowed: a valid datetime",
+            "start_time: 'yesterday' is not a date; allowed: an ISO date, or date and time",
         ),
         ("title: AFIT", "name: x\ntitle: AFIT", "name: unknown key"),
         (
@@ -469,7 +481,11 @@ def test_a_wrong_value_is_reported_with_key_allowed_values_and_line(
             "dec_deg: -91",
             "motion.start.dec_deg: -91 is not allowed; allowed: greater than",
         ),
-        ("ra_deg: 83.0", "ra_deg: .nan", "motion.start.ra_deg: nan is not a finite number"),
+        (
+            "ra_deg: 83.0",
+            "ra_deg: .nan",
+            "motion.start.ra_deg: nan is not allowed; allowed: a finite number",
+        ),
         (
             "dec_deg: 2.0",
             "decl_deg: 2.0",

@@ -24,6 +24,7 @@ from skysim.core.errors import InputError
 from skysim.core.plugins import Programs
 from skysim.core.types import frozen
 from skysim.core.units import (
+    AxisAngle,
     ConfigModel,
     Declination,
     Delay,
@@ -34,7 +35,8 @@ from skysim.core.units import (
     Number,
     PositiveInt,
     Seed,
-    Triple,
+    Signed,
+    Three,
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
 from skysim.experiments.study.factors import (
@@ -53,7 +55,6 @@ TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
-Angle = Annotated[Number, Field(ge=0, le=180)]
 BodyName = Literal[
     "zenith",
     "sun",
@@ -86,7 +87,7 @@ class NearBody(ConfigModel):
     """
 
     body: BodyName
-    off_deg: Annotated[tuple[Angle, Angle], AfterValidator(check_rising)] = (0.0, 5.0)
+    off_deg: Annotated[tuple[AxisAngle, AxisAngle], AfterValidator(check_rising)] = (0.0, 5.0)
 
 
 class AttitudeRange(ConfigModel):
@@ -129,8 +130,8 @@ class RandomAttitude(AttitudeRange):
 class AxisConfig(ConfigModel):
     """An axis of rotation: a vector of any length in body axes, or in camera axes (+x right, +y down, +z boresight)."""
 
-    body: Triple | None = None
-    camera: Triple | None = None
+    body: Three[Signed] | None = None
+    camera: Three[Signed] | None = None
 
     @model_validator(mode="after")
     def check_vector(self) -> AxisConfig:
@@ -213,7 +214,7 @@ class FrameTrial(RandomAttitude):
     kind: Literal["frames"]
     rate_deg_s: NotNegative = 0.0
     acceleration_deg_s2: NotNegative = 0.0
-    turn_deg: Number = 0.0
+    turn_deg: Signed = 0.0
     rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
     tracked: Annotated[int, Field(ge=0, le=100)] = 0
@@ -360,9 +361,9 @@ class Cost(ConfigModel):
     """
 
     parts: str | None = None
-    base: Number = 0.0
-    per: dict[str, Number] = Field(default_factory=dict)
-    levels: dict[str, dict[str, Number]] = Field(default_factory=dict)
+    base: Signed = 0.0
+    per: dict[str, Signed] = Field(default_factory=dict)
+    levels: dict[str, dict[str, Signed]] = Field(default_factory=dict)
 
 
 class Objective(ConfigModel):
@@ -376,8 +377,8 @@ class Constraint(ConfigModel):
     """A response (or `cost`) and its bounds."""
 
     response: str
-    at_least: Number | None = None
-    at_most: Number | None = None
+    at_least: Signed | None = None
+    at_most: Signed | None = None
 
 
 class Search(ConfigModel):

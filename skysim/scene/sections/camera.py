@@ -17,7 +17,7 @@ from skysim.core.paths import DATA
 from skysim.core.units import (
     BY_KIND,
     AboveZero,
-    Ascending,
+    AxisAngle,
     ConfigModel,
     Duration,
     Fraction,
@@ -28,6 +28,7 @@ from skysim.core.units import (
     PositiveFraction,
     Seed,
     Several,
+    Signed,
     TableConfig,
     Temperature,
     check_table,
@@ -53,13 +54,14 @@ TransferLoss = Annotated[Number, Field(ge=0, le=1e-2)]
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
+Distortion = tuple[Radial, Radial, Tangential, Tangential, Radial]
 
 
 def focus_distance(value: Any) -> float:
     """A length in m; infinity for the word infinity."""
     if value == "infinity":
         return math.inf
-    return quantity("m", "length", '"33 in", or infinity')(value)
+    return quantity("m", "length", '"33 in", or infinity', 1e12)(value)
 
 
 class PsfConfig(ConfigModel):
@@ -135,7 +137,7 @@ class VignettingTableConfig(TableConfig):
     """Measured transmission against field angle, 1 on the axis."""
 
     kind: Literal["table"]
-    angle_deg: Ascending
+    angle_deg: Several[AxisAngle]
     transmission: Fractions
 
 
@@ -223,12 +225,8 @@ class BaffleConfig(TableConfig):
         linear between the rows and constant beyond them. A curve of `transmission` is a further factor
     """
 
-    angle_deg: Ascending
+    angle_deg: Several[AxisAngle]
     pst: Fractions
-
-    def check(self) -> None:
-        if not 0 <= self.angle_deg[0] < self.angle_deg[-1] <= 180:
-            raise InputError("angle_deg", "outside of half a circle", "0 to 180")
 
 
 class GlobalShutterConfig(ConfigModel):
@@ -497,14 +495,14 @@ class CameraConfig(ConfigModel):
     ] = math.inf
     transmission: Transmission = 1.0
     vignetting: Annotated[TwoStopsConfig | VignettingTableConfig, BY_KIND] | None = None
-    distortion: tuple[Radial, Radial, Tangential, Tangential, Radial] = (
+    distortion: Distortion = (
         0.0,
         0.0,
         0.0,
         0.0,
         0.0,
     )
-    principal_point_px: tuple[Number, Number] | None = None
+    principal_point_px: tuple[Signed, Signed] | None = None
     pupil_walk_m: tuple[Walk, Walk] = (0.0, 0.0)
     psf: Psf = GaussianPsfConfig()
     chromatic: ChromaticConfig | None = None

@@ -1,6 +1,5 @@
 """Schema of the layouts of a dome's LEDs: positions and brightness."""
 
-import datetime
 import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -8,9 +7,11 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from skysim.core.errors import InputError
+from skysim.core.time import J2000, Moment
 from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
     BY_KIND,
+    AxisAngle,
     ConfigModel,
     Declination,
     Fractions,
@@ -25,6 +26,7 @@ from skysim.core.units import (
     PositiveLength,
     RightAscension,
     Seed,
+    Spin,
 )
 
 HOLES = 9  # holes of a patch board, 3x3
@@ -61,9 +63,9 @@ class BoardConfig(ConfigModel):
         Brightness of each LED, and its type, a name in `led.types`; full brightness and `led` if left out
     """
 
-    azimuth_deg: Number
+    azimuth_deg: Spin
     tilt_deg: Annotated[Number, Field(ge=0, le=90)]
-    rotation_deg: Number = 0.0
+    rotation_deg: Spin = 0.0
     leds: NotEmpty[Annotated[int, Field(ge=0, lt=HOLES)]]
     levels: Levels | None = None
     types: TypeNames | None = None
@@ -104,7 +106,7 @@ class PatchBoardsConfig(ConfigModel):
     spacing_m: PositiveLength | None = None
     pitch_m: PositiveLength
     spread: Literal["spiral", "grid"] = "spiral"
-    lit: tuple[int, int] = (4, 6)
+    lit: tuple[PositiveInt, PositiveInt] = (4, 6)
     pwm_levels: Levels = (1.0,)
     boards: tuple[BoardConfig, ...] = ()
     glue_scatter_m: LengthError = 0.0
@@ -215,7 +217,7 @@ class GeodesicConfig(LitConfig):
     kind: Literal["geodesic"]
     frequency: Annotated[int, Field(ge=1, le=100)]
     class_: Annotated[Literal["I", "II"], Field(alias="class")] = "I"
-    rotation_deg: Number = 0.0
+    rotation_deg: Spin = 0.0
 
     def check(self) -> None:
         if self.class_ == "II" and self.frequency % 2:
@@ -308,19 +310,17 @@ class CelestialConfig(ConfigModel):
     count: Count | None = None
     limit_mag: LimitMagnitude | None = None
     brightness: Literal["v", "band"] = "band"
-    brightest_mag: Number | None = None
+    brightest_mag: Magnitude | None = None
     camera_m: Position
     zenith_ra_deg: RightAscension
     zenith_dec_deg: Declination
-    roll_deg: Number = 0.0
-    epoch: datetime.datetime = datetime.datetime(2000, 1, 1, 12)
+    roll_deg: Spin = 0.0
+    epoch: Moment = J2000
     hardware_seed: Seed = 0
 
     def check(self) -> None:
         if (self.count is None) == (self.limit_mag is None):
             raise InputError("", "celestial takes either count or limit_mag")
-        if not 1900 <= self.epoch.year <= 2100:
-            raise InputError("epoch", f"{self.epoch.isoformat()} is outside 1900 to 2100")
 
 
 class ListedConfig(DimmedConfig):
@@ -341,7 +341,7 @@ class ListedConfig(DimmedConfig):
 
     kind: Literal["listed"]
     positions_m: NotEmpty[Position] | None = None
-    directions_deg: NotEmpty[tuple[Number, Number]] | None = None
+    directions_deg: NotEmpty[tuple[Spin, AxisAngle]] | None = None
     file: str | None = None
     types: TypeNames | None = None
 
@@ -454,10 +454,10 @@ class PixelsConfig(ConfigModel):
 
     pixels: tuple[Pixels, Pixels]
     pitch_m: PositiveLength
-    block: PositiveInt = 1
+    block: Pixels = 1
     gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
     gamma: Annotated[Number, Field(gt=0, le=10)] | Literal["srgb"] | Fractions = 2.2
-    contrast: Annotated[Number, Field(ge=2)] | None = None
+    contrast: Annotated[Positive, Field(ge=2)] | None = None
 
     def check(self) -> None:
         if self.block > min(self.pixels):
@@ -540,7 +540,7 @@ class ProjectorConfig(LensDisplayConfig):
     points: Points
     position_m: Position
     aim_m: Position
-    rotation_deg: Number = 0.0
+    rotation_deg: Spin = 0.0
     f_number: Positive = 2.0
     focus_m: PositiveLength | None = None
     falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0

@@ -16,7 +16,7 @@ from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     BY_KIND,
     AboveZero,
-    Ascending,
+    AxisAngle,
     ConfigModel,
     Duration,
     InnerFraction,
@@ -50,7 +50,7 @@ class LobeTableConfig(TableConfig):
     """Measured relative intensity against angle, 1 on the axis, zero beyond the last angle."""
 
     kind: Literal["table"]
-    angle_deg: Ascending
+    angle_deg: Several[AxisAngle]
     intensity: Several[NotNegative]
 
     def check(self) -> None:
@@ -286,6 +286,7 @@ def spectrum_tag(value: Any) -> str:
 
 Wavelength = Annotated[
     Number,
+    Positive,
     with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'),
     Field(ge=300e-9, le=1100e-9),
 ]

@@ -26,6 +26,7 @@ from skysim.core.units import (
     BY_KIND,
     ConfigModel,
     Declination,
+    Distance,
     Fraction,
     Length,
     Magnitude,
@@ -35,6 +36,7 @@ from skysim.core.units import (
     PositiveLength,
     RightAscension,
     Seed,
+    Spin,
     Three,
     ZeroOrMore,
 )
@@ -442,9 +444,9 @@ class CollimatedDisplayConfig(LensDisplayConfig):
     limit_mag: LimitMagnitude | None = None
     axis_ra_deg: RightAscension
     axis_dec_deg: Declination
-    roll_deg: Number = 0.0
+    roll_deg: Spin = 0.0
     brightest_mag: Magnitude
-    conjugate_m: Annotated[Length, Field(ge=10)] | None = None
+    conjugate_m: Annotated[Distance, Field(ge=10)] | None = None
 
 
 Light = DomeConfig | StarsConfig | CollimatedDisplayConfig
@@ -478,7 +480,10 @@ class LightConfig(ConfigModel):
         cls, value: Any, handler: ModelWrapValidatorHandler["LightConfig"]
     ) -> "LightConfig":
         """Validate a section with the class of its `kind` when called on the base class."""
-        kind = value.get("kind") if cls is LightConfig and isinstance(value, dict) else None
+        # As text, because a kind that is a mapping is no key.
+        kind = str(
+            value.get("kind") if cls is LightConfig and isinstance(value, dict) else ""
+        )
         if kind not in CONFIGS and kind in PLUGINS.entry_points():
             PLUGINS.entry_points()[kind].load()  # the module registers the kind
         return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)

@@ -20,12 +20,13 @@ from skysim.core.units import (
     NotEmpty,
     NotNegative,
     Number,
+    Options,
     Positive,
     RightAscension,
+    Spin,
     Spins,
     Three,
     TimeLimit,
-    Triple,
 )
 from skysim.core.yaml_reader import ExistingFile
 from skysim.scene.sections.vehicle import ActuatorsName
@@ -43,9 +44,9 @@ PRESCRIBED = "prescribed"  # no controller: the vehicle moves exactly along the 
 class AttitudeConfig(ConfigModel):
     """3-2-1 Euler angles of the body in the lab."""
 
-    roll_deg: Number = 0.0
-    pitch_deg: Number = 0.0
-    yaw_deg: Number = 0.0
+    roll_deg: Spin = 0.0
+    pitch_deg: Spin = 0.0
+    yaw_deg: Spin = 0.0
 
 
 class PointingConfig(ConfigModel):
@@ -53,7 +54,7 @@ class PointingConfig(ConfigModel):
 
     ra_deg: RightAscension
     dec_deg: Declination
-    roll_deg: Number = 0.0
+    roll_deg: Spin = 0.0
 
 
 def start_tag(value: Any) -> str:
@@ -162,7 +163,7 @@ class SineConfig(ConfigModel):
     """Oscillate about the attitude: amplitude_deg about body x, y, z at frequency_hz, starting and ending smoothly."""
 
     kind: Literal["sine"]
-    amplitude_deg: Triple
+    amplitude_deg: Spins
     frequency_hz: Positive
     duration_s: Duration
 
@@ -179,7 +180,7 @@ class ChirpConfig(ConfigModel):
     """
 
     kind: Literal["chirp"]
-    amplitude_deg: Triple
+    amplitude_deg: Spins
     from_hz: Positive
     to_hz: Positive
     duration_s: Duration
@@ -331,7 +332,7 @@ class ControlConfig(ConfigModel):
     """
 
     law: LawName = "pid"
-    options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
+    options: Options = Field(default_factory=dict)
     time_limit_s: TimeLimit = 10.0
     actuators: ActuatorsName = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"

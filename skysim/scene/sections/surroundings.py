@@ -9,9 +9,10 @@ from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
-    Ascending,
+    AxisAngle,
     ConfigModel,
     Declination,
+    Distance,
     Duration,
     Fraction,
     Fractions,
@@ -22,11 +23,12 @@ from skysim.core.units import (
     RightAscension,
     Seed,
     Several,
+    Signed,
     Spin,
     TableConfig,
     Temperature,
     Three,
-    ZeroOrMore,
+    Whole,
 )
 from skysim.core.yaml_reader import ExistingFile
 
@@ -42,12 +44,8 @@ class HorizonConfig(TableConfig):
     The altitude is linear between the azimuths, also from the last row to the first.
     """
 
-    azimuth_deg: Ascending
+    azimuth_deg: Several[RightAscension]
     altitude_deg: Several[Altitude]
-
-    def check(self) -> None:
-        if not 0 <= self.azimuth_deg[0] <= self.azimuth_deg[-1] < 360:
-            raise InputError("azimuth_deg", "outside the circle", "0 to below 360")
 
 
 class AirGlowConfig(ConfigModel):
@@ -146,7 +144,7 @@ class TemperatureTableConfig(TableConfig):
     """A measured history, linear between its times and constant beyond them."""
 
     kind: Literal["table"]
-    hours: Ascending
+    hours: Several[Signed]
     temperature_c: Several[Temperature]
 
 
@@ -275,7 +273,7 @@ class ExclusionConfig(ConfigModel):
     sun_deg: ExclusionAngle = 0.0
     earth_deg: ExclusionAngle = 0.0
     moon_deg: ExclusionAngle = 0.0
-    stars: ZeroOrMore[int] = 4
+    stars: Whole = 4
 
 
 class EarthConfig(ConfigModel):
@@ -320,7 +318,7 @@ class CircularOrbitConfig(OrbitConfig):
     """
 
     kind: Literal["circular"]
-    altitude_m: Annotated[Length, Field(ge=100e3, le=1e9)]
+    altitude_m: Annotated[Distance, Field(ge=100e3, le=1e9)]
     inclination_deg: Annotated[Number, Field(ge=0, le=180)]
     raan_deg: Spin = 0.0
     argument_deg: Spin = 0.0
@@ -368,7 +366,7 @@ class SkyGlowConfig(ConfigModel):
 
     kind: Literal["sky"]
     mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
-    gradient_per_deg: tuple[Number, Number] = (0.0, 0.0)
+    gradient_per_deg: tuple[Coefficient, Coefficient] = (0.0, 0.0)
 
 
 class MoonGlowConfig(ConfigModel):
@@ -409,8 +407,8 @@ class StrayLightConfig(TableConfig):
     kind: Literal["stray"]
     ra_deg: RightAscension
     dec_deg: Declination
-    v_mag: Number = SUN_V_MAG
-    angle_deg: Ascending
+    v_mag: Magnitude = SUN_V_MAG
+    angle_deg: Several[AxisAngle]
     pst: Fractions
 
 

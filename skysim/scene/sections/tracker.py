@@ -11,8 +11,10 @@ from skysim.core.units import (
     Delay,
     Duration,
     InnerFraction,
+    Magnitude,
     NotNegative,
     Number,
+    Options,
     Position,
     Positive,
     PositiveInt,
@@ -21,9 +23,10 @@ from skysim.core.units import (
     Spins,
     Time,
     TimeLimit,
-    ZeroOrMore,
+    Whole,
 )
 from skysim.core.yaml_reader import ExistingFile, value_at
+from skysim.scene.sections.camera import Distortion
 
 OWN = "own"  # skysim's tracker
 
@@ -126,7 +129,7 @@ class ExposureControlConfig(ConfigModel):
     step_s: Annotated[Time, Field(ge=1e-6)] = 2e-3
     min_stars: PositiveInt = 4
     overexposed_objects: PositiveInt = 4
-    saturated_px: ZeroOrMore[int] = 1
+    saturated_px: Whole = 1
 
     def check(self) -> None:
         if self.shortest_s > self.longest_s:
@@ -240,7 +243,7 @@ class TrackerConfig(ConfigModel):
     """
 
     name: Annotated[str, Field(pattern=r"^\w[\w.-]*$")] = OWN
-    options: dict[str, bool | int | Number | str] = Field(default_factory=dict)
+    options: Options = Field(default_factory=dict)
     time_limit_s: TimeLimit = 10.0
     detector: str | None = None
     centroider: str | None = None
@@ -252,10 +255,10 @@ class TrackerConfig(ConfigModel):
     min_area_px: PositiveInt = 3
     intensity_threshold: InnerFraction = 0.04
     catalog: str = "hipparcos_hp6.5"
-    limit_mag: Number = 6.0
+    limit_mag: Magnitude = 6.0
     centroid_sigma_px: Positive | None = None
     assumed_focal_length_m: PositiveLength | None = None
-    assumed_distortion: tuple[Number, Number, Number, Number, Number] | None = None
+    assumed_distortion: Distortion | None = None
     assumed_row_time_s: Delay | None = None
     gyro: bool = False
     orbit_velocity: bool = True

@@ -8,7 +8,6 @@ from skysim.core.errors import InputError
 from skysim.core.tolerance import NumberError
 from skysim.core.units import (
     AboveZero,
-    Angles,
     ConfigModel,
     Damping,
     Delay,
@@ -26,6 +25,7 @@ from skysim.core.units import (
     PositiveLength,
     QuadraticDrag,
     Seed,
+    Signed,
     Speed,
     Spin,
     Spins,
@@ -72,7 +72,7 @@ class WheelsConfig(ConfigModel):
     stiction_nm: TorqueLevel = 0.0
     static_imbalance_kg_m: ZeroOrMore[Imbalance] = 0.0
     dynamic_imbalance_kg_m2: ZeroOrMore[Inertia] = 0.0
-    start_rpm: tuple[Number, ...] = ()
+    start_rpm: tuple[Signed, ...] = ()
 
     def check(self) -> None:
         if any(abs(rpm) > self.speed_limit_rpm for rpm in self.start_rpm):
@@ -163,7 +163,7 @@ class CmgsConfig(ConfigModel):
     gimbal_rate_limit_deg_s: Positive = 60.0
     gimbal_time_constant_s: LagTime = 0.01
     steering: Literal["pseudo_inverse", "singularity_robust"] = "singularity_robust"
-    start_deg: tuple[Number, ...] = ()
+    start_deg: tuple[Spin, ...] = ()
     rotor_torque_limit_nm: TorqueLimit | None = None
 
 
@@ -291,7 +291,7 @@ class ImuConfig(ConfigModel):
     gyro: GyroConfig = GyroConfig()
     accelerometer: AccelerometerConfig = AccelerometerConfig()
     earth_rate: Literal["none", "uncompensated", "compensated"] = "none"
-    home_error_deg: Angles = (0.0, 0.0, 0.0)
+    home_error_deg: Spins = (0.0, 0.0, 0.0)
     hardware_seed: Seed = 200
 
 
@@ -310,8 +310,8 @@ class GimbalsConfig(ConfigModel):
         Play of the gears, through which an axis does not follow after each reversal
     """
 
-    azimuth_deg: tuple[Number, Number] = (-180.0, 180.0)
-    elevation_deg: tuple[Number, Number] = (-90.0, 90.0)
+    azimuth_deg: tuple[Signed, Signed] = (-180.0, 180.0)
+    elevation_deg: tuple[Spin, Spin] = (-90.0, 90.0)
     rate_limit_deg_s: Positive = 30.0
     resolution_arcsec: NotNegative = 0.0
     backlash_arcsec: NotNegative = 0.0

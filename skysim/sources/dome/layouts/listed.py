@@ -58,7 +58,7 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     Raises
     ------
     InputError
-        For a place more than 5 cm off the surface or beyond the cap, and for two LEDs of a file at one place.
+        For a place more than 5 cm off the surface or beyond the cap, and for two LEDs at one place.
     """
     level: Floats | None = np.array(config.levels or relative_levels(config.magnitudes or ()))
     number: Ints | None = None
@@ -71,7 +71,8 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     # Places are used as they are; directions are projected from the bearing.
     are_places = coordinates.shape[1] == 3
     directions = coordinates if are_places else directions_from_angles(coordinates)
-    if config.file and (pairs := cKDTree(directions).query_pairs(SAME_PLACE)):
+    # A file is measured, with errors; the numbers of a list are exact, and stars of a display are close.
+    if pairs := cKDTree(directions).query_pairs(SAME_PLACE if config.file else 1e-6):
         first, second = min(pairs)
         raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
     check_cap(key, directions, config.cap_deg)
