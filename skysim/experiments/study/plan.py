@@ -24,12 +24,14 @@ from skysim.core.errors import InputError
 from skysim.core.plugins import Programs
 from skysim.core.types import frozen
 from skysim.core.units import (
+    BY_KIND,
     ConfigModel,
     Declination,
     Delay,
     Duration,
     Fraction,
     InnerFraction,
+    NotEmpty,
     NotNegative,
     Number,
     PositiveInt,
@@ -132,12 +134,10 @@ class AxisConfig(ConfigModel):
     body: Triple | None = None
     camera: Triple | None = None
 
-    @model_validator(mode="after")
-    def check_vector(self) -> AxisConfig:
+    def check(self) -> None:
         given = [vector for vector in (self.body, self.camera) if vector is not None]
         if len(given) != 1 or not any(given[0]):
             raise InputError("", "", "one of body and camera, a vector that is not zero")
-        return self
 
 
 def axis_tag(value: Any) -> str:
@@ -249,7 +249,7 @@ class FlightTrial(ConfigModel):
     settle_s: Delay = 0.0
 
 
-Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator="kind")]
+Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, BY_KIND]
 
 
 class Budget(ConfigModel):
@@ -326,7 +326,7 @@ class Heat(FigureKeys):
     value: str
 
 
-Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
+Figure = Annotated[Curve | Heat | Map, BY_KIND]
 
 
 class Threshold(Selection):
@@ -438,7 +438,7 @@ class Study(ConfigModel):
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()
     paired: bool = True
-    responses: Annotated[tuple[str, ...], Field(min_length=1)]
+    responses: NotEmpty[str]
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()
