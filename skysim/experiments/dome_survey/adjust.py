@@ -23,7 +23,6 @@ from skysim.core.types import Bools, Floats
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
-    led_sigma_m,
     light_table,
     stray_lights,
 )
@@ -35,7 +34,6 @@ from skysim.experiments.dome_survey.survey_frames import (
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
-    SurveyUncertainty,
     assumed,
 )
 from skysim.simulation.flight import Progress
@@ -67,10 +65,9 @@ MAX_DISPLACEMENT_M = 0.1  # greatest distance of an LED from its place in the li
 def run_survey(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     watch: Progress | None = None,
 ) -> SurveyRun:
-    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
+    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with its uncertainty.
 
     Parameters
     ----------
@@ -84,27 +81,25 @@ def run_survey(
         the prior lacks.
     """
     try:
-        run = survey_in_rounds(frames, prior, uncertainty, watch)
+        run = survey_in_rounds(frames, prior, watch)
     except InputError:
-        check_lens(frames, prior, uncertainty)
+        check_lens(frames, prior)
         raise
     if run.survey.noise_scale > MAX_NOISE_SCALE:
-        check_lens(frames, prior, uncertainty)
+        check_lens(frames, prior)
     return run
 
 
-def check_lens(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
-) -> None:
+def check_lens(frames: Sequence[SurveyFrame], prior: CalibrationPrior) -> None:
     """Raise InputError if the frames are those of a lens whose distortion the survey does not model.
 
     More frames would not help: a survey that fits the distortion succeeds, and finds another one than assumed.
     """
-    if uncertainty.fit_distortion:
+    if prior.uncertainty.fit_distortion:
         return
+    fitted = prior._replace(uncertainty=prior.uncertainty._replace(fit_distortion=True))
     try:
-        fitted = uncertainty._replace(fit_distortion=True)
-        survey = survey_in_rounds(frames, prior, fitted).survey
+        survey = survey_in_rounds(frames, fitted).survey
     except InputError:
         return
     sigma = lens_sigma(survey)[3:7]
@@ -121,7 +116,6 @@ def check_lens(
 def survey_in_rounds(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     watch: Progress | None = None,
 ) -> SurveyRun:
     """As `run_survey`, with the lens model as it is."""
@@ -133,19 +127,17 @@ def survey_in_rounds(
             (replace(frames[row], body_from_lab=start[row]), match)
             for row, match in zip(rows, matches, strict=True)
         ]
-        selected, survey = adjust_connected(pairs, prior, uncertainty, before)
+        selected, survey = adjust_connected(pairs, prior, before)
         rows = [rows[k] for k in selected]
         matches = [matches[k] for k in selected]
         start.update(zip(rows, survey.body_from_lab, strict=True))
-        return with_names(
-            SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
-        )
+        return with_names(SurveyRun(survey, frames, rows, matches, listed, prior))
 
     listed = prior.leds
-    before = assumed(prior, uncertainty)
+    before = assumed(prior)
     total = ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
-    run = adjusted(*identified_by_imu(frames, prior, uncertainty), prior)
+    run = adjusted(*identified_by_imu(frames, prior), prior)
     for completed in range(1, total):
         if watch:
             watch(completed, total)
@@ -193,10 +185,10 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
 
 
 def identified_by_imu(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior
 ) -> tuple[list[int], list[Correspondences]]:
     """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
-    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    matches = [match_by_imu(frame, prior) for frame in frames]
     shares = [
         matched_share(frame, match, prior)
         for frame, match in zip(frames, matches, strict=True)
@@ -230,9 +222,9 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     """
     survey = run.survey
     prior = run.prior
-    model = prior._replace(camera=survey.camera, leds=survey.leds, lever=survey.lever)
+    model = run.found
     # The attitudes are adjusted, so only the errors of the map and of the residuals remain in the predictions.
-    map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
+    map_px = run.accuracy.led_sigma_m * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
         row: frame
@@ -244,13 +236,13 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
         if match is None or matched_share(tied[row], match, model) < MIN_MATCHED:
-            match = match_by_imu(frame, model, run.uncertainty_after, sigma_px)
+            match = match_by_imu(frame, model, sigma_px)
             if matched_share(frame, match, model) < MIN_MATCHED:
                 continue
         rows.append(row)
         matches.append(match)
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, model._replace(leds=prior.leds)
+    return rows, matches, prior._replace(camera=survey.camera, lever=survey.lever)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -318,7 +310,6 @@ def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
 def adjust_connected(
     pairs: Sequence[tuple[SurveyFrame, Correspondences]],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     before: Assumed,
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
@@ -344,8 +335,8 @@ def adjust_connected(
                 prior.leds,
                 prior.lever,
                 prior.camera,
-                fit_distortion=uncertainty.fit_distortion,
-                leds_sigma_m=uncertainty.led_sigma_m,
+                fit_distortion=prior.uncertainty.fit_distortion,
+                leds_sigma_m=prior.uncertainty.led_sigma_m,
                 fit_noise=True,
                 assumed=before,
             )
@@ -416,14 +407,15 @@ def lens_sigma(survey: DomeSurvey) -> Floats:
     return np.concatenate([fitted, np.zeros(8 - len(fitted))])
 
 
-def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
+def dome_map(run: SurveyRun) -> DomeMap:
     """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
+    survey = run.survey
     leds = survey.surveyed_leds
     focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(survey).tolist()
     return DomeMap(
         id=leds.id,
         position_m=leds.position_m,
-        sigma_m=led_sigma_m(survey, uncertainty)[survey.surveyed],
+        sigma_m=run.accuracy.led_sigma_m[survey.surveyed],
         camera_body_m=survey.lever.camera_body_m,
         lever_sigma_m=math.sqrt(np.trace(survey.lever_covariance_m2) / 3),
         size_px=(survey.camera.width_px, survey.camera.height_px),

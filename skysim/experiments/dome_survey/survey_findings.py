@@ -25,7 +25,6 @@ from skysim.experiments.dome_survey.survey_frames import (
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
-    SurveyUncertainty,
     survey_model,
 )
 from skysim.results.metrics import rms
@@ -65,7 +64,6 @@ class SurveyRun:
     matches: list[Correspondences]
     listed: LedMap
     prior: CalibrationPrior
-    uncertainty: SurveyUncertainty
 
     @property
     def frames(self) -> list[SurveyFrame]:
@@ -104,22 +102,31 @@ class SurveyRun:
 
     @property
     def accuracy(self) -> SurveyAccuracy:
-        """The standard deviations of the survey."""
+        """The standard deviations of the survey: of an LED's position, RMS of three axes.
+
+        That of an LED that is not surveyed is as before.
+        """
         survey = self.survey
+        variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
+        before_m2 = self.prior.uncertainty.led_sigma_m**2
         return SurveyAccuracy(
             survey.surveyed,
-            led_sigma_m(survey, self.uncertainty),
+            np.sqrt(np.where(survey.surveyed, variance_m2, before_m2)),
             np.sqrt(np.diag(survey.lever_covariance_m2)),
             np.sqrt(np.diag(survey.lens_covariance)),
         )
 
     @property
-    def uncertainty_after(self) -> SurveyUncertainty:
-        """The uncertainty of the IMU and of unmeasured LEDs as before, and of lever and lens as found."""
+    def found(self) -> CalibrationPrior:
+        """The model found; the uncertainty of IMU and unmeasured LEDs is as before, that of lever and lens as found."""
         accuracy = self.accuracy
-        return self.uncertainty._replace(
+        survey = self.survey
+        after = self.prior.uncertainty._replace(
             lever_sigma_m=float(rms(accuracy.lever_sigma_m)),
-            focal_error=float(accuracy.lens_sigma[0] / self.survey.camera.focal_px),
+            focal_error=float(accuracy.lens_sigma[0] / survey.camera.focal_px),
+        )
+        return self.prior._replace(
+            camera=survey.camera, leds=survey.leds, lever=survey.lever, uncertainty=after
         )
 
 
@@ -129,12 +136,6 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     for row, match in zip(out, matches, strict=True):
         row[match.led] = True
     return out
-
-
-def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
-    """(N,) standard deviation of each LED's position, RMS of three axes; as before the survey if not surveyed."""
-    variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
-    return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
 
 
 def stray_lights(run: SurveyRun) -> list[StrayLight]:
@@ -221,20 +222,18 @@ class Coverage(NamedTuple):
 def coverage(run: SurveyRun) -> Coverage:
     """The coverage of a survey."""
     survey = run.survey
-    model = survey_model(survey, run.uncertainty, run.noise_px)
+    known = run.found._replace(uncertainty=run.prior.uncertainty)
+    model = survey_model(known, run.noise_px)
     return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
 
 
 def coverage_before(
-    frames: Sequence[SurveyFrame],
-    prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
-    noise_px: float,
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior, noise_px: float
 ) -> Coverage:
     """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and predicted accuracy."""
-    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    matches = [match_by_imu(frame, prior) for frame in frames]
     held = Rotation.concatenate([frame.body_from_lab for frame in frames])
-    model = survey_model(prior, uncertainty, noise_px)
+    model = survey_model(prior, noise_px)
     seen = identified(matches, len(prior.leds.id))
     return Coverage(model, held, seen, predicted(model, held, seen))
 
