@@ -59,6 +59,7 @@ PLAUSIBLE = 6.0
 LEAST_SHARE = 0.1
 # Factor by which residuals may exceed the noise of the centroids before the lens is doubted.
 MAX_NOISE_SCALE = 3.0
+Matches = dict[int, Correspondences]  # by row of the frame
 MAX_DISPLACEMENT_M = 0.1  # greatest distance of an LED from its place in the list
 
 
@@ -120,24 +121,22 @@ def survey_in_rounds(
 ) -> SurveyRun:
     """As `run_survey`, with the lens model as it is."""
 
-    def adjusted(
-        rows: list[int], matches: list[Correspondences], prior: CalibrationPrior
-    ) -> SurveyRun:
+    def adjusted(matches: Matches, prior: CalibrationPrior) -> SurveyRun:
         pairs = [
             (replace(frames[row], body_from_lab=start[row]), match)
-            for row, match in zip(rows, matches, strict=True)
+            for row, match in matches.items()
         ]
         selected, survey = adjust_connected(pairs, prior, before)
-        rows = [rows[k] for k in selected]
-        matches = [matches[k] for k in selected]
-        start.update(zip(rows, survey.body_from_lab, strict=True))
-        return with_names(SurveyRun(survey, frames, rows, matches, listed, prior))
+        named = list(matches.items())
+        kept = dict(named[k] for k in selected)
+        start.update(zip(kept, survey.body_from_lab, strict=True))
+        return with_names(SurveyRun(survey, frames, kept, listed, prior))
 
     listed = prior.leds
     before = assumed(prior)
     total = ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
-    run = adjusted(*identified_by_imu(frames, prior), prior)
+    run = adjusted(identified_by_imu(frames, prior), prior)
     for completed in range(1, total):
         if watch:
             watch(completed, total)
@@ -184,10 +183,8 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
             )
 
 
-def identified_by_imu(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior
-) -> tuple[list[int], list[Correspondences]]:
-    """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
+def identified_by_imu(frames: Sequence[SurveyFrame], prior: CalibrationPrior) -> Matches:
+    """The correspondences of the frames that the IMU's attitudes identify, by row. Raises InputError for none."""
     matches = [match_by_imu(frame, prior) for frame in frames]
     shares = [
         matched_share(frame, match, prior)
@@ -201,7 +198,7 @@ def identified_by_imu(
             f"in none of the {len(frames)} frames do the lights fit the LEDs of the list",
             "attitudes, LEDs and a camera that are true within the uncertainties",
         )
-    return rows, [matches[row] for row in rows]
+    return {row: matches[row] for row in rows}
 
 
 def matched_share(
@@ -214,8 +211,8 @@ def matched_share(
     return min(1.0, len(match.led) / max(1, min(len(frame.lights), visible)))
 
 
-def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
-    """Rows of the frames that are identified, their matches by the adjusted model, and that model.
+def rematched(run: SurveyRun) -> tuple[Matches, CalibrationPrior]:
+    """The matches of the frames that are identified, by the adjusted model, and that model.
 
     A frame that was left out, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
     matched again with the IMU's attitude, since lever and lens now are known better.
@@ -228,21 +225,19 @@ def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], Calibra
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
         row: frame
-        for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True)
+        for row, frame, ok in zip(run.matches, run.frames, survey.tied, strict=True)
         if ok
     }
-    rows = []
-    matches = []
+    matches = {}
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
         if match is None or matched_share(tied[row], match, model) < MIN_MATCHED:
             match = match_by_imu(frame, model, sigma_px)
             if matched_share(frame, match, model) < MIN_MATCHED:
                 continue
-        rows.append(row)
-        matches.append(match)
+        matches[row] = match
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, prior._replace(camera=survey.camera, lever=survey.lever)
+    return matches, prior._replace(camera=survey.camera, lever=survey.lever)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -270,7 +265,10 @@ def with_names(run: SurveyRun) -> SurveyRun:
         surveyed=survey.surveyed[order],
         common_m=survey.common_m[:, order],
     )
-    matches = [Correspondences(match.light, name[match.led]) for match in run.matches]
+    matches = {
+        row: Correspondences(match.light, name[match.led])
+        for row, match in run.matches.items()
+    }
     return replace(run, survey=renamed, matches=matches)
 
 

@@ -49,8 +49,8 @@ class SurveyRun:
     ----------
     taken
         All frames, with the IMU's attitudes
-    rows
-        Rows of `taken` that are in the survey
+    matches
+        Correspondences of the frames in the survey, by their rows in `taken`
     listed
         The LEDs before the survey
     prior
@@ -60,15 +60,14 @@ class SurveyRun:
 
     survey: DomeSurvey
     taken: Sequence[SurveyFrame]
-    rows: list[int]
-    matches: list[Correspondences]
+    matches: dict[int, Correspondences]
     listed: LedMap
     prior: CalibrationPrior
 
     @property
     def frames(self) -> list[SurveyFrame]:
         """The frames of the survey, with their adjusted attitudes."""
-        pairs = zip(self.rows, self.survey.body_from_lab, strict=True)
+        pairs = zip(self.matches, self.survey.body_from_lab, strict=True)
         return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
 
     @property
@@ -83,7 +82,7 @@ class SurveyRun:
         frame, row = self.survey.outliers.T
         return [
             Correspondences(*(np.delete(part, row[frame == k]) for part in match))
-            for k, match in enumerate(self.matches)
+            for k, match in enumerate(self.matches.values())
         ]
 
     @property
