@@ -150,7 +150,7 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
     )
 
 
-def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
+def table(rows: list[FrameRow], scene: Scene) -> Any:
     """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
@@ -159,7 +159,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")
     }
-    for n, name in enumerate(names):
+    for n, name in enumerate(angle_names(scene)):
         columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
         columns[f"{name.lower()}_deg"] = [(row.estimate_deg or missing)[n] for row in rows]
     for name in (
