@@ -449,8 +449,7 @@ def measured_attitudes(
     R_body_from_cam = body_from_cam.as_matrix()
     rows = []
     for shot in flight.shots(cameras=[0], progress=watch):
-        assert shot.report is not None
-        attitude = shot.report.attitude
+        attitude = shot.solution.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
             parts = [
                 np.zeros((3, 3)) if one is None else R_body_from_cam @ one @ R_body_from_cam.T

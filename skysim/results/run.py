@@ -59,10 +59,10 @@ class Recorder:
 
     def add(self, score: Score) -> None:
         """Write one solved frame with its truth and add it to the tables."""
-        assert score.shot.report is not None
-        self.write(score.shot.frame, score.truth)
+        shot = score.shot
+        self.write(shot.frame, score.truth)
         self.rows.append(score.row)
-        for stage, seconds in (score.shot.seconds | score.shot.report.seconds).items():
+        for stage, seconds in (shot.seconds | shot.solution.seconds).items():
             self.seconds.setdefault(stage, []).append(seconds)
         if self.shown is None or score.attitude.solved:
             self.shown = score

@@ -206,9 +206,8 @@ class Score:
     """
 
     def __init__(self, shot: Shot) -> None:
-        assert shot.report is not None
         self.shot = shot
-        self.row = row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status)
+        self.row = row(shot.camera, shot.frame, shot.truth, shot.solution, shot.update_status)
 
     @property
     def image(self) -> NDArray[Any]:
@@ -223,8 +222,7 @@ class Score:
     @property
     def attitude(self) -> Attitude:
         """The tracker's solution; if it has no attitude, its `status` gives the reason."""
-        assert self.shot.report is not None
-        return self.shot.report.attitude
+        return self.shot.solution.attitude
 
     @property
     def error_arcsec(self) -> float:

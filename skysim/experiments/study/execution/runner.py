@@ -433,10 +433,9 @@ def replay_flight(
     with trials.trial_flight(setup, seed) as flight:
         recorder = Recorder(folder, flight.lab.camera)
         for shot in flight.shots(cameras=[0]):
-            assert shot.report is not None
             recorder.add(scoring.Score(shot))
             if shot.frame.index < MAX_FRAMES:
-                write_annotated(folder, shot.frame, shot.truth, shot.report)
+                write_annotated(folder, shot.frame, shot.truth, shot.solution)
         if not recorder.rows:
             return []
         log = flight.telemetry()
@@ -469,8 +468,7 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
     if isinstance(trial, FlightTrial):
         with trials.trial_flight(setup, seed) as flight:
             shot = next(flight.shots(cameras=[0]))
-            assert shot.report is not None
-            return shot.frame, shot.truth, shot.report
+            return shot.frame, shot.truth, shot.solution
     frame, truth, streak_px = trials.render_trial_frame(setup, seed)
     solve = partial(trials.lost_in_space, setup, frame, truth, streak_px)
     return frame, truth, solve_or_failed(solve)
