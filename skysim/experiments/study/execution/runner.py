@@ -135,7 +135,8 @@ class ChunkQueue:
         self.missing = missing
         self.first = first
         self.spec = plan.spec
-        self.seconds = chunk_seconds(workers)
+        # In proportion to the workers beyond MANY, so that coordination is not the limit.
+        self.seconds = CHUNK_S * max(1.0, workers / MANY)
         self.position = 0
         self.size = 1
         apart = (np.diff(missing) != 1) | (missing[1:] % replicates == 0)
@@ -170,11 +171,6 @@ class ChunkQueue:
         count = sum(len(segment.replicates) for segment in chunk)
         size = int(self.seconds * count / max(seconds, 1e-6))
         self.size = int(np.clip(size, 1, min(2 * max(count, self.size), MAX_CHUNK)))
-
-
-def chunk_seconds(workers: int) -> float:
-    """Run time of a chunk, proportional to the number of workers beyond MANY, so that coordination is not the limit."""
-    return CHUNK_S * max(1.0, workers / MANY)
 
 
 def prepare_store(
