@@ -200,22 +200,13 @@ class Coverage(NamedTuple):
     held, seen
         body_from_lab of F frames, and (F, N) mask of the LEDs in them
     accuracy
-        Accuracy of the survey, or predicted before it; None if the frames are too few
+        Accuracy of the survey, or predicted before it; no LED is measured if the frames are too few
     """
 
     model: SurveyModel
     held: Rotation
     seen: Bools
-    accuracy: SurveyAccuracy | None
-
-    @property
-    def measured(self) -> Bools:
-        """(N,) LEDs that are surveyed."""
-        return (
-            np.zeros(len(self.model.leds.id), dtype=bool)
-            if self.accuracy is None
-            else self.accuracy.measured
-        )
+    accuracy: SurveyAccuracy
 
 
 def coverage(run: SurveyRun) -> Coverage:
@@ -238,14 +229,11 @@ def coverage_before(
 
 
 class NextStops(NamedTuple):
-    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them.
-
-    It is None if they do not determine the unknowns.
-    """
+    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them (`predicted`)."""
 
     lab_from_body: Rotation
     shown: Bools
-    accuracy: SurveyAccuracy | None
+    accuracy: SurveyAccuracy
 
 
 def next_stops(
@@ -262,14 +250,14 @@ def next_stops(
     return NextStops(further, shown, predicted(model, attitudes, seen))
 
 
-def predicted(
-    model: SurveyModel, body_from_lab: Rotation, seen: Bools
-) -> SurveyAccuracy | None:
-    """The accuracy predicted; None if the frames do not determine the unknowns."""
+def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyAccuracy:
+    """The accuracy predicted; no LED is measured if the frames do not determine the unknowns."""
     try:
         return survey_plan.predict(model, body_from_lab, seen)
     except ValueError:
-        return None
+        before_m = np.full(seen.shape[1], model.leds_sigma_m)
+        measured = np.zeros_like(before_m, dtype=bool)
+        return SurveyAccuracy(measured, before_m, np.empty(0), np.empty(0))
 
 
 # --- faults -------------------------------------------------------------------------------------------------
@@ -425,12 +413,7 @@ def attitude_rows(run: SurveyRun, names: Sequence[str]) -> list[Record]:
 def coverage_statistics(so_far: Coverage) -> Record:
     """Counts and errors of a coverage, one row for each LED."""
     frames = so_far.seen.sum(axis=0)
-    measured = so_far.measured
-    sigma_m = (
-        so_far.accuracy.led_sigma_m
-        if so_far.accuracy
-        else np.full(len(measured), so_far.model.leds_sigma_m)
-    )
+    measured = so_far.accuracy.measured
     return {
         "leds": len(frames),
         "measured": int(measured.sum()),
@@ -440,7 +423,7 @@ def coverage_statistics(so_far: Coverage) -> Record:
             led=so_far.model.leds.id,
             frames=frames,
             measured=measured,
-            sigma_mm=1e3 * sigma_m,
+            sigma_mm=1e3 * so_far.accuracy.led_sigma_m,
         ),
     }
 
@@ -451,9 +434,9 @@ def rows_of_columns(**columns: ArrayLike) -> list[Record]:
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
+def accuracy_statistics(accuracy: SurveyAccuracy) -> Record:
     """Number of measured LEDs, rms errors of LEDs and lever in mm, and of focal length in px; None if undetermined."""
-    if accuracy is None:
+    if not accuracy.measured.any():
         return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
     return {
         "measured": int(accuracy.measured.sum()),

@@ -79,8 +79,8 @@ class HeldAttitudes(NamedTuple):
     margin_px: float
     in_reach: Bools
 
-    def first(self, count: int) -> SurveyAccuracy | None:
-        """The accuracy predicted after the first `count` frames; None if they do not determine the unknowns."""
+    def first(self, count: int) -> SurveyAccuracy:
+        """The accuracy predicted after the first `count` frames."""
         return predicted(self.model, self.lab_from_body[:count].inv(), self.shown[:count])
 
     def counts(self, count: int) -> Record:
@@ -112,7 +112,7 @@ class HeldAttitudes(NamedTuple):
             "measured_range": [round(end) for end in np.quantile(found, [0.025, 0.975])],
         }
 
-    def steps(self) -> list[tuple[int, SurveyAccuracy | None]]:
+    def steps(self) -> list[tuple[int, SurveyAccuracy]]:
         """The accuracy predicted after a quarter, a half, three quarters and all of the frames."""
         total = len(self.lab_from_body)
         counts = sorted({max(round(total * part / 4), 2) for part in range(1, 5)})

@@ -212,7 +212,7 @@ def survey_plan(
     return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
 
 
-def plan_step(count: int, accuracy: SurveyAccuracy | None) -> PlanStep:
+def plan_step(count: int, accuracy: SurveyAccuracy) -> PlanStep:
     """Number of frames; predicted after them, the number of LEDs measured and their rms error in mm."""
     statistics = survey_findings.accuracy_statistics(accuracy)
     return count, int(statistics["measured"] or 0), statistics["led_mm"]
