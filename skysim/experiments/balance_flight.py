@@ -186,7 +186,9 @@ def uncertain(
     """
     values = estimate.values
     sigma = estimate.sigma
-    rate_deg_s = largest_rates_deg_s(records)
+    # The largest rate about each body axis between two attitudes.
+    rates = [turn_rates(one.t_s, one.lab_from_body) for one in records]
+    rate_deg_s = np.degrees(np.abs(np.concatenate(rates)).max(axis=0))
     tilt_deg = largest_tilt_deg(records)
     faults = []
     for axis in range(3):
@@ -236,12 +238,6 @@ def remedy(
     longer = math.ceil(10 * 1.05 * factor * excitation.longer) / 10
     by_tilt = f"--tilt {tilt_deg:g}, or " if tilt_deg <= excitation.most_deg else ""
     return f"fly again with {by_tilt}--longer {longer:g}"
-
-
-def largest_rates_deg_s(records: Sequence[BearingRecord]) -> Floats:
-    """(3,) largest rate about each body axis between two attitudes."""
-    rates = [turn_rates(one.t_s, one.lab_from_body) for one in records]
-    return np.degrees(np.abs(np.concatenate(rates)).max(axis=0))
 
 
 def turn_rates(t_s: Floats, lab_from_body: Rotation) -> Floats:
@@ -449,8 +445,7 @@ def measured_attitudes(
     R_body_from_cam = body_from_cam.as_matrix()
     rows = []
     for shot in flight.shots(cameras=[0], progress=watch):
-        assert shot.report is not None
-        attitude = shot.report.attitude
+        attitude = shot.solution.attitude
         if attitude.cam_from_ref is not None and attitude.covariance_rad2 is not None:
             parts = [
                 np.zeros((3, 3)) if one is None else R_body_from_cam @ one @ R_body_from_cam.T

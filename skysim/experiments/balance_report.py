@@ -35,10 +35,9 @@ from skysim.results.report_blocks import (
     Verdict,
     text_column,
 )
-from skysim.results.telemetry_report import EULER, euler_deg
+from skysim.results.telemetry_report import AXES, EULER, euler_deg
 
 INERTIA_NAMES = ("Jxx", "Jyy", "Jzz", "Jxy", "Jxz", "Jyz")
-MOMENT_NAMES = ("x", "y", "z")
 
 
 def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -> Record:
@@ -93,7 +92,7 @@ def true_values(flight: BalanceFlight) -> Floats:
 def estimate_rows(flight: BalanceFlight, estimate: MassEstimate) -> list[Record]:
     """One row per mass property, of the vehicle with its trim masses at zero: offsets in micrometers."""
     scale = np.repeat([1.0, 1e6 / flight.vehicle.mass.mass_kg], [6, 3])
-    names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in MOMENT_NAMES))
+    names = (*INERTIA_NAMES, *(f"offset {axis} um" for axis in AXES))
     columns = scale * [estimate.values[:9], estimate.sigma[:9], true_values(flight)]
     return [
         {"what": name, "estimate": value, "sigma": sigma, "truth": truth}
@@ -121,7 +120,7 @@ def draw_flights(fig: Any, statistics: Record, record: BearingRecord) -> None:
         torque.semilogy(numbers, [row[key] for row in rows], style, label=label)
     torque.axhline(statistics["torque_bar_nm"], color="0.5", linestyle=":")
     torque.set(xlabel="flight", ylabel="largest gravity torque [N m]", xticks=numbers)
-    for axis, name in enumerate(MOMENT_NAMES):
+    for axis, name in enumerate(AXES):
         values, sigma = (
             [row[key][axis] for row in rows] for key in ("offset_um", "offset_sigma_um")
         )

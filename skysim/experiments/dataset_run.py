@@ -7,7 +7,6 @@ continues: frames that are made again have the same bytes.
 
 import json
 import tarfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -415,7 +414,7 @@ def run(
         if shard_name("", shard, "parquet")[1:] not in there
     ]
     left = sum(len(plan.frames_of(shard)) for shard in missing)
-    progress = Progress(plan.frames, plan.frames - left, began=time.perf_counter())
+    progress = Progress(plan.frames, plan.frames - left)
     for results in engine.run(DatasetJob(plan, url), ShardQueue(missing)) if missing else ():
         for result in results:
             progress.done += result.frames

@@ -150,7 +150,7 @@ def write_scores(
     for name, tracker_rows in rows.items():
         files.write_table(
             folder / f"solutions.{name}.ecsv",
-            scoring.table(tracker_rows, scoring.angle_names(scene)),
+            scoring.table(tracker_rows, scene),
         )
     board = Table(as_dicts(scores))
     del board["refusals"]

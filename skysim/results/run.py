@@ -22,7 +22,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check, check
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab, StarCamera
-from skysim.tracking.computer_time import computer_text, on_computer
+from skysim.tracking.computer_time import on_computer
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -59,10 +59,10 @@ class Recorder:
 
     def add(self, score: Score) -> None:
         """Write one solved frame with its truth and add it to the tables."""
-        assert score.shot.report is not None
-        self.write(score.shot.frame, score.truth)
+        shot = score.shot
+        self.write(shot.frame, score.truth)
         self.rows.append(score.row)
-        for stage, seconds in (score.shot.seconds | score.shot.report.seconds).items():
+        for stage, seconds in (shot.seconds | shot.solution.seconds).items():
             self.seconds.setdefault(stage, []).append(seconds)
         if self.shown is None or score.attitude.solved:
             self.shown = score
@@ -97,8 +97,7 @@ class Recorder:
         Returns the report, and before it what `skysim run --json` prints.
         """
         scene = self.camera.scene
-        names = scoring.angle_names(scene)
-        write_table(self.folder / "solutions.ecsv", scoring.table(self.rows, names))
+        write_table(self.folder / "solutions.ecsv", scoring.table(self.rows, scene))
         write_table(self.folder / "telemetry.ecsv", telemetry_report.table(log))
         if imu_samples:
             write_table(self.folder / "imu.ecsv", telemetry_report.imu_table(imu_samples))
@@ -111,24 +110,18 @@ class Recorder:
         computer = scene.tracker.computer
         has_plot = len(self.rows) > 1 or log.t_s[-1] > SHORT_S
         flight = telemetry_report.figure(log) if has_plot else b""
-        facts = [(name, [text]) for name, text in scene.summary] + [
-            (fact.name, fact.lines) for fact in plan.facts
-        ]
         motion = telemetry_report.summary(log)
         flown = telemetry_report.findings(log)
         judged = requirements.of_run(scene.require, self.rows, plan.facts)
         report = run_report.run_report(
-            scene.title,
+            scene,
+            plan,
             command,
-            names,
             self.rows,
             stages_ms=stages_ms,
-            computer=computer_text(computer, stages_ms) if computer else "",
             annotated=annotated,
             motion=run_report.motion_section(motion, flown, flight),
             views=pictures,
-            facts=facts,
-            findings=plan.findings,
             judged=judged,
         )
         page = report.save(self.folder / "report.html")
@@ -202,7 +195,7 @@ class Run(Sequence[Score]):
 
     def table(self) -> Table:
         """One row per frame, as in `solutions.ecsv`: angles in degrees, errors in arcseconds."""
-        return scoring.table(self.rows, scoring.angle_names(self.scene))
+        return scoring.table(self.rows, self.scene)
 
     def to_pandas(self) -> pd.DataFrame:
         """`table` as a data frame; needs pandas."""

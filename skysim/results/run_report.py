@@ -28,6 +28,9 @@ from skysim.results.report_blocks import (
     text_column,
 )
 from skysim.results.requirements import NOT_MET, Judgment
+from skysim.scene.scene import Scene
+from skysim.simulation.checks import Check
+from skysim.tracking.computer_time import computer_text
 
 Rows = Sequence[FrameRow]
 # Settings that help where the tracker's own refusal names none.
@@ -62,38 +65,31 @@ MOTION = {  # sentences of the motion's statistics, by the statistic that a scen
 
 
 def run_report(
-    title: str,
+    scene: Scene,
+    plan: Check,
     command: str,
-    angles: tuple[str, str, str],
     rows: Rows,
     *,
     stages_ms: Mapping[str, float],
-    computer: str,
     annotated: Picture,
     motion: Section,
     views: Sequence[Path],
-    facts: Sequence[tuple[str, Sequence[str]]],
-    findings: Sequence[str],
     judged: Sequence[Judgment],
 ) -> Report:
     """The report of a run. A single frame has no plot against time.
 
     Parameters
     ----------
-    angles
-        Names of the three angles of a row
+    plan
+        The check of the scene, whose facts and warnings are shown
     stages_ms
         Median time by stage
-    computer
-        Sentence on the times on another computer
     annotated
         The last solved frame with its markers, BGR
     motion
         Section of `motion_section`
     views
         Image files of the laboratory in 3-D
-    facts, findings
-        Names and lines of the scene's table, and the check's warnings
     judged
         Judgments of the scene's requirements
     """
@@ -102,9 +98,14 @@ def run_report(
         Figure(path.read_bytes(), "the laboratory in 3-D", path.suffix[1:]) for path in views
     ]
     errors = [Figure(error_figure(rows), ERROR_CAPTION)] if len(rows) > 1 else []
+    findings = plan.findings
     warned = f"The check of the plan warns: {len(findings)}, see below." if findings else ""
+    facts = [(name, [text]) for name, text in scene.summary]
+    facts += [(fact.name, fact.lines) for fact in plan.facts]
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages_ms.items())
-    last = [Text(f"Median ms a frame: {stages}"), Text(computer), Text(magnitude_text(rows))]
+    computer = scene.tracker.computer
+    on_it = computer_text(computer, stages_ms) if computer else ""
+    last = [Text(f"Median ms a frame: {stages}"), Text(on_it), Text(magnitude_text(rows))]
     blocks = [
         verdict(rows),
         required(judged, rows),
@@ -117,10 +118,15 @@ def run_report(
         Section("Scene", [Facts(facts)], on_terminal=False),
         Section("Check of the plan", [Items(findings, tone="warning")], on_terminal=False),
         Section(
-            "Frames", [frame_table(angles, rows), Items(refusals(rows, findings)), *last]
+            "Frames",
+            [
+                frame_table(scoring.angle_names(scene), rows),
+                Items(refusals(rows, findings)),
+                *last,
+            ],
         ),
     ]
-    return Report(title, blocks, command)
+    return Report(scene.title, blocks, command)
 
 
 FRAME_CAPTION = "Blue ticks: truth. Red squares: detected. Green circles: identified."

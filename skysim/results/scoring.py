@@ -150,7 +150,7 @@ def rate_errors_deg_s(rate: RateEstimate | None, truth: Truth) -> tuple[float, f
     )
 
 
-def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
+def table(rows: list[FrameRow], scene: Scene) -> Any:
     """The rows as an astropy table, one column per quantity."""
     from astropy.table import Table
 
@@ -159,7 +159,7 @@ def table(rows: list[FrameRow], names: tuple[str, str, str]) -> Any:
         name: [getattr(row, name) for row in rows]
         for name in ("frame", "t_s", "rate_deg_s", "status")
     }
-    for n, name in enumerate(names):
+    for n, name in enumerate(angle_names(scene)):
         columns[f"true_{name.lower()}_deg"] = [row.truth_deg[n] for row in rows]
         columns[f"{name.lower()}_deg"] = [(row.estimate_deg or missing)[n] for row in rows]
     for name in (
@@ -206,9 +206,8 @@ class Score:
     """
 
     def __init__(self, shot: Shot) -> None:
-        assert shot.report is not None
         self.shot = shot
-        self.row = row(shot.camera, shot.frame, shot.truth, shot.report, shot.update_status)
+        self.row = row(shot.camera, shot.frame, shot.truth, shot.solution, shot.update_status)
 
     @property
     def image(self) -> NDArray[Any]:
@@ -223,8 +222,7 @@ class Score:
     @property
     def attitude(self) -> Attitude:
         """The tracker's solution; if it has no attitude, its `status` gives the reason."""
-        assert self.shot.report is not None
-        return self.shot.report.attitude
+        return self.shot.solution.attitude
 
     @property
     def error_arcsec(self) -> float:

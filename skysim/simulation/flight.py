@@ -74,6 +74,12 @@ class Shot:
     update_status: str
     seconds: dict[str, float]
 
+    @property
+    def solution(self) -> Report:
+        """The report of an exposure that the tracker was to solve."""
+        assert self.report is not None
+        return self.report
+
 
 @frozen
 class State:

@@ -53,9 +53,7 @@ def sky_flight(folder: Path) -> Flight:
     for shot in flight.shots():
         recording.write_frame(folder, shot.frame, shot.truth, scene)
         rows.append(scoring.Score(shot).row)
-    files.write_table(
-        folder / "solutions.ecsv", scoring.table(rows, scoring.angle_names(scene))
-    )
+    files.write_table(folder / "solutions.ecsv", scoring.table(rows, scene))
     return flight
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from skysim.core.errors import printable
 from skysim.core.paths import shipped_files, title_of
 from skysim.results.report import print_blocks, print_table, print_wrapped
-from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text
+from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text, text_column
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -121,7 +121,7 @@ def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
     columns = [
-        Column("tracker", kind="text"),
+        text_column("tracker"),
         Column("frames"),
         Column("right", "%", ".1f"),
         *map(Column, ("(95 %)", "wrong", "refused", "failed")),
@@ -157,7 +157,7 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 def print_solutions(solutions: list[Record], out: Path) -> None:
     """Print the attitudes of pictures of the sky, or of a dome's LEDs, with remarks."""
-    columns = [Column("file", kind="text"), Column("status", kind="text")]
+    columns = [text_column("file"), text_column("status")]
     if "leds" in solutions[0]:
         keys = (
             "roll_deg pitch_deg yaw_deg cross_sigma_arcsec roll_sigma_arcsec matches rms_px"

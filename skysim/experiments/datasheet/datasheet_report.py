@@ -366,7 +366,7 @@ def section_blocks(section: StatementSection, statement: Statement) -> list[Bloc
     columns = [
         Column(head, kind="aside" if head == "what it is" else "number") for head in others
     ]
-    return [*texts, *figures, Table([Column(first, kind="text"), *columns], section.rows)]
+    return [*texts, *figures, Table([text_column(first), *columns], section.rows)]
 
 
 # The second page.

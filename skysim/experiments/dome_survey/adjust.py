@@ -23,7 +23,6 @@ from skysim.core.types import Bools, Floats
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
-    led_sigma_m,
     light_table,
     stray_lights,
 )
@@ -35,7 +34,6 @@ from skysim.experiments.dome_survey.survey_frames import (
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
-    SurveyUncertainty,
     assumed,
 )
 from skysim.simulation.flight import Progress
@@ -61,16 +59,16 @@ PLAUSIBLE = 6.0
 LEAST_SHARE = 0.1
 # Factor by which residuals may exceed the noise of the centroids before the lens is doubted.
 MAX_NOISE_SCALE = 3.0
+Matches = dict[int, Correspondences]  # by row of the frame
 MAX_DISPLACEMENT_M = 0.1  # greatest distance of an LED from its place in the list
 
 
 def run_survey(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     watch: Progress | None = None,
 ) -> SurveyRun:
-    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with errors of `uncertainty`.
+    """Survey LEDs, lever arm, lens and attitudes from all frames, starting from `prior` with its uncertainty.
 
     Parameters
     ----------
@@ -84,27 +82,25 @@ def run_survey(
         the prior lacks.
     """
     try:
-        run = survey_in_rounds(frames, prior, uncertainty, watch)
+        run = survey_in_rounds(frames, prior, watch)
     except InputError:
-        check_lens(frames, prior, uncertainty)
+        check_lens(frames, prior)
         raise
     if run.survey.noise_scale > MAX_NOISE_SCALE:
-        check_lens(frames, prior, uncertainty)
+        check_lens(frames, prior)
     return run
 
 
-def check_lens(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
-) -> None:
+def check_lens(frames: Sequence[SurveyFrame], prior: CalibrationPrior) -> None:
     """Raise InputError if the frames are those of a lens whose distortion the survey does not model.
 
     More frames would not help: a survey that fits the distortion succeeds, and finds another one than assumed.
     """
-    if uncertainty.fit_distortion:
+    if prior.uncertainty.fit_distortion:
         return
+    fitted = prior._replace(uncertainty=prior.uncertainty._replace(fit_distortion=True))
     try:
-        fitted = uncertainty._replace(fit_distortion=True)
-        survey = survey_in_rounds(frames, prior, fitted).survey
+        survey = survey_in_rounds(frames, fitted).survey
     except InputError:
         return
     sigma = lens_sigma(survey)[3:7]
@@ -121,31 +117,26 @@ def check_lens(
 def survey_in_rounds(
     frames: Sequence[SurveyFrame],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     watch: Progress | None = None,
 ) -> SurveyRun:
     """As `run_survey`, with the lens model as it is."""
 
-    def adjusted(
-        rows: list[int], matches: list[Correspondences], prior: CalibrationPrior
-    ) -> SurveyRun:
+    def adjusted(matches: Matches, prior: CalibrationPrior) -> SurveyRun:
         pairs = [
             (replace(frames[row], body_from_lab=start[row]), match)
-            for row, match in zip(rows, matches, strict=True)
+            for row, match in matches.items()
         ]
-        selected, survey = adjust_connected(pairs, prior, uncertainty, before)
-        rows = [rows[k] for k in selected]
-        matches = [matches[k] for k in selected]
-        start.update(zip(rows, survey.body_from_lab, strict=True))
-        return with_names(
-            SurveyRun(survey, frames, rows, matches, listed, prior, uncertainty)
-        )
+        selected, survey = adjust_connected(pairs, prior, before)
+        named = list(matches.items())
+        kept = dict(named[k] for k in selected)
+        start.update(zip(kept, survey.body_from_lab, strict=True))
+        return with_names(SurveyRun(survey, frames, kept, listed, prior))
 
     listed = prior.leds
-    before = assumed(prior, uncertainty)
+    before = assumed(prior)
     total = ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
-    run = adjusted(*identified_by_imu(frames, prior, uncertainty), prior)
+    run = adjusted(identified_by_imu(frames, prior), prior)
     for completed in range(1, total):
         if watch:
             watch(completed, total)
@@ -192,11 +183,9 @@ def check_plausible(run: SurveyRun, before: Assumed) -> None:
             )
 
 
-def identified_by_imu(
-    frames: Sequence[SurveyFrame], prior: CalibrationPrior, uncertainty: SurveyUncertainty
-) -> tuple[list[int], list[Correspondences]]:
-    """Rows of the frames that the IMU's attitudes identify, and their correspondences. Raises InputError for none."""
-    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+def identified_by_imu(frames: Sequence[SurveyFrame], prior: CalibrationPrior) -> Matches:
+    """The correspondences of the frames that the IMU's attitudes identify, by row. Raises InputError for none."""
+    matches = [match_by_imu(frame, prior) for frame in frames]
     shares = [
         matched_share(frame, match, prior)
         for frame, match in zip(frames, matches, strict=True)
@@ -209,7 +198,7 @@ def identified_by_imu(
             f"in none of the {len(frames)} frames do the lights fit the LEDs of the list",
             "attitudes, LEDs and a camera that are true within the uncertainties",
         )
-    return rows, [matches[row] for row in rows]
+    return {row: matches[row] for row in rows}
 
 
 def matched_share(
@@ -222,35 +211,33 @@ def matched_share(
     return min(1.0, len(match.led) / max(1, min(len(frame.lights), visible)))
 
 
-def rematched(run: SurveyRun) -> tuple[list[int], list[Correspondences], CalibrationPrior]:
-    """Rows of the frames that are identified, their matches by the adjusted model, and that model.
+def rematched(run: SurveyRun) -> tuple[Matches, CalibrationPrior]:
+    """The matches of the frames that are identified, by the adjusted model, and that model.
 
     A frame that was left out, or has too few matches with its adjusted attitude, was misidentified as a whole: it is
     matched again with the IMU's attitude, since lever and lens now are known better.
     """
     survey = run.survey
     prior = run.prior
-    model = prior._replace(camera=survey.camera, leds=survey.leds, lever=survey.lever)
+    model = run.found
     # The attitudes are adjusted, so only the errors of the map and of the residuals remain in the predictions.
-    map_px = led_sigma_m(survey, run.uncertainty) * model.px_per_m
+    map_px = run.accuracy.led_sigma_m * model.px_per_m
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
         row: frame
-        for row, frame, ok in zip(run.rows, run.frames, survey.tied, strict=True)
+        for row, frame, ok in zip(run.matches, run.frames, survey.tied, strict=True)
         if ok
     }
-    rows = []
-    matches = []
+    matches = {}
     for row, frame in enumerate(run.taken):
         match = match_by_survey(tied[row], model, sigma_px) if row in tied else None
         if match is None or matched_share(tied[row], match, model) < MIN_MATCHED:
-            match = match_by_imu(frame, model, run.uncertainty_after, sigma_px)
+            match = match_by_imu(frame, model, sigma_px)
             if matched_share(frame, match, model) < MIN_MATCHED:
                 continue
-        rows.append(row)
-        matches.append(match)
+        matches[row] = match
     # Keep the map from before the survey: it enters each adjustment as a measurement, as the assumed lever does.
-    return rows, matches, model._replace(leds=prior.leds)
+    return matches, prior._replace(camera=survey.camera, lever=survey.lever)
 
 
 def with_names(run: SurveyRun) -> SurveyRun:
@@ -278,7 +265,10 @@ def with_names(run: SurveyRun) -> SurveyRun:
         surveyed=survey.surveyed[order],
         common_m=survey.common_m[:, order],
     )
-    matches = [Correspondences(match.light, name[match.led]) for match in run.matches]
+    matches = {
+        row: Correspondences(match.light, name[match.led])
+        for row, match in run.matches.items()
+    }
     return replace(run, survey=renamed, matches=matches)
 
 
@@ -318,7 +308,6 @@ def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
 def adjust_connected(
     pairs: Sequence[tuple[SurveyFrame, Correspondences]],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     before: Assumed,
 ) -> tuple[list[int], DomeSurvey]:
     """Adjust the largest group of connected frames. Returns its rows and the survey.
@@ -344,8 +333,8 @@ def adjust_connected(
                 prior.leds,
                 prior.lever,
                 prior.camera,
-                fit_distortion=uncertainty.fit_distortion,
-                leds_sigma_m=uncertainty.led_sigma_m,
+                fit_distortion=prior.uncertainty.fit_distortion,
+                leds_sigma_m=prior.uncertainty.led_sigma_m,
                 fit_noise=True,
                 assumed=before,
             )
@@ -416,14 +405,15 @@ def lens_sigma(survey: DomeSurvey) -> Floats:
     return np.concatenate([fitted, np.zeros(8 - len(fitted))])
 
 
-def dome_map(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> DomeMap:
+def dome_map(run: SurveyRun) -> DomeMap:
     """The map file of a survey for the tracker: surveyed LEDs, lever arm, lens, and their standard deviations."""
+    survey = run.survey
     leds = survey.surveyed_leds
     focal_sigma_px, x_sigma_px, y_sigma_px, *k_sigma = lens_sigma(survey).tolist()
     return DomeMap(
         id=leds.id,
         position_m=leds.position_m,
-        sigma_m=led_sigma_m(survey, uncertainty)[survey.surveyed],
+        sigma_m=run.accuracy.led_sigma_m[survey.surveyed],
         camera_body_m=survey.lever.camera_body_m,
         lever_sigma_m=math.sqrt(np.trace(survey.lever_covariance_m2) / 3),
         size_px=(survey.camera.width_px, survey.camera.height_px),

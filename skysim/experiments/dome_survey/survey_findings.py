@@ -25,7 +25,6 @@ from skysim.experiments.dome_survey.survey_frames import (
 )
 from skysim.experiments.dome_survey.survey_prior import (
     CalibrationPrior,
-    SurveyUncertainty,
     survey_model,
 )
 from skysim.results.metrics import rms
@@ -50,8 +49,8 @@ class SurveyRun:
     ----------
     taken
         All frames, with the IMU's attitudes
-    rows
-        Rows of `taken` that are in the survey
+    matches
+        Correspondences of the frames in the survey, by their rows in `taken`
     listed
         The LEDs before the survey
     prior
@@ -61,16 +60,14 @@ class SurveyRun:
 
     survey: DomeSurvey
     taken: Sequence[SurveyFrame]
-    rows: list[int]
-    matches: list[Correspondences]
+    matches: dict[int, Correspondences]
     listed: LedMap
     prior: CalibrationPrior
-    uncertainty: SurveyUncertainty
 
     @property
     def frames(self) -> list[SurveyFrame]:
         """The frames of the survey, with their adjusted attitudes."""
-        pairs = zip(self.rows, self.survey.body_from_lab, strict=True)
+        pairs = zip(self.matches, self.survey.body_from_lab, strict=True)
         return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
 
     @property
@@ -85,7 +82,7 @@ class SurveyRun:
         frame, row = self.survey.outliers.T
         return [
             Correspondences(*(np.delete(part, row[frame == k]) for part in match))
-            for k, match in enumerate(self.matches)
+            for k, match in enumerate(self.matches.values())
         ]
 
     @property
@@ -104,22 +101,31 @@ class SurveyRun:
 
     @property
     def accuracy(self) -> SurveyAccuracy:
-        """The standard deviations of the survey."""
+        """The standard deviations of the survey: of an LED's position, RMS of three axes.
+
+        That of an LED that is not surveyed is as before.
+        """
         survey = self.survey
+        variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
+        before_m2 = self.prior.uncertainty.led_sigma_m**2
         return SurveyAccuracy(
             survey.surveyed,
-            led_sigma_m(survey, self.uncertainty),
+            np.sqrt(np.where(survey.surveyed, variance_m2, before_m2)),
             np.sqrt(np.diag(survey.lever_covariance_m2)),
             np.sqrt(np.diag(survey.lens_covariance)),
         )
 
     @property
-    def uncertainty_after(self) -> SurveyUncertainty:
-        """The uncertainty of the IMU and of unmeasured LEDs as before, and of lever and lens as found."""
+    def found(self) -> CalibrationPrior:
+        """The model found; the uncertainty of IMU and unmeasured LEDs is as before, that of lever and lens as found."""
         accuracy = self.accuracy
-        return self.uncertainty._replace(
+        survey = self.survey
+        after = self.prior.uncertainty._replace(
             lever_sigma_m=float(rms(accuracy.lever_sigma_m)),
-            focal_error=float(accuracy.lens_sigma[0] / self.survey.camera.focal_px),
+            focal_error=float(accuracy.lens_sigma[0] / survey.camera.focal_px),
+        )
+        return self.prior._replace(
+            camera=survey.camera, leds=survey.leds, lever=survey.lever, uncertainty=after
         )
 
 
@@ -129,12 +135,6 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     for row, match in zip(out, matches, strict=True):
         row[match.led] = True
     return out
-
-
-def led_sigma_m(survey: DomeSurvey, uncertainty: SurveyUncertainty) -> Floats:
-    """(N,) standard deviation of each LED's position, RMS of three axes; as before the survey if not surveyed."""
-    variance_m2 = np.einsum("nii->n", survey.led_covariance_m2) / 3
-    return np.sqrt(np.where(survey.surveyed, variance_m2, uncertainty.led_sigma_m**2))
 
 
 def stray_lights(run: SurveyRun) -> list[StrayLight]:
@@ -200,54 +200,40 @@ class Coverage(NamedTuple):
     held, seen
         body_from_lab of F frames, and (F, N) mask of the LEDs in them
     accuracy
-        Accuracy of the survey, or predicted before it; None if the frames are too few
+        Accuracy of the survey, or predicted before it; no LED is measured if the frames are too few
     """
 
     model: SurveyModel
     held: Rotation
     seen: Bools
-    accuracy: SurveyAccuracy | None
-
-    @property
-    def measured(self) -> Bools:
-        """(N,) LEDs that are surveyed."""
-        return (
-            np.zeros(len(self.model.leds.id), dtype=bool)
-            if self.accuracy is None
-            else self.accuracy.measured
-        )
+    accuracy: SurveyAccuracy
 
 
 def coverage(run: SurveyRun) -> Coverage:
     """The coverage of a survey."""
     survey = run.survey
-    model = survey_model(survey, run.uncertainty, run.noise_px)
+    known = run.found._replace(uncertainty=run.prior.uncertainty)
+    model = survey_model(known, run.noise_px)
     return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
 
 
 def coverage_before(
-    frames: Sequence[SurveyFrame],
-    prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
-    noise_px: float,
+    frames: Sequence[SurveyFrame], prior: CalibrationPrior, noise_px: float
 ) -> Coverage:
     """The coverage of frames before their survey: LEDs named by the IMU's attitudes, and predicted accuracy."""
-    matches = [match_by_imu(frame, prior, uncertainty) for frame in frames]
+    matches = [match_by_imu(frame, prior) for frame in frames]
     held = Rotation.concatenate([frame.body_from_lab for frame in frames])
-    model = survey_model(prior, uncertainty, noise_px)
+    model = survey_model(prior, noise_px)
     seen = identified(matches, len(prior.leds.id))
     return Coverage(model, held, seen, predicted(model, held, seen))
 
 
 class NextStops(NamedTuple):
-    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them.
-
-    It is None if they do not determine the unknowns.
-    """
+    """Attitudes to hold next, the LEDs that each shows, and the accuracy predicted with them (`predicted`)."""
 
     lab_from_body: Rotation
     shown: Bools
-    accuracy: SurveyAccuracy | None
+    accuracy: SurveyAccuracy
 
 
 def next_stops(
@@ -264,14 +250,14 @@ def next_stops(
     return NextStops(further, shown, predicted(model, attitudes, seen))
 
 
-def predicted(
-    model: SurveyModel, body_from_lab: Rotation, seen: Bools
-) -> SurveyAccuracy | None:
-    """The accuracy predicted; None if the frames do not determine the unknowns."""
+def predicted(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyAccuracy:
+    """The accuracy predicted; no LED is measured if the frames do not determine the unknowns."""
     try:
         return survey_plan.predict(model, body_from_lab, seen)
     except ValueError:
-        return None
+        before_m = np.full(seen.shape[1], model.leds_sigma_m)
+        measured = np.zeros_like(before_m, dtype=bool)
+        return SurveyAccuracy(measured, before_m, np.empty(0), np.empty(0))
 
 
 # --- faults -------------------------------------------------------------------------------------------------
@@ -427,12 +413,7 @@ def attitude_rows(run: SurveyRun, names: Sequence[str]) -> list[Record]:
 def coverage_statistics(so_far: Coverage) -> Record:
     """Counts and errors of a coverage, one row for each LED."""
     frames = so_far.seen.sum(axis=0)
-    measured = so_far.measured
-    sigma_m = (
-        so_far.accuracy.led_sigma_m
-        if so_far.accuracy
-        else np.full(len(measured), so_far.model.leds_sigma_m)
-    )
+    measured = so_far.accuracy.measured
     return {
         "leds": len(frames),
         "measured": int(measured.sum()),
@@ -442,7 +423,7 @@ def coverage_statistics(so_far: Coverage) -> Record:
             led=so_far.model.leds.id,
             frames=frames,
             measured=measured,
-            sigma_mm=1e3 * sigma_m,
+            sigma_mm=1e3 * so_far.accuracy.led_sigma_m,
         ),
     }
 
@@ -453,9 +434,9 @@ def rows_of_columns(**columns: ArrayLike) -> list[Record]:
     return [dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def accuracy_statistics(accuracy: SurveyAccuracy | None) -> Record:
+def accuracy_statistics(accuracy: SurveyAccuracy) -> Record:
     """Number of measured LEDs, rms errors of LEDs and lever in mm, and of focal length in px; None if undetermined."""
-    if accuracy is None:
+    if not accuracy.measured.any():
         return {"measured": 0, "led_mm": None, "lever_mm": None, "focal_px": None}
     return {
         "measured": int(accuracy.measured.sum()),

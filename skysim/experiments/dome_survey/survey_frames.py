@@ -18,7 +18,7 @@ from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Frame, Ints, Truth, around_z, frozen
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab
@@ -215,7 +215,7 @@ class Correspondences(NamedTuple):
 
 
 def prediction_sigmas_px(
-    prior: CalibrationPrior, uncertainty: SurveyUncertainty, map_px: Floats | None = None
+    prior: CalibrationPrior, map_px: Floats | None = None
 ) -> tuple[float, Floats]:
     """Standard deviations per coordinate in pixels: of the common shift of a frame, and (N,) of each LED individually.
 
@@ -227,9 +227,10 @@ def prediction_sigmas_px(
     Parameters
     ----------
     map_px
-        (N,) standard deviation of each LED's place; from `uncertainty` if None
+        (N,) standard deviation of each LED's place; as known before a survey if None
     """
     camera = prior.camera
+    uncertainty = prior.uncertainty
     corner_px = np.hypot(camera.width_px, camera.height_px) / 2
     common = (
         np.hypot(uncertainty.imu_sigma_rad * prior.nearest_m, uncertainty.lever_sigma_m)
@@ -244,7 +245,6 @@ def prediction_sigmas_px(
 def match_by_imu(
     frame: SurveyFrame,
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     map_px: Floats | None = None,
 ) -> Correspondences:
     """Match detections to LEDs with the IMU attitude and the declared errors: common shift first, then assignment.
@@ -254,7 +254,7 @@ def match_by_imu(
     map_px
         See `prediction_sigmas_px`
     """
-    common_px, individual_px = prediction_sigmas_px(prior, uncertainty, map_px)
+    common_px, individual_px = prediction_sigmas_px(prior, map_px)
     predicted = prior.pixels(frame.body_from_lab)
     margin_px = GATE_SIGMAS * (common_px + float(individual_px.max()))
     visible = np.flatnonzero(prior.camera.contains(predicted, -margin_px))

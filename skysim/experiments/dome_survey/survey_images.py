@@ -33,7 +33,7 @@ from skysim.experiments.dome_survey.survey_frames import (
     from_angles,
     from_rows,
 )
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results.telemetry_report import euler_deg
 
 ATTITUDES = "attitudes.csv"
@@ -145,7 +145,6 @@ def write_solved(path: Path, rows: Sequence[Record]) -> None:
 def frames_with_attitude(
     pictures: Sequence[SurveyImage],
     model: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     settings: Settings,
 ) -> list[SurveyFrame]:
     """The images whose attitude is known, or is found by the tracker with this model, lost in space."""
@@ -154,7 +153,7 @@ def frames_with_attitude(
     for index, picture in enumerate(pictures):
         attitude = picture.lab_from_body
         if attitude is None:
-            tracker = tracker or lost_in_space(model, uncertainty, settings)
+            tracker = tracker or lost_in_space(model, settings)
             cam_from_lab = tracker.solve_centroids(picture.lights).cam_from_ref
             if cam_from_lab is None:
                 continue
@@ -163,10 +162,9 @@ def frames_with_attitude(
     return out
 
 
-def lost_in_space(
-    model: CalibrationPrior, uncertainty: SurveyUncertainty, settings: Settings
-) -> DomeTracker:
+def lost_in_space(model: CalibrationPrior, settings: Settings) -> DomeTracker:
     """A tracker with the uncertainty of the model. Raises InputError for LEDs that it cannot use."""
+    uncertainty = model.uncertainty
     camera = replace(model.camera, focal_sigma=uncertainty.focal_error)
     leds: LedMap = replace(
         model.leds,

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration.bundle_adjustment import Assumed
-from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.identification.led_codes import LedCode
@@ -65,6 +64,9 @@ class SurveyUncertainty(NamedTuple):
         return self.focal_error * camera.focal_px
 
 
+EXACT = SurveyUncertainty(0.0, 0.0, 0.0, 0.0, fit_distortion=False)
+
+
 class CalibrationPrior(NamedTuple):
     """Assumed model of dome and camera, before a survey or from it.
 
@@ -78,6 +80,8 @@ class CalibrationPrior(NamedTuple):
         (N,) relative nominal brightness of the LEDs
     code
         Code of the LEDs; None if all are steady
+    uncertainty
+        Errors of the model, which a survey needs
     """
 
     camera: Camera
@@ -87,6 +91,7 @@ class CalibrationPrior(NamedTuple):
     disk_m: float
     levels: Floats
     code: LedCode | None = None
+    uncertainty: SurveyUncertainty = EXACT
 
     def expected_light(self, index: Ints) -> Floats:
         """(F, N) relative light of each LED in frames of these numbers; 0 if its code switches it off."""
@@ -195,10 +200,9 @@ def require_dome(scene: Scene) -> DomeConfig:
     return scene.dome
 
 
-def survey_model(
-    known: CalibrationPrior | DomeSurvey, uncertainty: SurveyUncertainty, noise_px: float
-) -> SurveyModel:
+def survey_model(known: CalibrationPrior, noise_px: float) -> SurveyModel:
     """The estimator's model for plans and predictions, with the knowledge before or after a survey."""
+    uncertainty = known.uncertainty
     sigmas = (
         uncertainty.led_sigma_m,
         uncertainty.lever_sigma_m,
@@ -208,9 +212,10 @@ def survey_model(
     return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
 
 
-def assumed(prior: CalibrationPrior, uncertainty: SurveyUncertainty) -> Assumed:
+def assumed(prior: CalibrationPrior) -> Assumed:
     """Lever and focal length before a survey, which enter its adjustment as measurements."""
     camera = prior.camera
+    uncertainty = prior.uncertainty
     arm_m = prior.lever.camera_body_m
     return Assumed(
         arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)

@@ -79,8 +79,8 @@ class HeldAttitudes(NamedTuple):
     margin_px: float
     in_reach: Bools
 
-    def first(self, count: int) -> SurveyAccuracy | None:
-        """The accuracy predicted after the first `count` frames; None if they do not determine the unknowns."""
+    def first(self, count: int) -> SurveyAccuracy:
+        """The accuracy predicted after the first `count` frames."""
         return predicted(self.model, self.lab_from_body[:count].inv(), self.shown[:count])
 
     def counts(self, count: int) -> Record:
@@ -112,7 +112,7 @@ class HeldAttitudes(NamedTuple):
             "measured_range": [round(end) for end in np.quantile(found, [0.025, 0.975])],
         }
 
-    def steps(self) -> list[tuple[int, SurveyAccuracy | None]]:
+    def steps(self) -> list[tuple[int, SurveyAccuracy]]:
         """The accuracy predicted after a quarter, a half, three quarters and all of the frames."""
         total = len(self.lab_from_body)
         counts = sorted({max(round(total * part / 4), 2) for part in range(1, 5)})
@@ -134,9 +134,9 @@ def plan_survey(
         For a tilt beyond the vehicle's stop.
     """
     lab = build_lab(with_survey_errors(scene, uncertainty))
-    prior = calibration_prior(lab)
+    prior = calibration_prior(lab)._replace(uncertainty=uncertainty)
     random = stop_attitudes(lab.scene, "attitudes", count, tilt_deg)
-    model = survey_model(prior, uncertainty, centroid_noise_px(lab, tilt_deg))
+    model = survey_model(prior, centroid_noise_px(lab, tilt_deg))
     margin_px = prior.margin_px
     held = (
         random
@@ -178,7 +178,6 @@ def survey_images(
     pictures: Sequence[SurveyImage],
     frames: list[SurveyFrame],
     prior: CalibrationPrior,
-    uncertainty: SurveyUncertainty,
     settings: Settings,
     watch: Progress | None,
 ) -> SurveyRun:
@@ -195,26 +194,20 @@ def survey_images(
             f"{len(frames)} of {len(pictures)} images identified",
             f"2 or more: give their attitudes in {ATTITUDES}",
         )
-    run = run_survey(frames, prior, uncertainty, watch)
+    run = run_survey(frames, prior, watch)
     while len(frames) < len(pictures):
-        found = run.survey
-        model = prior._replace(
-            camera=found.camera, leds=found.surveyed_leds, lever=found.lever
-        )
+        found = run.found
+        measured = found.uncertainty._replace(led_sigma_m=run.accuracy.led_rms_m)
+        model = found._replace(leds=run.survey.surveyed_leds, uncertainty=measured)
         known = {frame.index: frame.body_from_lab.inv() for frame in frames}
         named = [
             picture._replace(lab_from_body=known.get(n)) for n, picture in enumerate(pictures)
         ]
-        more = frames_with_attitude(
-            named,
-            model,
-            run.uncertainty_after._replace(led_sigma_m=run.accuracy.led_rms_m),
-            settings,
-        )
+        more = frames_with_attitude(named, model, settings)
         if len(more) == len(frames):
             break
         frames = more
-        run = run_survey(frames, prior, uncertainty, watch)
+        run = run_survey(frames, prior, watch)
     return run
 
 
@@ -243,10 +236,10 @@ def repeat_survey(
     """
     for n in range(repeats):
         again = in_survey(lab, n)
-        prior = calibration_prior(again)
+        prior = calibration_prior(again)._replace(uncertainty=uncertainty)
         frames = list(simulated_frames(again, uncertainty, plan.lab_from_body))
         try:
-            yield survey_errors(run_survey(frames, prior, uncertainty), prior, again)
+            yield survey_errors(run_survey(frames, prior), prior, again)
         except InputError as error:
             yield error
 

@@ -373,7 +373,7 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation
     from matplotlib.colors import LogNorm
 
     leds = so_far.model.leds
-    measured = so_far.measured
+    measured = so_far.accuracy.measured
     x_m, y_m, _ = leds.position_m.T
     once = so_far.seen.any(axis=0) & ~measured
     unseen = ~measured & ~once
@@ -385,7 +385,7 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation
 
     dots(unseen, "not seen", facecolor="none", edgecolor="0.6")
     dots(once, "seen, not measured", color="0.75")
-    if so_far.accuracy is not None:
+    if measured.any():
         sigma_mm = 1e3 * so_far.accuracy.led_sigma_m[measured]
         points = dots(measured, "measured", c=sigma_mm, norm=LogNorm())
         axes.figure.colorbar(

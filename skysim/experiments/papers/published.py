@@ -2,13 +2,13 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.units import ConfigModel, NotNegative, Number, PositiveInt
+from skysim.core.units import ConfigModel, NotNegative, Number, PositiveInt, ZeroOrMore
 from skysim.core.yaml_reader import explain, read_yaml
 
 FOLDER = DATA / "published"
@@ -58,12 +58,10 @@ class PublishedRow(ConfigModel):
     source: str = ""
     note: str = ""
 
-    @model_validator(mode="after")
-    def check_number_or_bounds(self) -> Self:
+    def check(self) -> None:
         bounded = self.at_least is not None or self.at_most is not None
         if bounded == (self.published is not None):
             raise InputError("", "give either published, or at_least or at_most or both")
-        return self
 
 
 class Experiment(ConfigModel):
@@ -95,7 +93,7 @@ class Experiment(ConfigModel):
     file: str
     runs: PositiveInt = 1
     quick_runs: PositiveInt = 1
-    clicks: Annotated[int, Field(ge=0)] | None = None
+    clicks: ZeroOrMore[int] | None = None
     hardware: tuple[str, ...] = ()
     wrong: str = ""
     assumed: tuple[str, ...] = ()

@@ -11,15 +11,15 @@ import inspect
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.core.units import ConfigModel
+from skysim.core.units import ConfigModel, NotEmpty
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
@@ -74,11 +74,9 @@ class KeyedFactor(ConfigModel):
     key: Name | None = None
     keys: tuple[Name, ...] = ()
 
-    @model_validator(mode="after")
-    def check_keys(self) -> Self:
+    def check(self) -> None:
         if (self.key is None) == (not self.keys):
             raise InputError("", "a factor needs either key or keys")
-        return self
 
     def settings_for(self, value: Value) -> Settings:
         """Settings that give every key this value."""
@@ -88,7 +86,7 @@ class KeyedFactor(ConfigModel):
 class Values(KeyedFactor):
     """Explicit values of a key."""
 
-    values: Annotated[tuple[Value, ...], Field(min_length=1)]
+    values: NotEmpty[Value]
     value_at = option_at
 
     def options(self) -> list[Option]:
@@ -113,8 +111,7 @@ class Range(KeyedFactor):
     scale: Literal["linear", "log"] = "linear"
     integer: bool = False
 
-    @model_validator(mode="after")
-    def check_bounds(self) -> Range:
+    def check(self) -> None:
         (low, unit), (high, other) = split_quantity(self.from_), split_quantity(self.to)
         if unit != other:
             raise InputError(
@@ -124,7 +121,6 @@ class Range(KeyedFactor):
             raise InputError("", f"from is {self.from_!r}", f"below to, {self.to!r}")
         if self.scale == "log" and low <= 0:
             raise InputError("", f"from is {self.from_!r}", "above 0 with scale: log")
-        return self
 
     def options(self) -> list[Option]:
         """`steps` values from one bound to the other, both included."""
@@ -154,8 +150,7 @@ class Distribution(KeyedFactor):
     mode: Value = None
     high: Value = None
 
-    @model_validator(mode="after")
-    def check_parameters(self) -> Distribution:
+    def check(self) -> None:
         required = PARAMETERS[self.distribution]
         provided = [name for name in ALL_PARAMETERS if getattr(self, name) is not None]
         if sorted(provided) != sorted(required):
@@ -165,7 +160,6 @@ class Distribution(KeyedFactor):
                 ", ".join(required),
             )
         self.parameters()
-        return self
 
     def parameters(self) -> tuple[list[float], str]:
         """The parameters in the order of PARAMETERS, and their unit. Raises InputError."""

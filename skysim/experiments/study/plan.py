@@ -24,6 +24,7 @@ from skysim.core.errors import InputError
 from skysim.core.plugins import Programs
 from skysim.core.types import frozen
 from skysim.core.units import (
+    BY_KIND,
     AxisAngle,
     ConfigModel,
     Declination,
@@ -31,6 +32,7 @@ from skysim.core.units import (
     Duration,
     Fraction,
     InnerFraction,
+    NotEmpty,
     NotNegative,
     Number,
     PositiveInt,
@@ -133,12 +135,10 @@ class AxisConfig(ConfigModel):
     body: Three[Signed] | None = None
     camera: Three[Signed] | None = None
 
-    @model_validator(mode="after")
-    def check_vector(self) -> AxisConfig:
+    def check(self) -> None:
         given = [vector for vector in (self.body, self.camera) if vector is not None]
         if len(given) != 1 or not any(given[0]):
             raise InputError("", "", "one of body and camera, a vector that is not zero")
-        return self
 
 
 def axis_tag(value: Any) -> str:
@@ -250,7 +250,7 @@ class FlightTrial(ConfigModel):
     settle_s: Delay = 0.0
 
 
-Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, Field(discriminator="kind")]
+Trial = Annotated[CentroidTrial | FrameTrial | FlightTrial, BY_KIND]
 
 
 class Budget(ConfigModel):
@@ -327,7 +327,7 @@ class Heat(FigureKeys):
     value: str
 
 
-Figure = Annotated[Curve | Heat | Map, Field(discriminator="kind")]
+Figure = Annotated[Curve | Heat | Map, BY_KIND]
 
 
 class Threshold(Selection):
@@ -439,7 +439,7 @@ class Study(ConfigModel):
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()
     paired: bool = True
-    responses: Annotated[tuple[str, ...], Field(min_length=1)]
+    responses: NotEmpty[str]
     budget: Budget = Budget()
     figures: tuple[Figure, ...] = ()
     thresholds: tuple[Threshold, ...] = ()

@@ -316,16 +316,14 @@ def brief(threshold: Threshold, lines: PointTable) -> str:
         for label, one in found
         if math.isinf(one.value)
     ]
-    always = [label for label, every in beyond if every]
-    never = [label for label, every in beyond if not every]
     parts = []
     if at:
         crosses = "reaches" if any(one.rising for _, one in found) else "falls below"
         parts.append(
             f"{threshold.response} {crosses} {limit} at {threshold.along} = {', '.join(at)}"
         )
-    for labels, text in ((always, f"at least {limit}"), (never, f"below {limit}")):
-        if labels:
+    for text, everywhere in ((f"at least {limit}", True), (f"below {limit}", False)):
+        if labels := [label for label, every in beyond if every == everywhere]:
             subject = "" if parts else f"{threshold.response} is "
             parts.append(f"{subject}{text} at all levels{','.join(labels)}")
     return "; ".join(parts) + "." if parts else ""

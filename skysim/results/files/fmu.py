@@ -186,8 +186,7 @@ NO_SHOT: Record = {
 
 def shot_values(shot: Shot) -> Record:
     """The values of `NO_SHOT` for an exposure."""
-    assert shot.report is not None
-    attitude = shot.report.attitude
+    attitude = shot.solution.attitude
     values = NO_SHOT | {
         "frame": shot.frame.index,
         "is_new": True,

@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
@@ -202,31 +203,32 @@ def truths(run: Recording, bar: Bar) -> Iterator[FrameTruth]:
     return bar(run.truths(), len(run.stems), "reading truths")
 
 
+# Names of the columns of a quantity with several components.
+COMPONENTS = {
+    **{f"{name}_xyzw": [f"{name}_q{end}" for end in "xyzw"] for name in ATTITUDES},
+    "rate_cam_rad_s": [f"rate_cam_{end}_rad_s" for end in "xyz"],
+}
+
+
+def frame_columns(run: Recording, bar: Bar) -> dict[str, NDArray[Any]]:
+    """The truth of all frames by the fields of FrameTruth, (F,) or (F, K) each; times as text."""
+    true = [truth._replace(sources=None) for truth in truths(run, bar)]
+    utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in true]
+    columns = {
+        name: np.array([getattr(truth, name) for truth in true])
+        for name in FrameTruth._fields[:-1]
+    }
+    return columns | {"mid_utc": np.array(utc)}
+
+
 def truth_table(run: Recording, bar: Bar) -> Any:
     """The truth as an astropy table, one row per frame."""
     from astropy.table import Table
 
-    rows = [truth_row(truth) for truth in truths(run, bar)]
-    return Table(rows=rows, meta=run.meta)
-
-
-def truth_row(truth: FrameTruth) -> Record:
-    row: Record = {
-        "frame": truth.frame,
-        "mid_utc": truth.mid_utc.isoformat(timespec="microseconds"),
-        "t_mid_s": truth.t_mid_s,
-        "exposure_s": truth.exposure_s,
-    }
-    for name in ATTITUDES:
-        quaternion = getattr(truth, f"{name}_xyzw")
-        row |= {
-            f"{name}_q{end}": float(component)
-            for end, component in zip("xyzw", quaternion, strict=True)
-        }
-    return row | {
-        f"rate_cam_{end}_rad_s": float(rate)
-        for end, rate in zip("xyz", truth.rate_cam_rad_s, strict=True)
-    }
+    columns: Record = {}
+    for name, values in frame_columns(run, bar).items():
+        columns |= zip(COMPONENTS.get(name, [name]), np.atleast_2d(values.T), strict=True)
+    return Table(columns, meta=run.meta)
 
 
 def to_ecsv(run: Recording, out: Path, bar: Bar) -> Paths:
@@ -335,7 +337,7 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
         raise InputError("export.formats", f"zarr {EXTRA}") from None
     path = out / ZARR
     count = len(run.stems)
-    frame_truths = [truth._replace(sources=None) for truth in truths(run, bar)]
+    columns = frame_columns(run, bar)
     first = run.image(run.stems[0])
     with files.atomic_folder(path) as temporary:
         group = zarr.create_group(
@@ -351,39 +353,18 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
         )
         for n, stem in enumerate(bar(run.stems, count, "Zarr")):
             frames[n] = check_same_format(run.image(stem), first, stem)
-        for name, values, axis, unit in frame_arrays(frame_truths):
-            dimensions = ("frame", axis) if axis else ("frame",)
+        for name, values in columns.items():
+            unit = unit_of(name)
+            if name == "mid_utc":
+                values = values.astype("datetime64[us]").astype(np.int64)
+                unit = "microseconds since 1970-01-01"
             group.create_array(
                 name,
                 data=values,
-                dimension_names=dimensions,
+                dimension_names=("frame", "xyzw"[: values.shape[-1]])[: values.ndim],
                 attributes={"units": unit} if unit else {},
             )
     return [path]
-
-
-def frame_arrays(frame_truths: list[FrameTruth]) -> Iterator[tuple[str, Any, str, str]]:
-    """Arrays stored with the frames of a sequence: name, array, name of its second axis, unit."""
-    utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in frame_truths]
-    yield (
-        "mid_utc",
-        np.array(utc, dtype="datetime64[us]").astype(np.int64),
-        "",
-        "microseconds since 1970-01-01",
-    )
-    for name, axis in (
-        ("frame", ""),
-        ("t_mid_s", ""),
-        ("exposure_s", ""),
-        ("rate_cam_rad_s", "xyz"),
-        *((f"{name}_xyzw", "xyzw") for name in ATTITUDES),
-    ):
-        yield (
-            name,
-            np.array([getattr(truth, name) for truth in frame_truths]),
-            axis,
-            unit_of(name),
-        )
 
 
 def check_same_format(image: Any, first: Any, stem: Path) -> Any:

@@ -13,6 +13,8 @@ from skysim.results import report as as_text
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
 from skysim.results.run_report import frame_table, motion_section, run_report
+from skysim.scene import loader
+from skysim.simulation.checks import Check
 
 TRIPLE = ("roll", "pitch", "yaw")
 
@@ -71,17 +73,14 @@ def report(motion: dict[str, float]) -> Report:
         ["render", "detector", "detect", "centroid", "identify", "solve"], 12.34
     )
     return run_report(
-        "title",
+        loader.load("afit_simsat"),
+        Check([], []),
         "skysim run x",
-        TRIPLE,
         [row(0), row(1)],
         stages_ms=stages,
         motion=motion_section(motion, (), b""),
-        computer="",
         annotated=picture,
         views=[],
-        facts=[],
-        findings=[],
         judged=[],
     )
 

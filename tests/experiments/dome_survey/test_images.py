@@ -121,8 +121,8 @@ def frames(folder: Path, built: Lab) -> Path:
         lab,
         survey_prior.calibration_prior(lab).camera,
         survey_prior.calibration_prior(lab).leds,
-    )
-    model = survey_prior.survey_model(assumed, uncertainty, 0.02)
+    )._replace(uncertainty=uncertainty)
+    model = survey_prior.survey_model(assumed, 0.02)
     held = survey_frames.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
     for _ in survey_procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
         pass

@@ -68,6 +68,7 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         SimpleNamespace(
             camera=SimpleNamespace(focal_px=focal_px - focal),
             lever=SimpleNamespace(camera_body_m=np.array([0.0, 0.0, 0.381 - lever])),
+            uncertainty=assumed,
         )
         for focal, lever in ((0.0, 0.0), (off_px, off_m))
     )
@@ -79,6 +80,6 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         with pytest.raises(
             InputError, match=f"survey: {parameter} .* contradicts the assumed"
         ):
-            adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]
+            adjust.check_plausible(run, survey_prior.assumed(before))  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, survey_prior.assumed(before, assumed))  # type: ignore[arg-type]
+        adjust.check_plausible(run, survey_prior.assumed(before))  # type: ignore[arg-type]

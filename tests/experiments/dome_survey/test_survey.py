@@ -296,7 +296,7 @@ def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
     prior = survey_prior.calibration_prior(lab)
     sigmas = UNCERTAINTY._replace(lever_sigma_m=0.0)
-    predicted_px, _ = survey_frames.prediction_sigmas_px(prior, sigmas)
+    predicted_px, _ = survey_frames.prediction_sigmas_px(prior._replace(uncertainty=sigmas))
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
     center = np.argsort(
         np.linalg.norm(prior.pixels(Rotation.identity()) - prior.camera.center_px, axis=1)
@@ -313,14 +313,14 @@ def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
 
 def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
-    prior = survey_prior.calibration_prior(lab)
+    prior = survey_prior.calibration_prior(lab)._replace(uncertainty=UNCERTAINTY)
     stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
     taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
     for survey_frame, (_, truth) in zip(
         taken, survey_frames.render_stops(lab, stops), strict=True
     ):
-        names = survey_frames.match_by_imu(survey_frame, prior, UNCERTAINTY)
+        names = survey_frames.match_by_imu(survey_frame, prior)
         apart_px, nearest = cKDTree(truth.sources.flux_xy_px).query(
             survey_frame.lights.xy_px[names.light]
         )
@@ -384,7 +384,7 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
         dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3)
     )
     prior = survey_prior.CalibrationPrior(
-        dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120)
+        dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
     for index, attitude in enumerate(held):
@@ -399,7 +399,7 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
             Rotation.from_rotvec(UNCERTAINTY.imu_sigma_rad * rng.normal(size=3)) * attitude
         )
         frames.append(SurveyFrame(lights, by_imu, index))
-    run = adjust.run_survey(frames, prior, UNCERTAINTY)
+    run = adjust.run_survey(frames, prior)
     survey = run.survey
     found, _ = survey_faults.displaced(
         listed_m, survey.leds.position_m, survey.led_covariance_m2
@@ -478,7 +478,7 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
     dome = model(120)
     held = attitudes(rng, 40)
     prior = survey_prior.CalibrationPrior(
-        dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120)
+        dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
     for index, attitude in enumerate(held):
@@ -491,9 +491,9 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
         )
     lever_z_m = []
     for fits in (False, True):
-        known = UNCERTAINTY._replace(fit_distortion=fits)
-        run = adjust.run_survey(frames, prior, known)
-        planned = survey_prior.survey_model(prior, known, NOISE_PX)
+        known = prior._replace(uncertainty=UNCERTAINTY._replace(fit_distortion=fits))
+        run = adjust.run_survey(frames, known)
+        planned = survey_prior.survey_model(known, NOISE_PX)
         predicted = survey_plan.predict(planned, held, planned.visible(held))
         np.testing.assert_allclose(
             run.accuracy.lever_sigma_m, predicted.lever_sigma_m, rtol=0.1
@@ -544,7 +544,7 @@ def test_a_lens_that_is_not_modeled_is_named() -> None:
     bent = replace(dome.camera, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
     true = replace(dome, camera=bent)
     prior = survey_prior.CalibrationPrior(
-        dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120)
+        dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
     for index, attitude in enumerate(attitudes(rng, 40)):
@@ -554,9 +554,9 @@ def test_a_lens_that_is_not_modeled_is_named() -> None:
         lights = Centroids(xy_px, np.full(len(xy_px), NOISE_PX), np.ones(len(xy_px)))
         frames.append(SurveyFrame(lights, attitude, index))
     with pytest.raises(InputError, match=r"the lens has k1 = -0\.(1|09).* the model 0"):
-        adjust.run_survey(frames, prior, UNCERTAINTY)
+        adjust.run_survey(frames, prior)
     named = prior._replace(camera=bent)
-    assert adjust.run_survey(frames, named, UNCERTAINTY).survey.status == "converged"
+    assert adjust.run_survey(frames, named).survey.status == "converged"
 
 
 # --- the file -----------------------------------------------------------------------------------------------
@@ -715,9 +715,10 @@ def surveyed_nees(lab: Lab, folder: Path, surveys: int) -> list[float]:
     for n in range(surveys):
         again = survey_procedure.in_survey(lab, n)
         frames = list(survey_procedure.simulated_frames(again, UNCERTAINTY, stops))
-        run = adjust.run_survey(frames, survey_prior.calibration_prior(again), UNCERTAINTY)
+        prior = survey_prior.calibration_prior(again)._replace(uncertainty=UNCERTAINTY)
+        run = adjust.run_survey(frames, prior)
         path = folder / f"leds_{n}.ecsv"
-        dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, UNCERTAINTY))
+        dome_map_file.write_dome_map(path, adjust.dome_map(run))
         tracker = factory.build_tracker(
             survey_prior.with_map(again.scene, str(path)),
             again.camera.mount,

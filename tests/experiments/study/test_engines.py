@@ -40,10 +40,10 @@ from tests.helpers.study_stores import contents, done
 DRIVER = """
 import sys
 from pathlib import Path
-from skysim.experiments.study import loader
+from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import store
 from skysim.experiments.study.execution import engines, runner
-study_plan = loader.load(sys.argv[1])
+study_plan = study_file.load(sys.argv[1])
 with store.writing(Path(sys.argv[2])) as kept:
     runner.prepare_store(study_plan, kept, kept.counts()["done"] > 0)
     runner.run(study_plan, kept, engines.Pool(int(sys.argv[3])), lambda progress: print(progress.done, flush=True))

@@ -13,7 +13,7 @@ from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, EARTH_MU_M3_S2, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
 from skysim.results.report import print_table
-from skysim.results.report_blocks import Column, Table
+from skysim.results.report_blocks import Column, Table, text_column
 
 if TYPE_CHECKING:
     from skysim.core.types import Bools
@@ -97,7 +97,7 @@ def fraction_table(fractions: dict[str, float], exclusion: ExclusionConfig) -> T
         [name, condition, f"{100 * fractions[name]:.2f} %"]
         for name, condition in conditions.items()
     ]
-    columns = [Column("", kind="text"), Column("condition"), Column("fraction of time")]
+    columns = [text_column(""), Column("condition"), Column("fraction of time")]
     return Table(columns, rows)
 
 

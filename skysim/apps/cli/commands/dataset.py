@@ -2,7 +2,6 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -72,18 +71,20 @@ def dataset(
         trial_progress(f"dataset of {scene}", frames, "frames") as update,
     ):
         progress = dataset_run.run(made, out, chosen, update)
-    result = {"out": out, "frames": progress.done, "shards": made.shards}
-    print_result(result | {"failed": progress.failed, "rate_hz": progress.rate}, frames, json)
-
-
-def print_result(result: dict[str, Any], frames: int, json: bool) -> None:
-    """Print what was written of so many frames; end with exit code 2 if some are missing."""
     if json:
-        print_json(result)
+        print_json(
+            {
+                "out": out,
+                "frames": progress.done,
+                "shards": made.shards,
+                "failed": progress.failed,
+                "rate_hz": progress.rate,
+            }
+        )
     else:
-        print("{frames} of {0} frames in {shards} shards: {out}".format(frames, **result))
-    if result["failed"]:
+        print(f"{progress.done} of {frames} frames in {made.shards} shards: {out}")
+    if progress.failed:
         print_error(
-            f"{result['failed']} frames are missing: their workers died; the same command tries them again"
+            f"{progress.failed} frames are missing: their workers died; the same command tries them again"
         )
         raise typer.Exit(2)

@@ -157,12 +157,13 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> Record:
     """A simulated survey, compared with the truth."""
 
     lab, before, plan = planned(request)
-    uncertainty = request.uncertainty
     first_tracker = build_tracker(lab.camera)
-    taken = survey_procedure.simulated_frames(lab, uncertainty, plan.lab_from_body, frames_to)
+    taken = survey_procedure.simulated_frames(
+        lab, request.uncertainty, plan.lab_from_body, frames_to
+    )
     observations = list(progress(taken, len(plan.shown), "rendering"))
     with adjusting(request, observations, before, plan.model.sigma_px) as update:
-        run = adjust.run_survey(observations, before, uncertainty, update)
+        run = adjust.run_survey(observations, before, update)
     names = survey_images.frame_names(len(observations))
     statistics = write_results(request, run, before, lab, names)
     tracker = factory.build_tracker(
@@ -190,7 +191,7 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
     known, read = read_camera(camera_file)
     camera = known.model
     lab = build_lab(survey_prior.as_listed(request.scene))
-    before = survey_prior.listed_prior(lab, camera)
+    before = survey_prior.listed_prior(lab, camera)._replace(uncertainty=request.uncertainty)
     stages = factory.assumed_settings(lab.scene)
     if known.detector:
         stages = replace(stages, gain_e_dn=read.gain_e_dn, saturation=read.saturation)
@@ -201,11 +202,9 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
         pictures = list(
             progress(survey_images.read_images(images, camera, stages), total, "reading")
         )
-    found = survey_images.frames_with_attitude(pictures, before, request.uncertainty, stages)
+    found = survey_images.frames_with_attitude(pictures, before, stages)
     with adjusting(request, found, before, None) as update:
-        run = survey_procedure.survey_images(
-            pictures, found, before, request.uncertainty, stages, update
-        )
+        run = survey_procedure.survey_images(pictures, found, before, stages, update)
     names = [picture.name for picture in pictures]
     statistics = write_results(request, run, before, None, names)
     return write_report(request, run, statistics | {"frames": len(pictures)})
@@ -223,9 +222,7 @@ def followed(
                 print_error(str(complaint))
             if news.read and not request.quiet:
                 pictures = watched.pictures
-                found = survey_images.frames_with_attitude(
-                    pictures, before, request.uncertainty, stages
-                )
+                found = survey_images.frames_with_attitude(pictures, before, stages)
                 print(
                     f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude"
                 )
@@ -259,9 +256,7 @@ def print_coverage(
     noise_px: float | None,
 ) -> None:
     """Print the LEDs that the frames show, and the attitudes to hold next."""
-    so_far = survey_findings.coverage_before(
-        frames, prior, request.uncertainty, noise_px or prior.floor_px
-    )
+    so_far = survey_findings.coverage_before(frames, prior, noise_px or prior.floor_px)
     print_blocks(survey_report.coverage_blocks(with_next(request, so_far, prior)))
 
 
@@ -293,7 +288,7 @@ def write_results(
     folder = files.make_folder(request.folder)
     path = folder / "leds.ecsv"
     picture = folder / "survey.png"
-    dome_map_file.write_dome_map(path, adjust.dome_map(run.survey, request.uncertainty))
+    dome_map_file.write_dome_map(path, adjust.dome_map(run))
     so_far = survey_findings.coverage(run)
     faults = survey_findings.find_faults(run)
     statistics = survey_report.survey_statistics(run, before) | with_next(

@@ -97,15 +97,13 @@ class Survey:
             for frame, at in zip(taken, measured, strict=True)
         ]
         try:
-            run = adjust.run_survey(frames, self.before, UNCERTAINTY)
+            run = adjust.run_survey(frames, self.before)
             refusal = ""
             so_far = survey_findings.coverage(run)
         except InputError as error:
             run = None
             refusal = str(error)
-            so_far = survey_findings.coverage_before(
-                frames, self.before, UNCERTAINTY, self.noise_px
-            )
+            so_far = survey_findings.coverage_before(frames, self.before, self.noise_px)
         statistics = survey_findings.coverage_statistics(so_far)
         del statistics["by_led"]
         statistics |= {"frames": len(taken), "missed": missed, "refusal": refusal}
@@ -165,7 +163,7 @@ class Survey:
             )
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "leds.ecsv"
-            dome_map_file.write_dome_map(path, adjust.dome_map(self.run.survey, UNCERTAINTY))
+            dome_map_file.write_dome_map(path, adjust.dome_map(self.run))
             return path.read_bytes()
 
 
@@ -214,7 +212,7 @@ def survey_plan(
     return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
 
 
-def plan_step(count: int, accuracy: SurveyAccuracy | None) -> PlanStep:
+def plan_step(count: int, accuracy: SurveyAccuracy) -> PlanStep:
     """Number of frames; predicted after them, the number of LEDs measured and their rms error in mm."""
     statistics = survey_findings.accuracy_statistics(accuracy)
     return count, int(statistics["measured"] or 0), statistics["led_mm"]

@@ -90,30 +90,55 @@ class Pool:
         self._job: Job | None = None
 
     def run(self, job: Job, chunks: Chunks) -> Batches:
+        """Yield rows as chunks complete; retries first, each alone in flight.
+
+        Rows of chunks that are complete at the same time come together, so that the store takes one transaction for
+        them: the more workers wait for it, the fewer transactions.
+        """
         retries: deque[Chunk] = deque()
         deaths: Counter[int] = Counter()  # by trial
-        done = False
-        while not done:
-            in_flight: dict[Future[TimedRows], Chunk] = {}
-            try:
-                yield from self._run_until_death(
-                    self._pool_for(job), chunks, retries, in_flight
-                )
-                done = True
-            except BrokenProcessPool:
-                # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
-                lost = [
-                    single for chunk in in_flight.values() for single in split_chunk(chunk)
-                ]
-                deaths.update(single[0].first for single in lost if len(lost) == 1)
-                for single in lost:
-                    if deaths[single[0].first] == MAX_ATTEMPTS:
-                        yield [job.failed(single[0], DIED)]
-                    else:
-                        retries.append(single)
-            finally:
-                if not done:
+        in_flight: dict[Future[TimedRows], Chunk] = {}
+        try:
+            while True:
+                rows = list[Any]()
+                try:
+                    pool = self._pool_for(job)
+                    # A retried trial is alone in flight, so that a worker's death can be attributed to it.
+                    capacity = self.workers * (1 + AHEAD) if not retries else 1
+                    while len(in_flight) < capacity and (
+                        chunk := retries.popleft() if retries else chunks.next()
+                    ):
+                        try:
+                            in_flight[pool.submit(run_chunk, chunk)] = chunk
+                        except BrokenProcessPool:
+                            # A worker died while the caller stored rows.
+                            retries.appendleft(chunk)
+                            raise
+                    if not in_flight:
+                        return
+                    finished = wait(in_flight, return_when=FIRST_COMPLETED).done
+                    for future in [one for one in finished if one.exception() is None]:
+                        more, seconds = future.result()
+                        chunks.report_time(in_flight.pop(future), seconds)
+                        rows += more
+                    for future in finished:
+                        future.result()  # raises if its worker died
+                except BrokenProcessPool:
                     self._kill()
+                    # Count a death only for a trial that was alone in flight; otherwise the culprit is unknown.
+                    lost = [one for chunk in in_flight.values() for one in split_chunk(chunk)]
+                    in_flight.clear()
+                    deaths.update(single[0].first for single in lost if len(lost) == 1)
+                    for single in lost:
+                        if deaths[single[0].first] == MAX_ATTEMPTS:
+                            rows.append(job.failed(single[0], DIED))
+                        else:
+                            retries.append(single)
+                if rows:
+                    yield rows
+        except BaseException:  # the caller stops, or an error of the job
+            self._kill()
+            raise
 
     def close(self) -> None:
         if self._pool is not None:
@@ -136,48 +161,6 @@ class Pool:
                 process.kill()
             self._pool.shutdown(cancel_futures=True)
         self._pool = None
-
-    def _run_until_death(
-        self,
-        pool: ProcessPoolExecutor,
-        chunks: Chunks,
-        retries: deque[Chunk],
-        in_flight: dict[Future[TimedRows], Chunk],
-    ) -> Batches:
-        """Yield rows as chunks complete; retries first, each alone in flight. `in_flight` maps futures to their chunks.
-
-        Rows of chunks that are complete at the same time come together, so that the store takes one transaction for
-        them: the more workers wait for it, the fewer transactions.
-
-        Raises
-        ------
-        BrokenProcessPool
-            If a worker dies; `in_flight` then holds the chunks that were lost.
-        """
-        while True:
-            # A retried trial runs with nothing else in flight, so that a worker's death can be attributed to it.
-            capacity = self.workers * (1 + AHEAD) if not retries else 1
-            while len(in_flight) < capacity and (
-                chunk := retries.popleft() if retries else chunks.next()
-            ):
-                try:
-                    in_flight[pool.submit(run_chunk, chunk)] = chunk
-                except BrokenProcessPool:  # a worker died while the caller stored rows
-                    retries.appendleft(chunk)
-                    raise
-            if not in_flight:
-                return
-            finished = wait(in_flight, return_when=FIRST_COMPLETED).done
-            rows = list[Any]()
-            whole = [future for future in finished if future.exception() is None]
-            for future in whole:
-                more, seconds = future.result()
-                chunks.report_time(in_flight.pop(future), seconds)
-                rows += more
-            if rows:
-                yield rows
-            for future in finished:
-                future.result()  # raises if its worker died
 
 
 def run_timed(job: Job, chunk: Chunk) -> TimedRows:

@@ -22,6 +22,7 @@ from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 from skysim.tracking.computer_time import total
+from skysim.tracking.onboard_model import rows_of
 
 # A centroid is a light's own if it is within this distance of its true image, and half of its streak. Errors of
 # centroids are below it even where two images touch; neighboring stars or LEDs are usually farther apart.
@@ -274,12 +275,7 @@ def claimed_image_px(
     directions of the tracker's catalog, which is independent of the simulated sky and may have merged a double.
     """
     if isinstance(estimator, DomeTracker):
-        order = np.argsort(lab.camera.sources.id)
-        rows = order[
-            np.searchsorted(
-                lab.camera.sources.id, estimator.leds.id[match.star], sorter=order
-            )
-        ]
+        rows = rows_of(estimator.leds.id[match.star], lab.camera.sources.id)
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
         offset_lab = lab.camera.sources.place[rows, :3] - camera_m
     else:

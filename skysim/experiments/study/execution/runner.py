@@ -135,7 +135,8 @@ class ChunkQueue:
         self.missing = missing
         self.first = first
         self.spec = plan.spec
-        self.seconds = chunk_seconds(workers)
+        # In proportion to the workers beyond MANY, so that coordination is not the limit.
+        self.seconds = CHUNK_S * max(1.0, workers / MANY)
         self.position = 0
         self.size = 1
         apart = (np.diff(missing) != 1) | (missing[1:] % replicates == 0)
@@ -170,11 +171,6 @@ class ChunkQueue:
         count = sum(len(segment.replicates) for segment in chunk)
         size = int(self.seconds * count / max(seconds, 1e-6))
         self.size = int(np.clip(size, 1, min(2 * max(count, self.size), MAX_CHUNK)))
-
-
-def chunk_seconds(workers: int) -> float:
-    """Run time of a chunk, proportional to the number of workers beyond MANY, so that coordination is not the limit."""
-    return CHUNK_S * max(1.0, workers / MANY)
 
 
 def prepare_store(
@@ -433,10 +429,9 @@ def replay_flight(
     with trials.trial_flight(setup, seed) as flight:
         recorder = Recorder(folder, flight.lab.camera)
         for shot in flight.shots(cameras=[0]):
-            assert shot.report is not None
             recorder.add(scoring.Score(shot))
             if shot.frame.index < MAX_FRAMES:
-                write_annotated(folder, shot.frame, shot.truth, shot.report)
+                write_annotated(folder, shot.frame, shot.truth, shot.solution)
         if not recorder.rows:
             return []
         log = flight.telemetry()
@@ -469,8 +464,7 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
     if isinstance(trial, FlightTrial):
         with trials.trial_flight(setup, seed) as flight:
             shot = next(flight.shots(cameras=[0]))
-            assert shot.report is not None
-            return shot.frame, shot.truth, shot.report
+            return shot.frame, shot.truth, shot.solution
     frame, truth, streak_px = trials.render_trial_frame(setup, seed)
     solve = partial(trials.lost_in_space, setup, frame, truth, streak_px)
     return frame, truth, solve_or_failed(solve)

@@ -289,8 +289,7 @@ def flight_outcomes(
 ) -> Iterator[tuple[float, Outcome]]:
     """Mid-exposure time and outcome of every frame of the main camera."""
     for shot in flight.shots(cameras=[0]):
-        assert shot.report is not None
-        one = score(flight.lab, estimator, shot.report, true_lights(shot.truth))
+        one = score(flight.lab, estimator, shot.solution, true_lights(shot.truth))
         yield shot.truth.t_s, replace(one, exposure_ms=1e3 * shot.frame.exposure_s)
 
 

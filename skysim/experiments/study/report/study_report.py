@@ -502,7 +502,7 @@ def pivot_table(figure: Curve | Heat, lines: PointTable) -> Table:
         for one in levels
     ]
     heads = [Column(across.tick_label(x)) for x in across.levels]
-    return Table([Column(f"{figure.response}: {across.label}", kind="text"), *heads], rows)
+    return Table([text_column(f"{figure.response}: {across.label}"), *heads], rows)
 
 
 def search_figures(
