@@ -63,9 +63,7 @@ def render_frame(
     window: Window | None = None,
     added: AddedCharge | None = None,
 ) -> tuple[Frame, Truth]:
-    """A frame and its truth, both for mid-exposure of the middle row.
-
-    They do not depend on other frames.
+    """A frame and its truth, both for mid-exposure of the middle row, and independent of other frames.
 
     Parameters
     ----------

@@ -60,9 +60,8 @@ def claimed_errors(lines: PointTable, survey_share: float) -> Sentences:
     means = [one.value for one, _ in known]
     shared = survey_share > ONE_SURVEY
     if shared and max(means) < OVERCONFIDENT_NEES:
-        spread = (
-            f"{min(means):.3g} to {max(means):.3g}" if len(means) > 1 else f"{means[0]:.3g}"
-        )
+        spread = f"{min(means):.3g}"
+        spread += f" to {max(means):.3g}" if len(means) > 1 else ""
         return [
             f"{CLAIMED} One survey cannot decide it: {100 * survey_share:.0f} % of the expected variance is of the"
             f" survey that all trials share (NEES {spread}; over many surveys 3 if true). `hardware:"
