@@ -81,15 +81,20 @@ def name_in_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # Some libraries report a full disk in the text only.
-        full = (
-            error.errno in (None, errno.ENOSPC, errno.EDQUOT)
-            and "space" in str(error).lower()
+        # Some libraries report a full disk in the text only, as NumPy does: "9 requested and 4 written".
+        full = error.errno in (None, errno.ENOSPC, errno.EDQUOT) and re.search(
+            "(?i)space| written", str(error)
         )
         number = errno.ENOSPC if full else error.errno
         if number is None:
             raise
-        raise OSError(number, os.strerror(number), str(path)) from error
+        reason = f"{os.strerror(number)}{'; ' + room_left(path) if full else ''}"
+        raise OSError(number, reason, str(path)) from error
+
+
+def room_left(path: Path) -> str:
+    """Text that says how much room is left for a file that could not be written."""
+    return f"{shutil.disk_usage(path.parent).free / 1e6:.3g} MB are free, nothing is half-written"
 
 
 @contextmanager
@@ -98,7 +103,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
     If the body raises an exception, the temporary file is removed and `path` is unchanged.
     """
-    with temporary_path(path) as temporary, name_in_errors(path):
+    # Removed first, so that its room counts as free.
+    with name_in_errors(path), temporary_path(path) as temporary:
         yield temporary
         os.replace(temporary, path)
 
@@ -108,9 +114,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """As `atomic_file`, for a folder, which replaces `path` and its previous content."""
     backup = path.with_name(f"{path.stem}.old{path.suffix}")
     with (
+        name_in_errors(path),
         temporary_path(path) as temporary,
         temporary_path(backup) as old,
-        name_in_errors(path),
     ):
         yield temporary
         # Two renames are fast, and the old folder is removed afterward: an interruption leaves one of the two complete.

@@ -30,6 +30,8 @@ class Storage:
     """Files of a dataset by name. Raises InputError for a URL that cannot be opened."""
 
     def __init__(self, url: str) -> None:
+        if "memory://" in url:
+            raise InputError(url, "is lost at the end of the process", URLS)
         try:
             from fsspec.core import url_to_fs
         except ImportError:

@@ -355,6 +355,10 @@ def segment_samples(
     # Nine numbers with accelerations, else six.
     width = 9 if len(rows[0]) == 9 else 6
     numbers = 1e3 * to_numbers(path, lines, rows, width)
+    for n in np.flatnonzero(np.abs(numbers[:, :3]).max(axis=1) < 1e6):
+        raise Where(path, lines[n]).error(
+            "a position in the Earth's core", "positions in km from its center"
+        )
     t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
     if width == 6:
         numbers = np.column_stack([numbers, np.full((len(numbers), 3), np.nan)])

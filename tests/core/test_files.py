@@ -276,6 +276,22 @@ def test_an_interrupted_file_keeps_the_old_one(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_full_disk_that_only_a_text_reports_is_named_with_the_room_left(
+    tmp_path: Path,
+) -> None:
+    """NumPy counts the numbers of an array that were written, without an error number."""
+
+    def break_off_as_numpy() -> None:
+        with files.atomic_file(tmp_path / "new.fits") as temporary:
+            temporary.write_text("half")
+            raise OSError("324887 requested and 152160 written")
+
+    with pytest.raises(OSError, match=r"No space left on device; .* MB are free") as raised:
+        break_off_as_numpy()
+    assert raised.value.filename == str(tmp_path / "new.fits")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_picture_that_cannot_be_encoded_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(
         InputError,

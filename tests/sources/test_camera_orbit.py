@@ -177,6 +177,11 @@ def test_an_oem_is_interpolated_between_its_samples(
         ("TIME_SYSTEM = UTC\n", "", "TIME_SYSTEM is missing"),
         ("META_START", "META", "is not KEYWORD = value"),
         ("META_START\n", "", "line 5: META_STOP before META_START"),
+        (
+            numbers(ellipse(np.zeros(1))[0][0] / 1e3),
+            "0 0 0",
+            "a position in the Earth's core",
+        ),
     ],
 )
 def test_a_bad_oem_is_refused_in_one_line(

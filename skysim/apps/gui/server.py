@@ -17,6 +17,7 @@ from urllib.parse import quote
 import nicegui
 from nicegui import app, core, ui
 from starlette.datastructures import MutableHeaders
+from starlette.middleware.exceptions import ExceptionMiddleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import (
@@ -149,8 +150,8 @@ async def stream(request: Request) -> Response:
 
 
 # Frames bypass the application's own layers, each of which takes a tenth of the time that a frame may take.
-FRAME_ROUTES = Router(
-    [Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)]
+FRAME_ROUTES = ExceptionMiddleware(
+    Router([Route("/frame/{tab}/{number:int}", frame), Route("/frame/{tab}/next", stream)])
 )
 
 

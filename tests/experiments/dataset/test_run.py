@@ -421,7 +421,9 @@ def test_another_dataset_is_not_overwritten(
     assert contents(tmp_path) == before
 
 
-@pytest.mark.parametrize("url", ["nowhere://x/y", "s4://bucket"])
+@pytest.mark.parametrize(
+    "url", ["nowhere://x/y", "s4://bucket", "memory://x", "simplecache::memory://x"]
+)
 def test_an_unknown_url_is_refused(url: str) -> None:
     with pytest.raises(InputError, match=rf"^{url}: .*allowed"):
         dataset_shards.Storage(url)

@@ -493,3 +493,28 @@ def test_a_lost_scheduler_is_reported_and_received_rows_are_kept(
             done(plan_, path, engine, watch=kill)
     done(plan_, path, engines.Serial(), resume=True)
     assert contents(path) == serial_contents
+
+
+CTRL_C = """
+import os, signal, time
+from skysim.experiments.study.execution import workers
+
+signal.signal(signal.SIGINT, lambda *_: None)
+workers.start_fork_server()
+time.sleep(0.4)
+os.killpg(0, signal.SIGINT)
+time.sleep(0.6)
+"""
+
+
+def test_ctrl_c_during_the_imports_of_the_workers_prints_nothing_of_theirs() -> None:
+    """A terminal sends it to every process of the command."""
+    done_ = subprocess.run(
+        [sys.executable, "-c", CTRL_C],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        start_new_session=True,
+        check=False,
+    )
+    assert (done_.returncode, done_.stderr) == (0, "")

@@ -536,7 +536,11 @@ def test_a_part_that_is_missing_or_damaged_is_named(tmp_path: Path) -> None:
         ),
         (
             "UPDATE meta SET value = '0' WHERE key = 'replicates'",
-            r"s\.sqlite: not a valid study store: replicates 0",
+            r"s\.sqlite: not a valid study store: trial 100, .* of 3 points and 0 replicates",
+        ),
+        (
+            "UPDATE parts SET last = 7 WHERE part = 3",
+            r"s\.sqlite: not a valid study store: .*'no point 7'",
         ),
     ],
 )
@@ -546,7 +550,7 @@ def test_an_invalid_list_of_parts_is_refused_in_one_line(
     path = filled(tmp_path / "s.sqlite", ALL)
     with closing(sqlite3.connect(path)) as db, db:
         assert db.execute(change).rowcount
-    with store.open_store(path) as kept, pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message), store.open_store(path) as kept:
         kept.trial_range()
 
 

@@ -253,6 +253,83 @@ def test_a_value_of_a_wrong_type_is_refused_in_one_line(
     assert str(refused.value).count("odd.sqlite") == 1
 
 
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("trials SET point = -1 WHERE trial = 1", "trial 1, point -1, replicate 1"),
+        ("trials SET point = 7 WHERE trial = 1", "trial 1, point 7, replicate 1"),
+        ("trials SET replicate = 0 WHERE trial = 1", "trial 1, point 0, replicate 0"),
+        ("trials SET trial = -1 WHERE trial = 1", "trial -1, point 0, replicate 1"),
+        ("trials SET trial = 9 WHERE trial = 1", "trial 9, point 0, replicate 1"),
+        ("meta SET value = '1' WHERE key = 'replicates'", "trial 1, point 0, replicate 1"),
+        ("points SET point = 5 WHERE point = 1", "point 5 of 2, levels of led"),
+        ("points SET levels = '{}' WHERE point = 1", "point 1 of 2, levels of no factor"),
+    ],
+)
+def test_a_row_that_is_none_of_the_study_s_is_refused(
+    damage: str, message: str, tmp_path: Path
+) -> None:
+    """Its numbers would be indices of other rows: point -1 is the last one."""
+    path = tmp_path / "odd.sqlite"
+    row = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
+    with store.writing(path) as kept:
+        kept.begin([Point({"led": one}, {"led": one}) for one in "ab"], replicates="2")
+        kept.add([row, row._replace(trial=1, replicate=1), row._replace(trial=2, point=1)])
+    with store.open_store(path) as kept:
+        assert len(kept.columns()["trial"]) == 3
+    with closing(sqlite3.connect(path)) as db, db:
+        assert db.execute(f"UPDATE {damage}").rowcount
+    for opened in (store.open_store, store.writing):
+        with pytest.raises(InputError) as refused, opened(path):
+            pass
+        assert str(refused.value).startswith(f"{path}: not a valid study store: {message}")
+        assert "; allowed: " in str(refused.value)
+
+
+def test_several_rows_of_a_trial_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "odd.sqlite"
+    row = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
+    with store.writing(path) as kept:
+        kept.begin([Point({}, {})], replicates="1")
+        kept.add([row])
+    with closing(sqlite3.connect(path)) as db:
+        db.executescript(
+            "CREATE TABLE twice AS SELECT * FROM trials UNION ALL SELECT * FROM trials;"
+            "DROP TABLE trials; ALTER TABLE twice RENAME TO trials"
+        )
+    with (
+        store.open_store(path) as kept,
+        pytest.raises(InputError, match=r"odd\.sqlite: .*several rows of a trial"),
+    ):
+        kept.columns()
+
+
+def test_a_store_without_room_for_its_tables_has_none_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk ends the run between two tables; `resume` then says that there is nothing to resume."""
+    path = tmp_path / "s.sqlite"
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "TABLES", store.TABLES + "INSERT INTO nowhere VALUES (1)")
+        with pytest.raises(InputError, match="no such table"), store.writing(path):
+            pass
+    with pytest.raises(InputError, match="contains no trials"), store.open_store(path):
+        pass
+    with store.writing(path) as kept:
+        kept.begin([], replicates="1")
+
+
+def test_a_store_on_a_full_disk_says_how_much_room_is_left(tmp_path: Path) -> None:
+
+    def write() -> None:
+        with store.writing(tmp_path / "s.sqlite") as kept:
+            kept.db.execute("PRAGMA max_page_count = 16")
+            kept.begin([Point({}, {"key": "x" * 100_000})], replicates="1")
+
+    with pytest.raises(InputError, match=r"MB are free, nothing is half-written; .*is full"):
+        write()
+
+
 def test_no_points_have_columns_without_rows(tmp_path: Path) -> None:
     """A map with a panel for each level has a level without points if `where` chooses another one."""
     path = tmp_path / "s.sqlite"
@@ -268,14 +345,15 @@ def test_a_resumed_store_with_text_for_a_number_is_refused(tmp_path: Path) -> No
     path = tmp_path / "odd.sqlite"
     row = Row(0, 0, 0, 7, "scene", "code", Outcome("solved", 1, 1), None, 1e-3)
     with store.writing(path) as kept:
-        kept.add([row, row._replace(trial=1), row._replace(trial=2)])
+        kept.begin([Point({}, {})], replicates="3")
+        kept.add([row._replace(trial=n, replicate=n) for n in range(3)])
     with closing(sqlite3.connect(path)) as db, db:
         db.execute("UPDATE trials SET point = 'two' WHERE trial = 2")
     with (
-        store.writing(path) as kept,
-        pytest.raises(InputError, match=r"odd\.sqlite: .*'two'.*allowed: int, str"),
+        pytest.raises(InputError, match=r"odd\.sqlite: .*trial 2, point 'two', replicate 2"),
+        store.writing(path),
     ):
-        kept.scenes()
+        pass
 
 
 def taken(folder: Path) -> Path:

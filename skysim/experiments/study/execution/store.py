@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.files import make_folder, remove
+from skysim.core.files import make_folder, remove, room_left
 from skysim.core.types import Bools, Ints, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
@@ -64,6 +64,26 @@ CREATE TABLE IF NOT EXISTS runs (
 CREATE TABLE IF NOT EXISTS parts (
   part INTEGER PRIMARY KEY, rows INTEGER NOT NULL, wrong INTEGER NOT NULL, first INTEGER NOT NULL,
   last INTEGER NOT NULL);
+"""
+
+# What is wrong with the first row that is none of the study's, and what is allowed. A point's number is its place in
+# the list of points, and the numbers of a trial follow from one another, so that each of them can serve as an index.
+STRAY = """
+WITH study AS (
+  SELECT COALESCE(MAX(CAST(value AS INTEGER)), 0) AS each, (SELECT COUNT(*) FROM points) AS points,
+    (SELECT group_concat(key, ', ') FROM json_each((SELECT levels FROM points ORDER BY point LIMIT 1))) AS factors
+  FROM meta WHERE key = 'replicates')
+SELECT 'not a valid study store: trial ' || trial || ', point ' || quote(point) || ', replicate ' || quote(replicate),
+  'trial ' || each || ' * point + replicate, of ' || points || ' points and ' || each || ' replicates'
+FROM trials, study
+WHERE trial < 0 OR trial >= each * points OR point IS NOT trial / each OR replicate IS NOT trial % each
+UNION ALL
+SELECT 'not a valid study store: point ' || point || ' of ' || points || ', levels of '
+  || COALESCE((SELECT group_concat(key, ', ') FROM json_each(levels)), 'no factor'),
+  'points from 0 on, levels of ' || COALESCE(factors, 'no factor')
+FROM points, study
+WHERE point < 0 OR point >= points OR (SELECT group_concat(key, ', ') FROM json_each(levels)) IS NOT factors
+LIMIT 1
 """
 
 values_of = attrgetter(
@@ -243,8 +263,10 @@ class Store:
         # A store of an earlier skysim has no such table.
         if self.meta("format") != str(FORMAT_OF_PARTS):
             return []
+        # A last point that the study does not have is no integer here, which is refused.
         rows = self.db.execute(
-            "SELECT part, rows, wrong, first, last FROM parts ORDER BY part"
+            "SELECT part, rows, wrong, first, CASE WHEN typeof(last) = 'integer' AND last >= (SELECT COUNT(*) "
+            "FROM points) THEN 'no point ' || last ELSE last END FROM parts ORDER BY part"
         )
         known = (self.checked(row, int, int, int, int, int) for row in rows)
         return [
@@ -396,6 +418,11 @@ class Store:
         trial = np.concatenate(numbers)
         in_order = bool(np.all(trial[1:] > trial[:-1]))
         order = None if in_order else np.argsort(trial, kind="stable")
+        # The numbers are a table's key, but a part has none.
+        if not in_order and len(np.unique(trial)) < len(trial):
+            raise InputError(
+                self.path, "not a valid study store: several rows of a trial", "one"
+            )
         return Rows(COLUMNS, sources, list(map(len, numbers)), order)
 
     def _replicates(self) -> int:
@@ -503,8 +530,12 @@ def open_store(path: Path) -> Iterator[Store]:
 
 
 def check_format(store: Store) -> None:
-    """Raise InputError for a store of another format."""
-    stored = store.meta("format")
+    """Raise InputError for a store of another format, or with a row that is none of its study's."""
+    # A run that the disk had no room for leaves an empty database.
+    found = store.db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone()
+    stored = found and store.meta("format")
+    if not stored:
+        raise InputError(store.path, "contains no trials of a study", "to run the study")
     if stored in ("1", "4", "5"):
         raise InputError(
             store.path,
@@ -513,6 +544,8 @@ def check_format(store: Store) -> None:
         )
     if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):
         raise InputError(store.path, f"format {stored!r}", f"{FORMAT}, {FORMAT_OF_PARTS}")
+    if stray := store.db.execute(STRAY).fetchone():
+        raise InputError(store.path, *stray)
 
 
 @contextmanager
@@ -524,6 +557,8 @@ def sqlite_errors_as_input_error(path: Path, what: str = "") -> Iterator[None]:
     try:
         yield
     except (sqlite3.DatabaseError, UnicodeDecodeError, MemoryError) as error:
+        if str(error).endswith(("is full", "I/O error")):
+            what = f"{room_left(path)}; "
         raise InputError(path, f"{what}{str(error) or 'not enough memory'}") from None
 
 
@@ -553,6 +588,8 @@ def writing(path: Path) -> Iterator[Store]:
             db.execute("PRAGMA synchronous = NORMAL")
             store = Store(path, db)
             with db:
+                # Python begins no transaction for tables, and a full disk must not leave some of them.
+                db.execute("BEGIN")
                 for statement in TABLES.split(";"):
                     db.execute(statement)
                 db.execute("INSERT OR IGNORE INTO meta VALUES ('format', ?)", (str(FORMAT),))

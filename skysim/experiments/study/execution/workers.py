@@ -2,9 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext
 
 from skysim.core.guarded import SAFE_PATH
@@ -35,9 +36,13 @@ def one_thread() -> Iterator[None]:
     """
     previous = {name: os.environ.get(name) for name in SETTINGS}
     os.environ.update(SETTINGS)
+    # They inherit the mask: Ctrl-C, which a terminal sends to all, would end their imports with a traceback.
+    resource_tracker.ensure_running()  # unblocks the signal
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name, value in previous.items():
             del os.environ[name]
             if value is not None:
