@@ -79,7 +79,8 @@ def test_a_flight_that_cannot_be_integrated_is_one_error_line_and_leaves_no_file
 ) -> None:
     monkeypatch.chdir(tmp_path)
     overrides = {
-        "vehicle.disturbances": "{cable: {stiffness: 1e8 N m / rad}}",
+        "vehicle.disturbances": "{cable: {stiffness: 1e6 N m / rad}}",
+        "vehicle.model": "vehicles/cubesat.xml",
         "exposure": QUIET % 0.3,
     }
     with pytest.raises(

@@ -150,6 +150,14 @@ CASES = [
         "detected lights",
         6,
     ),
+    Case(
+        "what_limits_a_dome",
+        {"dome": "measured", "cause": "die"},
+        "cross_arcsec_rms",
+        "| die |",
+        "across, measured dome ″",
+        8,
+    ),
     Case("dome_without_codes", SEARCH, "angle_arcsec_p95", "| 595 |", "within ″", 60),
     Case("dome_for_the_money", MONEY, "angle_arcsec_p95", "| 219 |", "within ″", 60),
 ]

@@ -487,9 +487,9 @@ def scale_etc() -> dict[str, Any]:
 
 def test_a_further_error_does_not_change_the_noise() -> None:
     quiet = unit({"arw_deg_sqrt_h": 0.07}).measure(steady([0, 0, 0], 50)).angle_rad
-    biased = unit({"arw_deg_sqrt_h": 0.07, "bias_deg_h": 1.0, "bias_time": "1e15 s"})
+    biased = unit({"arw_deg_sqrt_h": 0.07, "bias_deg_h": 1.0, "bias_time": "1e9 s"})
     got = biased.measure(steady([0, 0, 0], 50)).angle_rad - STEP * biased.gyro_bias_rad_s
-    np.testing.assert_allclose(got, quiet, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(got, quiet, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -555,7 +555,7 @@ def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     settings = {
         "turn_on_bias_ug": 300,
         "bias_ug": 50,
-        "bias_time": "1e15 s",
+        "bias_time": "1e9 s",
         "scale_ppm": 300,
     }
     one = Imu(part(None, settings), np.random.default_rng(3))
@@ -567,7 +567,7 @@ def test_accelerometer_errors_are_independent_of_gyro_errors() -> None:
     mean = got.velocity_m_s.mean(axis=0) / STEP
     up = one.accelerometer.matrix[2, 2] * G * np.array([0, 0, 1])
     np.testing.assert_allclose(
-        mean - up, one.accelerometer.turn_on_bias + one.accelerometer.markov_bias, rtol=1e-5
+        mean - up, one.accelerometer.turn_on_bias + one.accelerometer.markov_bias, rtol=2e-4
     )
     assert abs(one.accelerometer.matrix[2, 2] - 1) < 4 * 300e-6
 

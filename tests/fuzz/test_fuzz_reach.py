@@ -59,6 +59,7 @@ OUT_OF_REACH = {
     "estimator.attitude.dome_map._read_leds": "its lists are those of skysim's reader; a test reads them with both",
     "skysim.apps.cli.commands.datasheet.parse_rates": "numbers of an option, not of a file",
     "skysim.experiments.datasheet.datasheet_report.standard_section": SHIPPED,
+    "skysim.experiments.study.execution.store.Store.overrides": "a row of a store, which `open_store` reads",
     "skysim.experiments.study.own_code.digest_of": "the text of the user's own code, which Python has read",
     "skysim.experiments.study.execution.runner.check_functions": "the store is read by `open_store`",
     "skysim.apps.cli.commands.resources.new": SHIPPED,

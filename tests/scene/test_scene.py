@@ -1037,7 +1037,7 @@ def test_an_override_precedes_scene_and_base(tmp_path: Path) -> None:
     [
         (
             "nosuch",
-            "base: nosuch: no such scene; allowed: a .yaml file or one of afit_board, ",
+            "base: nosuch: no such scene; allowed: a .yaml file or one of afit_as_built, ",
         ),
         ("nosuch.yaml", "base: nosuch.yaml: no such scene; allowed: a .yaml file or one of "),
         ("3", "base: 3: no such scene; allowed: "),

@@ -162,7 +162,8 @@ def test_every_file_that_skysim_reads_is_valid(tmp_path: Path) -> None:
         result = check_file(path, {})
         assert (result.fault, result.what[: len(what)]) == ("", what)
     assert (
-        "allowed: a .yaml file or one of afit_board" in check_file(Path("nosuch"), {}).fault
+        "allowed: a .yaml file or one of afit_as_built"
+        in check_file(Path("nosuch"), {}).fault
     )
 
 

@@ -463,7 +463,7 @@ def test_a_function_s_attitudes_reach_the_filter_and_the_controller() -> None:
         "motion.start": {},
         "motion.maneuver": [],
         **exposures("0.1 s", frames=12, rate_hz=4),
-        "filter.gate_sigma": 1e9,
+        "filter.gate_sigma": 1e6,
         "filter.latency": "0 s",
     }
     scene = skysim.load_scene("simsat_bump", changes)
