@@ -252,7 +252,7 @@ def test_the_sun_s_stray_light_matches_its_transmittance() -> None:
     """Irradiance by Planck: 5772 K over the solar disk's 6.794e-5 sr, 400-1000 nm, with an efficiency of one half."""
     ra_deg, dec_deg = lab_place(110.0)
     sun = glow(
-        kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(20, 180), pst=(1e-4, 1e-12)
+        kind="stray", ra_deg=ra_deg, dec_deg=dec_deg, angle_deg=(40, 180), pst=(1e-4, 1e-12)
     )
     wavelength = np.linspace(400e-9, 1000e-9, 6001)
     photons = (
