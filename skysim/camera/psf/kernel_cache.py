@@ -231,14 +231,14 @@ def ellipses(
 def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     """The kernels of N keys (N, 3 or 5) in the camera's cache, with the ellipses `disk`; makes the missing ones."""
     cache = kernel_cache(camera)
-    codes = keys[:, :3] @ PACKING
+    # Sizes pack into integers, which sort faster than rows; those with coma do not.
+    has_coma = keys.shape[1] > len(PACKING)
+    codes = keys if has_coma else keys @ PACKING
     # Stars in focus share one key, which saves the sort.
     first = np.zeros(1, int)
     inverse = np.zeros(len(codes), int)
     if codes.any() or not codes.size:
-        _, first, inverse = np.unique(codes, return_index=True, return_inverse=True)
-    if keys.shape[1] > 3:
-        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        _, first, inverse = np.unique(codes, axis=0, return_index=True, return_inverse=True)
     used = [tuple(key) for key in keys[first].tolist()]
     add_kernels(cache, camera, used)
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -53,22 +54,25 @@ class LedDome(KnownLight):
     thermal: ThermalConfig | None
     _timing: dict[int, LedTiming] = field(init=False, repr=False, default_factory=dict)
 
+    @cached_property
+    def dies(self) -> Sources:
+        """The LEDs with their light beside the surveyed centers of their windows."""
+        die_m = np.array(self.config.led.die_m)
+        return off_center(self.sources, die_m) if die_m.any() else self.sources
+
     def during(self, exposure: Exposure) -> Lit:
         """The LEDs and the light of black pixels. Without seeds the LEDs are lit for their share of the time.
 
         1. Warm-up reduces the strength of all LEDs.
-        2. Their dies are beside the surveyed centers of the windows, and temperature moves them.
+        2. Temperature moves them.
         3. Pulses and codes of this run set their on-times.
         """
         # 1. Warm-up.
         left = warm_up_factor(self.config.led.warm_up, exposure.t_s)
-        leds = self.sources
+        leds = self.dies
         if left < 1:
             leds = replace(leds, strength=left * leds.strength)
-        # 2. Dies and thermal motion.
-        die_m = np.array(self.config.led.die_m)
-        if die_m.any():
-            leds = off_center(leds, die_m)
+        # 2. Thermal motion.
         if self.thermal is not None:
             leds = leds_at(self.thermal, leds, exposure.t_s)
         # 3. Pulses and codes.
