@@ -7,7 +7,8 @@ from contextlib import contextmanager
 
 from skysim.core.errors import InputError
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1", "[::1]")
+HOST = "127.0.0.1"  # reached by this machine alone
+LOOPBACK = (HOST, "localhost", "::1", "[::1]")
 
 
 def token_matches(candidate: str, token: str) -> bool:

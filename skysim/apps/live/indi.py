@@ -27,7 +27,7 @@ from indipydriver import (
 )
 from indipyserver import IPyServer
 
-from skysim.apps.access import listen
+from skysim.apps.access import HOST, listen
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.sinks import CLOSE_TIMEOUT_S, Sink
@@ -38,7 +38,6 @@ from skysim.results.files.recording import fits_image
 from skysim.scene.scene import Scene
 from skysim.simulation.timing import longest_live_s
 
-HOST = "127.0.0.1"
 DEVICE = "skysim"
 GROUP = "Main"
 CCD_INTERFACE = "2"  # the bit of a camera in DRIVER_INTERFACE

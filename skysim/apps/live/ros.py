@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from mcap_ros2._dynamic import serialize_dynamic
 from scipy.spatial.transform import Rotation
 
+from skysim.apps.access import HOST
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet
 from skysim.apps.live.sinks import Sink
@@ -29,7 +30,6 @@ from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard
 
 BODY = "body"
 CAMERA = "camera_optical_frame"
-LOOPBACK_HOST = "127.0.0.1"
 MOST_WAITING = 64  # messages for a slow client of Foxglove, each of which may be a frame
 
 Message = dict[str, Any]
@@ -298,13 +298,13 @@ class FoxgloveSink(Sink):
         try:
             self.server = foxglove.start_server(
                 name="skysim live",
-                host=LOOPBACK_HOST,
+                host=HOST,
                 port=port,
                 context=self.context,
                 message_backlog_size=MOST_WAITING,
             )
         except Exception as error:
-            problem = printable(f"cannot listen on {LOOPBACK_HOST}:{port}: {error}")
+            problem = printable(f"cannot listen on {HOST}:{port}: {error}")
             raise InputError(f"--foxglove {port}", problem) from None
         super().__init__(
             "foxglove", self.publish, {topic.channel for topic in encoder.topics}

@@ -245,7 +245,7 @@ def as_built(view: View, context: Context) -> Floats | None:
     shifts = (*camera.pupil_walk_m, *die_m, camera.detector.edge_px)
     if not (scene.thermal or scene.vehicle.is_bent or any(shifts)):
         return None
-    mount = context.lab.camera.mount
+    mount = context.camera.mount
     place = context.beliefs.lights.place[view.row]
     surveyed_m = mount.toward(place, view.lab_from_cam * mount.cam_from_body)
     surveyed_px = context.camera.optics.project(surveyed_m)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from typer import Option
 
+from skysim.apps.access import HOST
 from skysim.apps.cli.options import Frames, Json, Overrides, SceneArg, Seed, load
 from skysim.core.errors import InputError
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from skysim.apps.live.sinks import Output
 
 
-HOST = "127.0.0.1"
 PORTS = {"min": 0, "max": 65535}
 
 
