@@ -13,7 +13,7 @@ import sys
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +43,21 @@ NARROW = {"width": 1280, "height": 800}
 class Server:
     """A process that serves the page, with a folder of its own."""
 
-    def __init__(self, folder: Path, *options: str, host: str = "127.0.0.1") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        host: str = "127.0.0.1",
+        program: Sequence[str] = (sys.executable, "-m", "skysim"),
+        cwd: Path = ROOT,
+    ) -> None:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.folder = folder
         self.out = folder / "out"
         command = [
-            sys.executable,
-            "-m",
-            "skysim",
+            *program,
             "gui",
             "shefex2",
             "--no-open",
@@ -74,7 +79,7 @@ class Server:
             name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"
         }
         self.process = subprocess.Popen(
-            [*command, *place, *options], cwd=ROOT, env=environment, start_new_session=True
+            [*command, *place, *options], cwd=cwd, env=environment, start_new_session=True
         )
         self.url = f"http://127.0.0.1:{self.port}/"
         self.login = f"{self.url}?token={TOKEN}"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
+
+from tests.helpers.labpage import Server, come
 
 SKYSIM = Path(sys.executable).with_name("skysim")
 NAMES = {
@@ -67,18 +67,16 @@ def test_a_command_imports_nothing_from_the_working_directory(
 
 
 @pytest.mark.slow
-def test_nor_does_the_page(folder: Path) -> None:
+def test_nor_does_the_page(folder: Path, tmp_path: Path) -> None:
     """Its workers are forked from a process that sets a scene up."""
-    words = [SKYSIM, "gui", "s.yaml", "--no-open", "--port", "18437"]
-    # The library of the page does not start its server under pytest.
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith("PYTEST")
-    }
-    with subprocess.Popen(words, cwd=folder, env=environment) as page:
-        try:
-            time.sleep(20)
-            assert page.poll() is None
-        finally:
-            page.terminate()
-        page.wait(30)
+    pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+    with Server(tmp_path, program=[str(SKYSIM)], cwd=folder) as page:
+        # The process from which the workers are forked is idle once it has imported what they need.
+        assert page.come_to("gui.template", 1) == 1
+        (template,) = page.children("gui.template")
+        busy_s = 1.0
+        assert come(
+            lambda: template.cpu_times().user > busy_s and template.cpu_percent(busy_s) < 1
+        )
+        assert page.status() in (200, 401, 403)
     assert [path.name for path in (folder / "marks").iterdir()] == []

@@ -530,7 +530,7 @@ def open_store(path: Path) -> Iterator[Store]:
 
 
 def check_format(store: Store) -> None:
-    """Raise InputError for a store of another format, or with a row that is none of its study's."""
+    """Raise InputError for a store of another format, or with a row that does not belong to its study."""
     # A run that the disk had no room for leaves an empty database.
     found = store.db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone()
     stored = found and store.meta("format")
