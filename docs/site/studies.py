@@ -33,7 +33,7 @@ from skysim.experiments.study.report.study_report import Analysis, analyze, comm
 from skysim.experiments.study.study_file import load
 from skysim.experiments.study.table import format_level, format_response, format_summary
 from skysim.results import metrics
-from skysim.results.report_blocks import figures
+from skysim.results.report import figures
 
 SITE = Path(__file__).parent
 PAGES = SITE.parent / "findings" / "studies"

@@ -21,14 +21,14 @@ from skysim.core.types import Floats, Record
 from skysim.experiments.balance_flight import Assumptions, BalanceFlight, largest_tilt_deg
 from skysim.experiments.balance_procedure import BalancePlan, Iteration
 from skysim.results.plots import png
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Block,
     Cell,
     Column,
     Facts,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Text,

@@ -46,10 +46,10 @@ from skysim.core.types import Floats, Ints, Record, normalized
 from skysim.experiments.dome_survey import survey_images
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, calibration_prior
 from skysim.results.plots import INK, png
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Column,
     Figure,
+    Report,
     Section,
     Table,
     Verdict,

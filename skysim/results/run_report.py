@@ -13,13 +13,13 @@ from estimator.identification import refusals as reasons
 from skysim.core.types import FrameRow, Record
 from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Cell,
     Column,
     Facts,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Text,

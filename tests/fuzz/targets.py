@@ -40,8 +40,7 @@ from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import store
 from skysim.results.files import recording
 from skysim.results.files.parts import read_prices
-from skysim.results.report import print_table
-from skysim.results.report_blocks import Column, Table
+from skysim.results.report import Column, Table, print_table
 from skysim.scene import loader, opencv_calibration
 from skysim.simulation.flight import open_flight
 from skysim.sources import catalog as star_catalog

@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from skysim.core.errors import printable
 from skysim.core.paths import shipped_files, title_of
-from skysim.results.report import print_blocks, print_table, print_wrapped
-from skysim.results.report_blocks import Cell, Column, Facts, Items, Table, Text, text_column
+from skysim.results.report import (
+    Cell,
+    Column,
+    Facts,
+    Items,
+    Table,
+    Text,
+    print_blocks,
+    print_table,
+    print_wrapped,
+    text_column,
+)
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar

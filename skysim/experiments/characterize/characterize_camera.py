@@ -27,13 +27,13 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.experiments.characterize.sensor_fit import MeasuredSensor
 from skysim.results.plots import INK, png
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Cell,
     Column,
     Facts,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Verdict,

@@ -25,12 +25,12 @@ from skysim.experiments.datasheet.statement import (
     sizes,
 )
 from skysim.results.plots import INK, png
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Block,
     Column,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Text,

@@ -29,13 +29,13 @@ from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Block,
     Cell,
     Column,
     Facts,
     Figure,
+    Report,
     Section,
     Table,
     Text,

@@ -8,12 +8,12 @@ from skysim.experiments.papers.published import PublishedRow
 from skysim.experiments.papers.reproduction import VERDICTS, Comparison, Ours, Reproduction
 from skysim.experiments.papers.reproduction import Verdict as RowVerdict
 from skysim.results.metrics import SIGMAS
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Cell,
     Code,
     Column,
     Items,
+    Report,
     Section,
     Table,
     Text,

@@ -12,8 +12,7 @@ from skysim.apps.cli.options import Json, Overrides, SceneArg, load
 from skysim.apps.cli.terminal import print_json, progress_callback
 from skysim.core.constants import DAY_S, EARTH_MU_M3_S2, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
-from skysim.results.report import print_table
-from skysim.results.report_blocks import Column, Table, text_column
+from skysim.results.report import Column, Table, print_table, text_column
 
 if TYPE_CHECKING:
     from skysim.core.types import Bools

@@ -13,8 +13,14 @@ from skysim.apps.cli.commands.study import Workers
 from skysim.apps.cli.options import LOADED, Json, OpenReport, Overrides, SceneArg, Seed, load
 from skysim.apps.cli.terminal import print_json, trial_progress
 from skysim.core.errors import InputError
-from skysim.results.report import page_path, print_table, print_wrapped
-from skysim.results.report_blocks import Column, Table, text_column
+from skysim.results.report import (
+    Column,
+    Table,
+    page_path,
+    print_table,
+    print_wrapped,
+    text_column,
+)
 
 if TYPE_CHECKING:
     from skysim.experiments.datasheet.cells import MeasuredFrames

@@ -11,8 +11,7 @@ from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write
 from skysim.apps.cli.terminal import print_json, print_titles, progress
 from skysim.core.errors import InputError, check_name
 from skysim.core.paths import DATA, SCENES
-from skysim.results.report import print_table
-from skysim.results.report_blocks import Column, Table
+from skysim.results.report import Column, Table, print_table
 
 # A kind is the name of its template, with any endings.
 NEW = DATA / "new"

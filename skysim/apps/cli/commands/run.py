@@ -98,7 +98,7 @@ def print_results(
     json: bool,
 ) -> Record:
     """Print the results of the main camera and of the further heads; return the main camera's statistics."""
-    from skysim.results.report_blocks import Facts
+    from skysim.results.report import Facts
     from skysim.simulation.checks.facts import TRACKER_KNOWS
 
     (statistics, report), *others = finished

@@ -24,8 +24,14 @@ from skysim.experiments.dome_survey import (
 from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
 from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
-from skysim.results.report import print_blocks, print_table, print_wrapped
-from skysim.results.report_blocks import Column, Table, text_column
+from skysim.results.report import (
+    Column,
+    Table,
+    print_blocks,
+    print_table,
+    print_wrapped,
+    text_column,
+)
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory

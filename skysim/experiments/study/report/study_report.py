@@ -33,8 +33,7 @@ from skysim.experiments.study.table import (
 )
 from skysim.experiments.study.worst import ColumnsOf, ranked, worst_trials
 from skysim.results import metrics
-from skysim.results.report import Report
-from skysim.results.report_blocks import (
+from skysim.results.report import (
     Block,
     Cell,
     Code,
@@ -42,6 +41,7 @@ from skysim.results.report_blocks import (
     Facts,
     Figure,
     Items,
+    Report,
     Section,
     Table,
     Text,
