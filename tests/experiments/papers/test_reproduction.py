@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT, SCENES, STUDIES, shipped_files
-from skysim.experiments.papers import papers_report, reproduction
+from skysim.experiments.papers import reproduction
 from skysim.experiments.papers.published import PublishedRow, experiments
-from skysim.experiments.papers.reproduction import Options, Ours, Verdict
+from skysim.experiments.papers.reproduction import Options, Ours, RowVerdict
 
 FINDINGS = ROOT / "docs" / "findings"
 
@@ -39,7 +39,7 @@ def row(**fields: object) -> PublishedRow:
         (Ours(math.nan), "disagrees"),
     ],
 )
-def test_a_verdict_tests_the_difference(ours: Ours, wanted: Verdict) -> None:
+def test_a_verdict_tests_the_difference(ours: Ours, wanted: RowVerdict) -> None:
     """A tolerance of 0.5 and 1.96 standard errors of ours; a wide interval that covers the number decides nothing."""
     assert reproduction.verdict(row(published=10, tolerance=0.5), ours) == wanted
 
@@ -61,7 +61,7 @@ def test_two_true_means_agree_as_often_as_stated() -> None:
     ("ours", "wanted"),
     [(Ours(0.95), "agrees"), (Ours(0.85), "disagrees"), (Ours(0.91, 0.02), "undecided")],
 )
-def test_a_bound_is_compared_on_its_side(ours: Ours, wanted: Verdict) -> None:
+def test_a_bound_is_compared_on_its_side(ours: Ours, wanted: RowVerdict) -> None:
     assert reproduction.verdict(row(at_least=0.9), ours) == wanted
 
 
@@ -142,10 +142,10 @@ def test_report_and_json_have_the_same_verdicts() -> None:
     listed = json.loads(printed.stdout)
     found = reproduction.reproduce("afit-bump", Options(quick=True))
     assert [one["verdict"] for one in listed] == [one.verdict for one in found.comparisons]
-    text = papers_report.papers_report([found], ["afit-bump"], True, 1).markdown()
+    text = reproduction.papers_report([found], ["afit-bump"], True, 1).markdown()
     assert found.commands[0] in text
     for one in found.comparisons:
-        assert papers_report.format_ours(one.ours) in text
+        assert reproduction.format_ours(one.ours) in text
 
 
 def test_the_page_counts_the_verdicts_of_its_table() -> None:

@@ -47,7 +47,6 @@ def reproduce(
     page = out / "report.html"
     paths = [page_path(path) for path in (page if report else None, markdown) if path]
     from skysim.experiments.papers import reproduction
-    from skysim.experiments.papers.papers_report import papers_report, section, verdict
 
     reproductions = []
     for id in reproduction.check_ids(ids):
@@ -55,9 +54,9 @@ def reproduce(
             done = reproduction.reproduce(id, reproduction.Options(quick, seed, watch))
         reproductions.append(done)
         if not json:
-            print_blocks([section(done)])
+            print_blocks([reproduction.section(done)])
     if paths:
-        made = papers_report(reproductions, ids, quick, seed)
+        made = reproduction.papers_report(reproductions, ids, quick, seed)
         for path in paths:
             made.save(path)
     if open_:
@@ -67,7 +66,7 @@ def reproduce(
             [line.as_dict() for result in reproductions for line in result.comparisons]
         )
         return
-    print_blocks([verdict(reproductions)])
+    print_blocks([reproduction.headline(reproductions)])
     for path in paths:
         print(path)
 
