@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 
 from skysim.core.errors import InputError
-from skysim.results.files import gore_pages, templates
-from skysim.results.files.gore_pages import (
+from skysim.results.files import templates
+from skysim.results.files.templates import (
     HEAD_MM,
     MARGIN_MM,
     OVERLAP_MM,
     PAPERS,
+    Circle,
     Page,
+    Polyline,
     pages,
     write_pdf,
 )
-from skysim.results.files.templates import Circle, Polyline
 from skysim.sources.dome.surface import Ellipsoid
 
 RADIUS_M = 1.2
@@ -124,4 +125,4 @@ def test_gores_of_a_sheet_are_no_wider_than_it() -> None:
     for page in pages(DOME, "a4"):
         for shape in page.shapes:
             if isinstance(shape, Polyline) and shape.closed:
-                assert np.ptp(shape.xy_mm[:, 0]) <= 210 - 2 * gore_pages.MARGIN_MM
+                assert np.ptp(shape.xy_mm[:, 0]) <= 210 - 2 * templates.MARGIN_MM

@@ -66,7 +66,7 @@ def scenes_export(
         Paper of a .pdf: a4 or a3 (sheets to join), roll (610 mm), gore (one a page).
     """
     from skysim.core import files
-    from skysim.results.files import fmu, gore_pages, parts, templates
+    from skysim.results.files import fmu, parts, templates
     from skysim.simulation.lab import build_lab
     from skysim.sources.dome.layouts.led_list import led_list
 
@@ -81,7 +81,7 @@ def scenes_export(
     use = f"python -m mujoco.viewer --mjcf={path}"
     if ending == ".pdf":
         files.make_folder(path.parent)
-        count = gore_pages.write_pdf(path, parts.DomeDesign(loaded, "templates"), paper)
+        count = templates.write_pdf(path, parts.DomeDesign(loaded, "templates"), paper)
         print(f"{path}: {count} pages; print them at 100 %")
         return
     if ending == ".csv":
