@@ -16,7 +16,7 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
-from skysim.experiments import balance_flight, balance_procedure, balance_report
+from skysim.experiments import balance_flight, balance_procedure
 from skysim.experiments.balance_procedure import BalancePlan
 from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader
@@ -60,14 +60,14 @@ def test_table_is_balanced_below_the_published_torque(
     last = list(balance_procedure.balance(scene, BALANCE, UNCERTAINTY))[-1]
     assert last.true_torque_nm < 5e-5
     assert last.torque_bound_nm <= 5e-5
-    result = balance_report.statistics(scene.name, BALANCE, [last])
+    result = balance_procedure.statistics(scene.name, BALANCE, [last])
     assert result["balanced"]
     assert result["nees"] < chi2.ppf(0.9999, 9)
     for row in result["estimates"][:3]:
         assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
     for row in result["estimates"][6:]:
         assert row["estimate"] == pytest.approx(row["truth"], abs=1.0)
-    balance_report.write_all(tmp_path, result, [last], "skysim balance cubesat_table")
+    balance_procedure.write_all(tmp_path, result, [last], "skysim balance cubesat_table")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert '<p class="verdict good">balanced: ' in page
     assert page.count("<tr><td") == 1 + 9
@@ -86,7 +86,7 @@ def test_the_errors_of_a_table_in_frames_match_their_covariance() -> None:
         changes = {"exposure.rate_hz": "1", "tracker.survey.seed": str(seed)}
         scene = loader.load("cubesat_table", changes | {"seed": str(seed)})
         (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
-        total += balance_report.statistics(scene.name, plan, [one])["nees"]
+        total += balance_procedure.statistics(scene.name, plan, [one])["nees"]
     assert chi2.ppf(1e-4, 270) < total < chi2.ppf(1 - 1e-4, 270)
 
 
@@ -99,7 +99,7 @@ def test_simsat_is_measured_to_a_percent_and_a_micrometer(
     scene = scene_of("simsat_slew")
     plan = BALANCE._replace(moves=False)
     (one,) = balance_procedure.balance(scene, plan, UNCERTAINTY)
-    rows = balance_report.statistics(scene.name, plan, [one])
+    rows = balance_procedure.statistics(scene.name, plan, [one])
     for row in rows["estimates"][:3]:
         assert row["estimate"] == pytest.approx(row["truth"], rel=0.01)
     for row in rows["estimates"][6:8]:

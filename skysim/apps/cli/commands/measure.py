@@ -88,7 +88,7 @@ def balance(
     tacho_sigma
         Standard error of a reading of a wheel's speed, rpm.
     """
-    from skysim.experiments import balance_flight, balance_procedure, balance_report
+    from skysim.experiments import balance_flight, balance_procedure
 
     if estimate_only and flights is not None:
         raise InputError("--flights", "has no effect with --estimate-only", "none")
@@ -102,9 +102,9 @@ def balance(
     )
     assumed = balance_procedure.assumed(loaded, uncertainty)
     flown = fly(loaded, plan, uncertainty, json)
-    statistics = balance_report.statistics(loaded.name, plan, flown)
+    statistics = balance_procedure.statistics(loaded.name, plan, flown)
     if in_flight:
-        statistics["in_flight"] = balance_report.filter_rows(flown[-1], assumed)
+        statistics["in_flight"] = balance_procedure.filter_rows(flown[-1], assumed)
     stop_deg = loaded.vehicle.tilt_stop_deg - balance_flight.STOP_MARGIN_DEG
     statistics["uncertain"] = balance_flight.uncertain(
         flown[-1].estimate,
@@ -117,7 +117,7 @@ def balance(
     folder = output_folder(out, loaded.name)
     command = command_line()
     print_report(
-        statistics, balance_report.write_all(folder, statistics, flown, command), json
+        statistics, balance_procedure.write_all(folder, statistics, flown, command), json
     )
 
 
@@ -125,7 +125,7 @@ def fly(
     scene: Scene, plan: BalancePlan, uncertainty: Uncertainty, json: bool
 ) -> list[Iteration]:
     """Fly and move the trim masses until the vehicle is balanced; print each flight, unless `json`."""
-    from skysim.experiments import balance_procedure, balance_report
+    from skysim.experiments import balance_procedure
 
     flown = []
     with progress_callback("flying") as watch:
@@ -133,7 +133,7 @@ def fly(
             flown.append(one)
             if json:
                 continue
-            row = balance_report.flight_row(len(flown), one)
+            row = balance_procedure.flight_row(len(flown), one)
             places = "/".join(f"{place:.3f}" for place in row["next_trim_mm"])
             moves = row["next_trim_mm"] != row["trim_mm"]
             moved = f"; trim masses to {places} mm" if moves else ""
@@ -141,7 +141,7 @@ def fly(
             contact = f", {after} of them after a contact" if after else ""
             print_wrapped(
                 f"flight {row['flight']}: {row['solved']} of {row['frames']} frames solved{contact};"
-                f" center of mass at {balance_report.offset_text(row)} um;"
+                f" center of mass at {balance_procedure.offset_text(row)} um;"
                 f" gravity torque {row['torque_nm']:.2g} N m, at most {row['torque_bound_nm']:.2g} N m{moved}"
             )
     return flown
