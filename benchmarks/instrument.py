@@ -21,7 +21,7 @@ from skysim.camera.glow.background import fill
 from skysim.camera.optics import Optics
 from skysim.camera.render import Window, render
 from skysim.core.types import Floats, Mount, Sources, Trajectory
-from skysim.results.simulate import simulate
+from skysim.results.run import simulate
 from skysim.scene import loader
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation import exposure

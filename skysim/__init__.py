@@ -22,7 +22,7 @@ __getattr__, __dir__, __all__ = lazy_loader.attach(
         "apps.plate_solver": ["solve"],
         "core.errors": ["InputError"],
         "experiments.study.api": ["run_study"],
-        "results.simulate": ["render", "render_at", "simulate"],
+        "results.run": ["render", "render_at", "simulate"],
         "scene.loader": ["list_scenes", "load_scene"],
         "scene.scene": ["Scene"],
         "simulation.flight": ["open_flight"],
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from skysim.apps.plate_solver import solve as solve
     from skysim.core.errors import InputError as InputError
     from skysim.experiments.study.api import run_study as run_study
-    from skysim.results.simulate import render as render
-    from skysim.results.simulate import render_at as render_at
-    from skysim.results.simulate import simulate as simulate
+    from skysim.results.run import render as render
+    from skysim.results.run import render_at as render_at
+    from skysim.results.run import simulate as simulate
     from skysim.scene.loader import list_scenes as list_scenes
     from skysim.scene.loader import load_scene as load_scene
     from skysim.scene.scene import Scene as Scene

@@ -19,7 +19,7 @@ from skysim.experiments.study.execution.trials import run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
 from skysim.experiments.tracker_comparison import with_config
 from skysim.results import metrics
-from skysim.results.simulate import render
+from skysim.results.run import render
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig

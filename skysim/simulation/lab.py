@@ -87,7 +87,7 @@ def with_parts(
     tracker: Any = None,
     profile: Any = None,
 ) -> tuple[Scene, UserParts]:
-    """The scene with the names of these parts, and the parts; see `results.simulate.simulate` for their types.
+    """The scene with the names of these parts, and the parts; see `results.run.simulate` for their types.
 
     Raises
     ------

@@ -22,7 +22,7 @@ import skysim
 from skysim.apps import plate_solver
 from skysim.apps.cli import main
 from skysim.core.errors import InputError
-from skysim.results.simulate import render
+from skysim.results.run import render
 from skysim.scene import loader
 
 DATE = datetime(2012, 6, 22, 21)

@@ -28,7 +28,7 @@ from skysim.apps.plate_solver.plate_solution import camera_notes
 from skysim.apps.plate_solver.solver import solve_centroids
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.results.simulate import render
+from skysim.results.run import render
 from skysim.scene import loader
 
 CAMERA = Camera(800, 600, 1500.0, (410.0, 290.0), (-0.12, 0.03, 4e-4, -3e-4, 0.0))

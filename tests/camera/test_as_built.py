@@ -23,7 +23,7 @@ from skysim.camera.projection import beside_edges
 from skysim.camera.psf.kernel import build_kernel
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Mount, Sources
-from skysim.results.simulate import simulate
+from skysim.results.run import simulate
 from skysim.scene import loader
 from skysim.scene.sections.surroundings import ThermalConfig
 from skysim.scene.sections.vehicle import VehicleConfig

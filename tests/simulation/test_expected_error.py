@@ -16,7 +16,7 @@ from estimator.detection.detect import DETECTORS
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import metrics
-from skysim.results.simulate import render_at
+from skysim.results.run import render_at
 from skysim.scene import loader
 from skysim.simulation.checks import (
     attitudes,

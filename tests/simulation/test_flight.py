@@ -15,7 +15,7 @@ import skysim
 from estimator.core.types import RateEstimate
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame
-from skysim.results.simulate import render
+from skysim.results.run import render
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation import flight as flight_module

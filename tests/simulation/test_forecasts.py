@@ -10,7 +10,7 @@ import pytest
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.results import metrics
-from skysim.results.simulate import render_at
+from skysim.results.run import render_at
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.checks import attitudes, detection, sampling

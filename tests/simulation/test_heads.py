@@ -9,7 +9,7 @@ import pytest
 
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.results.simulate import simulate
+from skysim.results.run import simulate
 from skysim.scene.loader import load_scene
 from skysim.simulation.checks import check
 from skysim.simulation.exposure import render_at_rest
