@@ -44,7 +44,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.core.types import Floats, Ints, Record, normalized
 from skysim.experiments.dome_survey import survey_images
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, calibration_prior
+from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.results.plots import INK, png
 from skysim.results.report import (
     Column,

@@ -11,7 +11,7 @@ from estimator.calibration.home_position import Sighting
 from estimator.core.camera import Camera
 from skysim.core.errors import InputError
 from skysim.experiments import home_calibration as home
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
+from skysim.experiments.dome_survey.survey_frames import CalibrationPrior
 from skysim.experiments.home_calibration import HeldFrame
 from skysim.scene.loader import load
 

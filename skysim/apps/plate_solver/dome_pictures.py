@@ -147,7 +147,7 @@ def make_dome_solver(
     stages
         Names of algorithms by stage; the scene's for the others
     """
-    from skysim.experiments.dome_survey import survey_images, survey_prior
+    from skysim.experiments.dome_survey import survey_frames, survey_images
     from skysim.experiments.tracker_comparison import with_config
     from skysim.scene import loader
     from skysim.simulation.lab import build_lab
@@ -160,12 +160,12 @@ def make_dome_solver(
         raise InputError("solve.dome", f"the light of {dome} is {scene.light.kind}", "a dome")
     # 1. The lists without simulated errors. One picture is too few for codes.
     own = with_config(scene, "tracker", name=OWN, decoder=None, **(stages or {}))
-    lab = build_lab(survey_prior.as_listed(own))
+    lab = build_lab(survey_frames.as_listed(own))
     sigma = onboard_model.assumed_camera(scene).focal_sigma
     camera = replace(onboard_model.assumed_camera(lab.scene), focal_sigma=sigma)
-    prior = survey_prior.listed_prior(lab, camera)
+    prior = survey_frames.listed_prior(lab, camera)
     # 2. The sizes of their errors.
-    doubt = onboard_model.assumed_dome(scene, light, survey_prior.design_of(lab))
+    doubt = onboard_model.assumed_dome(scene, light, survey_frames.design_of(lab))
     names = ("sigma_m", "covariance_m2", "common_m")
     leds = replace(prior.leds, **{name: getattr(doubt, name) for name in names})
     lever = replace(prior.lever, sigma_m=float(scene.tracker.survey.lever_sigma_m))

@@ -27,14 +27,12 @@ from skysim.experiments.dome_survey.survey_findings import (
     stray_lights,
 )
 from skysim.experiments.dome_survey.survey_frames import (
+    CalibrationPrior,
     Correspondences,
     SurveyFrame,
+    assumed,
     match_by_imu,
     match_by_survey,
-)
-from skysim.experiments.dome_survey.survey_prior import (
-    CalibrationPrior,
-    assumed,
 )
 from skysim.simulation.flight import Progress
 from skysim.tracking.dome_map_file import DomeMap

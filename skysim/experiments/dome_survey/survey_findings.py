@@ -18,13 +18,11 @@ from skysim.core.types import Bools, Floats, Record, frozen
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
+    CalibrationPrior,
     Correspondences,
     SurveyFrame,
     match_by_imu,
     planned_stops,
-)
-from skysim.experiments.dome_survey.survey_prior import (
-    CalibrationPrior,
     survey_model,
 )
 from skysim.results.metrics import rms

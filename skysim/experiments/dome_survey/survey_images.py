@@ -28,12 +28,12 @@ from skysim.core.text import excerpt, read_named_rows
 from skysim.core.types import Record
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
+    CalibrationPrior,
     SurveyFrame,
     detect_lights,
     from_angles,
     from_rows,
 )
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results.telemetry_report import euler_deg
 
 ATTITUDES = "attitudes.csv"

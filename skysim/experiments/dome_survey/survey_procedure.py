@@ -26,12 +26,17 @@ from skysim.experiments.dome_survey.survey_findings import (
 from skysim.experiments.dome_survey.survey_frames import (
     CANDIDATES,
     STREAM_KEYS,
+    CalibrationPrior,
     SurveyFrame,
+    SurveyUncertainty,
+    calibration_prior,
     centroid_noise_px,
     imu_attitudes,
     planned_stops,
     stop_attitudes,
+    survey_model,
     take_frames,
+    with_survey_errors,
 )
 from skysim.experiments.dome_survey.survey_images import (
     ATTITUDES,
@@ -40,13 +45,6 @@ from skysim.experiments.dome_survey.survey_images import (
     frame_names,
     frames_with_attitude,
     write_attitudes,
-)
-from skysim.experiments.dome_survey.survey_prior import (
-    CalibrationPrior,
-    SurveyUncertainty,
-    calibration_prior,
-    survey_model,
-    with_survey_errors,
 )
 from skysim.experiments.dome_survey.survey_report import led_errors
 from skysim.experiments.tracker_comparison import with_config

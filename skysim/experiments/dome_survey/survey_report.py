@@ -25,8 +25,8 @@ from skysim.experiments.dome_survey.survey_findings import (
     residuals_px,
     rows_of_columns,
 )
+from skysim.experiments.dome_survey.survey_frames import CalibrationPrior
 from skysim.experiments.dome_survey.survey_images import SOLVED
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior
 from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
 from skysim.results.report import (

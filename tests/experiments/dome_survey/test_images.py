@@ -24,7 +24,6 @@ from skysim.core.types import Floats
 from skysim.experiments.dome_survey import (
     survey_frames,
     survey_images,
-    survey_prior,
     survey_procedure,
 )
 from skysim.scene import loader
@@ -115,14 +114,14 @@ def built(folder: Path) -> Lab:
 @pytest.fixture(scope="module")
 def frames(folder: Path, built: Lab) -> Path:
     """The images of a survey of the built dome, and the attitudes of its IMU."""
-    uncertainty = survey_prior.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
-    lab = build_lab(survey_prior.as_listed(loader.load(folder / "design.yaml")))
-    assumed = survey_prior.prior_of(
+    uncertainty = survey_frames.survey_uncertainty("0.3 deg", "1 mm", "3 mm", "1%")
+    lab = build_lab(survey_frames.as_listed(loader.load(folder / "design.yaml")))
+    assumed = survey_frames.prior_of(
         lab,
-        survey_prior.calibration_prior(lab).camera,
-        survey_prior.calibration_prior(lab).leds,
+        survey_frames.calibration_prior(lab).camera,
+        survey_frames.calibration_prior(lab).leds,
     )._replace(uncertainty=uncertainty)
-    model = survey_prior.survey_model(assumed, 0.02)
+    model = survey_frames.survey_model(assumed, 0.02)
     held = survey_frames.planned_stops(built.scene, model, 8.0, STOPS, TILT_DEG)
     for _ in survey_procedure.simulated_frames(built, uncertainty, held, folder / "frames"):
         pass

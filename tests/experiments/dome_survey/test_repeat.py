@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey import adjust, survey_prior, survey_procedure
+from skysim.experiments.dome_survey import adjust, survey_frames, survey_procedure
 from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
@@ -51,7 +51,7 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
 ) -> None:
     """The frames alone give a value of sigma s, before that one of sigma p was assumed: they differ by hypot(s, p), and
     the weighted mean of both moves from the assumed one by p^2 / (s^2 + p^2) of this."""
-    assumed = survey_prior.survey_uncertainty()
+    assumed = survey_frames.survey_uncertainty()
     focal_px = 9222.6
     share = adjust.PLAUSIBLE * (1.01 if refused else 0.99)
 
@@ -80,6 +80,6 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         with pytest.raises(
             InputError, match=f"survey: {parameter} .* contradicts the assumed"
         ):
-            adjust.check_plausible(run, survey_prior.assumed(before))  # type: ignore[arg-type]
+            adjust.check_plausible(run, survey_frames.assumed(before))  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, survey_prior.assumed(before))  # type: ignore[arg-type]
+        adjust.check_plausible(run, survey_frames.assumed(before))  # type: ignore[arg-type]

@@ -27,7 +27,6 @@ from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
     survey_frames,
-    survey_prior,
     survey_procedure,
 )
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
@@ -48,7 +47,7 @@ light:
 camera: {width_px: 640, height_px: 480, pixel: "10.5 um", focal_length: "18 mm"}
 tracker: {min_area_px: 9}
 """
-UNCERTAINTY = survey_prior.survey_uncertainty("0.5 deg", "2 mm", "5 mm", "1%")
+UNCERTAINTY = survey_frames.survey_uncertainty("0.5 deg", "2 mm", "5 mm", "1%")
 
 
 def command(*words: object) -> tuple[int, str, str]:
@@ -107,7 +106,7 @@ def statistics(folder: Path) -> dict[str, Any]:
 def lab(folder: Path) -> Lab:
     """The small dome as assumed before the survey."""
     return build_lab(
-        survey_prior.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY)
+        survey_frames.with_survey_errors(loader.load(folder / "small.yaml"), UNCERTAINTY)
     )
 
 
@@ -294,7 +293,7 @@ def test_a_frame_of_a_stop_shows_the_vehicle_at_rest(lab: Lab) -> None:
 @pytest.mark.slow
 def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
     """The camera is off the center of rotation, so that it moves too: the LEDs shift by half as much again."""
-    prior = survey_prior.calibration_prior(lab)
+    prior = survey_frames.calibration_prior(lab)
     sigmas = UNCERTAINTY._replace(lever_sigma_m=0.0)
     predicted_px, _ = survey_frames.prediction_sigmas_px(prior._replace(uncertainty=sigmas))
     errors_rad = sigmas.imu_sigma_rad * np.random.default_rng(7).standard_normal((2000, 3))
@@ -313,7 +312,7 @@ def test_an_imu_error_shifts_a_frame_as_predicted(lab: Lab) -> None:
 
 def test_lights_get_their_true_names_by_the_imu(lab: Lab) -> None:
     """Of ten stops' lights, 25 px aside each and 60 px all together where LEDs are some 75 px apart: 19 in 20."""
-    prior = survey_prior.calibration_prior(lab)._replace(uncertainty=UNCERTAINTY)
+    prior = survey_frames.calibration_prior(lab)._replace(uncertainty=UNCERTAINTY)
     stops = survey_frames.stop_attitudes(lab.scene, "attitudes", 10, 18.0)
     taken = survey_procedure.simulated_frames(lab, UNCERTAINTY, stops)
     named = right = lights = 0
@@ -383,7 +382,7 @@ def test_a_board_that_is_displaced_is_found_whole(seed: int) -> None:
     lever = replace(
         dome.lever, camera_body_m=dome.lever.camera_body_m + rng.normal(0, 0.004, 3)
     )
-    prior = survey_prior.CalibrationPrior(
+    prior = survey_frames.CalibrationPrior(
         dome.camera, dome.leds, lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
@@ -453,9 +452,9 @@ def test_a_survey_s_seed_draws_list_lever_and_focal_length(folder: Path) -> None
     """As of `--seed`: what is known before a survey is as random as its frames."""
     scene = loader.load(folder / "small.yaml")
     first, again, other = (
-        survey_prior.calibration_prior(
+        survey_frames.calibration_prior(
             build_lab(
-                survey_prior.with_survey_errors(
+                survey_frames.with_survey_errors(
                     with_config(scene, "tracker.survey", seed=seed), UNCERTAINTY
                 )
             )
@@ -477,7 +476,7 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
     rng = np.random.default_rng(8)
     dome = model(120)
     held = attitudes(rng, 40)
-    prior = survey_prior.CalibrationPrior(
+    prior = survey_frames.CalibrationPrior(
         dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
@@ -493,7 +492,7 @@ def test_a_plan_predicts_the_survey_that_is_fitted() -> None:
     for fits in (False, True):
         known = prior._replace(uncertainty=UNCERTAINTY._replace(fit_distortion=fits))
         run = adjust.run_survey(frames, known)
-        planned = survey_prior.survey_model(known, NOISE_PX)
+        planned = survey_frames.survey_model(known, NOISE_PX)
         predicted = survey_plan.predict(planned, held, planned.visible(held))
         np.testing.assert_allclose(
             run.accuracy.lever_sigma_m, predicted.lever_sigma_m, rtol=0.1
@@ -543,7 +542,7 @@ def test_a_lens_that_is_not_modeled_is_named() -> None:
     dome = model(120)
     bent = replace(dome.camera, distortion=(-0.1, 0.0, 0.0, 0.0, 0.0))
     true = replace(dome, camera=bent)
-    prior = survey_prior.CalibrationPrior(
+    prior = survey_frames.CalibrationPrior(
         dome.camera, dome.leds, dome.lever, NOISE_PX, 0.002, np.ones(120), None, UNCERTAINTY
     )
     frames = []
@@ -715,12 +714,12 @@ def surveyed_nees(lab: Lab, folder: Path, surveys: int) -> list[float]:
     for n in range(surveys):
         again = survey_procedure.in_survey(lab, n)
         frames = list(survey_procedure.simulated_frames(again, UNCERTAINTY, stops))
-        prior = survey_prior.calibration_prior(again)._replace(uncertainty=UNCERTAINTY)
+        prior = survey_frames.calibration_prior(again)._replace(uncertainty=UNCERTAINTY)
         run = adjust.run_survey(frames, prior)
         path = folder / f"leds_{n}.ecsv"
         dome_map_file.write_dome_map(path, adjust.dome_map(run))
         tracker = factory.build_tracker(
-            survey_prior.with_map(again.scene, str(path)),
+            survey_frames.with_map(again.scene, str(path)),
             again.camera.mount,
             again.camera.sources,
         )

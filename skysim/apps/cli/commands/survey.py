@@ -103,7 +103,7 @@ def survey(
         Also fit the distortion k1, k2, p1, p2.
     """
     from skysim.apps.cli.commands import survey_modes
-    from skysim.experiments.dome_survey.survey_prior import survey_uncertainty
+    from skysim.experiments.dome_survey.survey_frames import survey_uncertainty
     from skysim.experiments.tracker_comparison import with_config
 
     limited = given_options(

@@ -17,13 +17,15 @@ from skysim.experiments.dome_survey import (
     survey_findings,
     survey_frames,
     survey_images,
-    survey_prior,
     survey_procedure,
     survey_report,
 )
 from skysim.experiments.dome_survey.survey_findings import Coverage, SurveyRun
-from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.dome_survey.survey_prior import CalibrationPrior, SurveyUncertainty
+from skysim.experiments.dome_survey.survey_frames import (
+    CalibrationPrior,
+    SurveyFrame,
+    SurveyUncertainty,
+)
 from skysim.results.report import (
     Column,
     Table,
@@ -57,7 +59,7 @@ def planned(request: Request) -> tuple[Lab, CalibrationPrior, survey_procedure.H
     """The lab whose onboard model has errors as before a survey, that model, and a plan; print these errors."""
 
     if not request.quiet:
-        print_wrapped(survey_prior.before_text(request.scene, request.uncertainty))
+        print_wrapped(survey_frames.before_text(request.scene, request.uncertainty))
     return survey_procedure.plan_survey(
         request.scene,
         request.uncertainty,
@@ -173,7 +175,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> Record:
     names = survey_images.frame_names(len(observations))
     statistics = write_results(request, run, before, lab, names)
     tracker = factory.build_tracker(
-        survey_prior.with_map(lab.scene, statistics["map"]),
+        survey_frames.with_map(lab.scene, statistics["map"]),
         lab.camera.mount,
         lab.camera.sources,
     )
@@ -196,8 +198,8 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
 
     known, read = read_camera(camera_file)
     camera = known.model
-    lab = build_lab(survey_prior.as_listed(request.scene))
-    before = survey_prior.listed_prior(lab, camera)._replace(uncertainty=request.uncertainty)
+    lab = build_lab(survey_frames.as_listed(request.scene))
+    before = survey_frames.listed_prior(lab, camera)._replace(uncertainty=request.uncertainty)
     stages = factory.assumed_settings(lab.scene)
     if known.detector:
         stages = replace(stages, gain_e_dn=read.gain_e_dn, saturation=read.saturation)

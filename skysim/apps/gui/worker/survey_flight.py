@@ -22,7 +22,6 @@ from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
     survey_frames,
-    survey_prior,
     survey_procedure,
     survey_report,
 )
@@ -37,7 +36,7 @@ from skysim.tracking import factory as tracker_settings
 SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
 MAX_STOPS = 200
 REST_PX = 1.0  # maximum motion of the image during an exposure for a vehicle at rest
-UNCERTAINTY = survey_prior.survey_uncertainty()  # as `skysim survey` assumes by default
+UNCERTAINTY = survey_frames.survey_uncertainty()  # as `skysim survey` assumes by default
 
 
 @dataclass
@@ -58,7 +57,7 @@ class Survey:
 
     scene: Scene
     lab: Lab
-    before: survey_prior.CalibrationPrior
+    before: survey_frames.CalibrationPrior
     noise_px: float
     taken: list[TakenFrame] = field(default_factory=list)
     run: survey_findings.SurveyRun | None = None

@@ -27,7 +27,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Ints, Record, Trajectory, Truth
-from skysim.experiments.dome_survey import survey_prior
+from skysim.experiments.dome_survey import survey_frames
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
@@ -273,7 +273,7 @@ def ambiguity(lab: Lab) -> AmbiguityMap:
     """
     found, coincidence_m = checks.ambiguity_map(lab)
     ids = onboard_model.assumed_dome(
-        lab.scene, survey_prior.require_dome(lab.scene), lab.camera.sources
+        lab.scene, survey_frames.require_dome(lab.scene), lab.camera.sources
     ).id
     return AmbiguityMap(
         ids[found.led],
