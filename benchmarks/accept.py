@@ -27,7 +27,7 @@ from typing import Any
 from benchmarks import AREAS
 from skysim.core.files import to_json
 from skysim.core.paths import ROOT
-from skysim.experiments.study.execution.setups import code_version
+from skysim.experiments.study.execution.trials import code_version
 
 OUT = ROOT / "out"
 RESULTS = OUT / "accept.json"

@@ -14,8 +14,7 @@ from skysim.camera.glow.background import PointedCamera
 from skysim.camera.glow.display_glow import black_glow
 from skysim.core.paths import SCENES, shipped_files
 from skysim.dynamics import multibody
-from skysim.experiments.study.execution.setups import TrialSetup
-from skysim.experiments.study.execution.trials import run_frame_trial
+from skysim.experiments.study.execution.trials import TrialSetup, run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
 from skysim.experiments.tracker_comparison import with_config
 from skysim.results import metrics

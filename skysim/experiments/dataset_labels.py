@@ -17,7 +17,7 @@ from skysim.camera.render import Window
 from skysim.core.types import Bools, Floats, Frame, Ints, SourceTruth, Truth
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
-from skysim.experiments.study.execution.setups import TrialSetup
+from skysim.experiments.study.execution.trials import TrialSetup
 from skysim.scene.scene import Scene
 from skysim.simulation.timing import exposure_window
 from skysim.tracking.factory import assumed_settings

@@ -37,14 +37,14 @@ from skysim.experiments.dataset_shards import (
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
 from skysim.experiments.study.execution.runner import Progress
-from skysim.experiments.study.execution.setups import (
+from skysim.experiments.study.execution.trials import (
+    Segment,
     TrialSetup,
     code_version,
     prepared_setup,
     scene_hash,
     seed_of,
 )
-from skysim.experiments.study.execution.trials import Segment
 from skysim.experiments.study.factors import Factor, Settings, Value
 from skysim.experiments.study.plan import (
     TRIAL,

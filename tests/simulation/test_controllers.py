@@ -24,7 +24,7 @@ from skysim.dynamics.controllers import (
 )
 from skysim.dynamics.guidance import plan
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import runner, setups, store
+from skysim.experiments.study.execution import runner, store, trials
 from skysim.experiments.study.execution.engines import Serial
 from skysim.scene import loader
 from skysim.simulation.checks import check
@@ -455,8 +455,8 @@ def test_a_controller_can_be_a_study_s_factor(installed: Path, tmp_path: Path) -
 
 def test_another_release_of_a_controller_changes_the_trial_s_hash(installed: Path) -> None:
     scene = loader.load("simsat_slew", {"motion.control": "mine"})
-    before = setups.scene_hash(scene)
+    before = trials.scene_hash(scene)
     (installed / "mypd-1.0.dist-info/METADATA").write_text(
         "Metadata-Version: 2.1\nName: mypd\nVersion: 1.1\n"
     )
-    assert setups.scene_hash(scene) != before
+    assert trials.scene_hash(scene) != before

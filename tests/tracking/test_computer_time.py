@@ -62,7 +62,7 @@ def test_a_study_has_the_tracker_s_time_on_that_computer_beside_the_trial_and_do
     for factor in 1, 50:
         computer = {"clock_mhz": 650, "host_clock_mhz": 2600, "cycles_factor": factor}
         segment = trials.Segment(0, {"tracker.computer": computer}, 0, range(6))
-        rows = trials.run_segments(spec, (segment,))
+        rows = trials.TrialJob(spec).run((segment,))
         outcomes.append(sorted(row.outcome.computer_ms for row in rows)[2])
     assert 20 < outcomes[1] / outcomes[0] < 125
     assert min(row.outcome.computer_ms / row.outcome.detect_ms for row in rows) > 200

@@ -27,7 +27,7 @@ from skysim.core.paths import ROOT
 from skysim.core.plugins import ProgramError
 from skysim.experiments import tracker_comparison
 from skysim.experiments.study import study_file as study_loader
-from skysim.experiments.study.execution import runner, setups, store
+from skysim.experiments.study.execution import runner, store, trials
 from skysim.experiments.study.execution.engines import Serial
 from skysim.results import metrics
 from skysim.scene import loader
@@ -332,13 +332,13 @@ def test_another_release_of_a_tracker_changes_the_trial_s_hash(
     installed: None, tmp_path: Path
 ) -> None:
     scene = loader.load("shefex2", {"tracker.name": "offset"})
-    before = setups.scene_hash(scene)
+    before = trials.scene_hash(scene)
     assert tracker_interface.TRACKERS.release("offset") == "offset 1.0"
     (tmp_path / "offset-1.0.dist-info" / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: offset\nVersion: 1.1\n"
     )
     assert tracker_interface.TRACKERS.release("offset") == "offset 1.1"
-    assert setups.scene_hash(scene) != before
+    assert trials.scene_hash(scene) != before
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from skysim.experiments.datasheet.variance_components import (
     mean_known,
     term_errors,
 )
-from skysim.experiments.study.execution import setups, trials
+from skysim.experiments.study.execution import trials
 from skysim.results.files.fmu import require_builder
 
 GRID = 60  # number of correlation angles that are tried
@@ -149,7 +149,7 @@ def along_square(
 def axes_rad(sheet: MeasuredFrames, rate_deg_s: float) -> Floats:
     """(fields,) angle of the axis of a rate from the camera's x toward y, as the trials at this rate draw it again."""
     row = rate_rows(sheet, rate_deg_s)[0]
-    setup = setups.prepared_setup(sheet.spec, sheet.cells[row].settings)
+    setup = trials.prepared_setup(sheet.spec, sheet.cells[row].settings)
     seeds = sheet.columns["seed"][[row]][0].tolist()
     rngs = (trials.streams(setup, seed)[0] for seed in seeds)
     x, y, _ = np.transpose([trials.attitude_and_axis(setup, rng)[1] for rng in rngs])

@@ -18,7 +18,7 @@ from skysim.experiments.datasheet.variance_components import (
     squares_by_field,
 )
 from skysim.experiments.study import answer
-from skysim.experiments.study.execution import setups, trials
+from skysim.experiments.study.execution import trials
 from skysim.results import metrics
 from skysim.results.metrics import Summary
 from skysim.tracking import factory
@@ -271,8 +271,8 @@ def solution_times_s(sheet: MeasuredFrames) -> Floats:
 
     All are solved twice, and the second time counts: the first one compiles and loads what the solutions need.
     """
-    setup = setups.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
-    seeds = (setups.seed_of(sheet.spec, 0, replicate) for replicate in range(TIMED))
+    setup = trials.prepared_setup(sheet.spec, sheet.cells[sheet.rows("sky")[0]].settings)
+    seeds = (trials.seed_of(sheet.spec, 0, replicate) for replicate in range(TIMED))
     frames = [trials.render_trial_frame(setup, seed)[0] for seed in seeds]
     found = []
     for frame in frames * 2:

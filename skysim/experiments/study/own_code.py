@@ -26,7 +26,7 @@ from skysim.simulation.lab import name_of
 from skysim.tracking.tracker_interface import OWN
 
 # Beginnings of the paths of code that is not the user's. That of skysim and estimator is in the version that a store
-# keeps (`setups.code_version`).
+# keeps (`trials.code_version`).
 INSTALLED = (
     *(sysconfig.get_paths()[name] for name in ("stdlib", "purelib", "platlib")),
     *(str(ROOT / package) for package in ("skysim", "estimator")),

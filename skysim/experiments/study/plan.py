@@ -54,7 +54,7 @@ from skysim.scene import loader
 from skysim.scene.scene import Requirements, Scene
 
 TRIAL = "trial."
-HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`setups.seed_of`)
+HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`trials.seed_of`)
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
 Tilt = Annotated[Number, Field(ge=0, le=90)]
 BodyName = Literal[

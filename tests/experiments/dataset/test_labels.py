@@ -15,7 +15,7 @@ from skysim.core.types import SourceTruth
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments import dataset_labels, dataset_shards
 from skysim.experiments.study.execution import trials
-from skysim.experiments.study.execution.setups import TrialSetup, prepared_setup
+from skysim.experiments.study.execution.trials import TrialSetup, prepared_setup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.scene.sections.camera import InterlineConfig
 from skysim.tracking.onboard_model import assumed_camera

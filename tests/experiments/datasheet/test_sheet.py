@@ -202,7 +202,7 @@ def test_an_injected_bias_and_thermal_drift_are_recovered() -> None:
     spec = TrialSpec("shefex2", ".", 3, base, {"kind": "frames"}, True)
     errors = []
     for cell in designer.terms():
-        rows = trials.run_segments(spec, (trials.Segment(0, cell.settings, 0, range(12)),))
+        rows = trials.TrialJob(spec).run((trials.Segment(0, cell.settings, 0, range(12)),))
         assert all(row.outcome.solved and not row.error for row in rows)
         errors.append(
             [

@@ -20,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
 from skysim.experiments.study.execution import runner, workers
-from skysim.experiments.study.execution.setups import code_version
+from skysim.experiments.study.execution.trials import code_version
 from tests.helpers.clusters import ENVIRONMENT, STUDY, Cluster, cluster_of, on_dask, study
 from tests.helpers.study_stores import contents, done
 

@@ -23,7 +23,7 @@ import skysim.experiments.study.execution
 from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import engines, runner, setups, store, trials
+from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.execution.engines import Engine
 from tests.helpers.clusters import (
     ENVIRONMENT,
@@ -88,7 +88,7 @@ def test_a_refused_trial_keeps_its_seed_and_reason_and_the_rest_is_done(
     with store.open_store(paths[1]) as stored:
         assert {trial for trial, _ in stored.failures()} == set(range(150))
         row = stored.trial(7)
-    assert row["seed"] == setups.seed_of(plan_.spec, 0, 7)
+    assert row["seed"] == trials.seed_of(plan_.spec, 0, 7)
     assert row["error"].startswith("lost.yaml: no such scene")
     assert contents(paths[0]) == contents(paths[1])
 
@@ -131,7 +131,7 @@ def deaths(plan_: plan.Plan) -> list[int]:
     bad = [
         n
         for n in range(plan_.trials)
-        if setups.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5
+        if trials.seed_of(plan_.spec, *divmod(n, 150)) % 200 == 5
     ]
     assert 1 <= len(bad) <= 3
     return bad
@@ -385,19 +385,19 @@ def test_other_code_on_the_cluster_is_refused(cluster: Cluster) -> None:
     try:
         with pytest.raises(
             InputError,
-            match=rf"has skysim 0123456789abcdef; allowed: {setups.code_version()}",
+            match=rf"has skysim 0123456789abcdef; allowed: {trials.code_version()}",
         ):
             dask(cluster.address)
     finally:
         from distributed import Client
 
         with Client(cluster.address, set_as_default=False) as client:
-            client.run(change_code, setups.code_version())
+            client.run(change_code, trials.code_version())
 
 
 def change_code(version: str) -> None:
     """Make a worker report another code version."""
-    setups.code_version = lambda: version  # type: ignore[assignment]
+    trials.code_version = lambda: version  # type: ignore[assignment]
 
 
 @pytest.mark.long

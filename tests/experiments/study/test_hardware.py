@@ -11,7 +11,7 @@ import yaml
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import plan, study_file, table
-from skysim.experiments.study.execution import runner, setups, store
+from skysim.experiments.study.execution import runner, store, trials
 from tests.helpers.study_stores import done
 
 STUDY: dict[str, Any] = {
@@ -78,7 +78,7 @@ def test_leds_and_survey_are_drawn_independently(tmp_path: Path) -> None:
     spec = loaded(tmp_path).spec
     errors_m = []
     for n in range(4):
-        setup = setups.prepared_setup(spec, spec.trial_settings({}, n))
+        setup = trials.prepared_setup(spec, spec.trial_settings({}, n))
         errors_m.append(
             setup.estimator.leds.position_m - setup.lab.camera.sources.place[:, :3]
         )

@@ -389,7 +389,7 @@ def test_the_worst_trials_are_replayed_by_their_number() -> None:
         if one.levels == {"leds": 1000, "placement": "poisson"}
     )
     segment = trials.Segment(point, plan.points[point].settings, 40 * point, range(40))
-    rows = trials.run_segments(plan.spec, (segment,))
+    rows = trials.TrialJob(plan.spec).run((segment,))
     table: dict[str, Any] = {
         name: np.array([getattr(row.outcome, name) for row in rows]) for name in FIELDS
     }
@@ -398,8 +398,7 @@ def test_the_worst_trials_are_replayed_by_their_number() -> None:
         for name in ("trial", "point", "seed")
     }
     first = worst.worst_trials(table, "roll_arcsec_p95")[0]
-    (again,) = trials.run_segments(
-        plan.spec,
+    (again,) = trials.TrialJob(plan.spec).run(
         (
             segment._replace(
                 first=first.trial, replicates=range(first.trial % 40, first.trial % 40 + 1)

@@ -13,9 +13,9 @@ from estimator.core.types import StarMatch, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.types import Floats
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import outcomes, setups, trials
+from skysim.experiments.study.execution import outcomes, trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX, Outcome, TrueLights
-from skysim.experiments.study.execution.setups import TrialSetup
+from skysim.experiments.study.execution.trials import TrialSetup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.simulation.flight import Flight
 from skysim.simulation.timing import exposure_window
@@ -27,7 +27,7 @@ ARCMIN_RAD = math.radians(1 / 60)
 
 def solved(spec: TrialSpec, seed: int = 3) -> tuple[TrialSetup, Report, TrueLights]:
     """A centroid trial's report and true lights."""
-    setup = setups.prepared_setup(spec, {})
+    setup = trials.prepared_setup(spec, {})
     ((lights, report),) = trials.solved_centroids(setup, [seed])
     assert report.attitude.solved
     return setup, report, lights
@@ -139,7 +139,7 @@ def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
     point = next(
         one for one in plan.points if one.levels == {"leds": 1000, "placement": "spiral"}
     )
-    rows = trials.run_segments(plan.spec, (trials.Segment(0, point.settings, 0, range(20)),))
+    rows = trials.TrialJob(plan.spec).run((trials.Segment(0, point.settings, 0, range(20)),))
     ambiguous = [row.outcome for row in rows if row.outcome.ambiguous]
     assert len(ambiguous) > 10
     assert all(one.solved == 0 and one.status.startswith("ambiguous") for one in ambiguous)
@@ -147,8 +147,8 @@ def test_a_regular_spiral_is_refused_as_ambiguous() -> None:
 
 def test_centroids_scatter_as_declared_in_the_trial() -> None:
     """RMS about each axis over 200 trials of some 20 lights each: to 4 standard errors, 0.3 / sqrt(2 * 4000)."""
-    rows = trials.run_segments(
-        SKY, (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),)
+    rows = trials.TrialJob(SKY).run(
+        (trials.Segment(0, {"trial.noise_px": 0.3}, 0, range(200)),)
     )
     weighted = [
         (row.outcome.centroid_px**2 * row.outcome.detected, row.outcome.detected)
@@ -183,7 +183,7 @@ def test_a_detection_is_of_a_light_or_of_none() -> None:
 def test_all_detections_without_noise_are_of_lights_and_false_ones_are_counted() -> None:
     for false in (0, 4):
         trial = {"trial.noise_px": 0.01, "trial.false_lights": false}
-        rows = trials.run_segments(SKY, (trials.Segment(0, trial, 0, range(5)),))
+        rows = trials.TrialJob(SKY).run((trials.Segment(0, trial, 0, range(5)),))
         for one in (row.outcome for row in rows):
             assert one.lights_detected == one.stars
             # A false one may fall on a light.
@@ -193,13 +193,13 @@ def test_all_detections_without_noise_are_of_lights_and_false_ones_are_counted()
 @pytest.mark.slow
 def test_a_streak_is_as_long_as_the_rate_times_the_exposure() -> None:
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0})
-    setup = setups.prepared_setup(spec, {})
+    setup = trials.prepared_setup(spec, {})
     expected_px = (
         math.radians(4.0) * setup.lab.scene.exposure.time_s * setup.lab.scene.camera.focal_px
     )
     assert trials.run_frame_trial(setup, 5).streak_px == pytest.approx(expected_px, rel=0.03)
     assert math.isnan(
-        trials.run_centroid_trials(setups.prepared_setup(SKY, {}), [5])[0].streak_px
+        trials.run_centroid_trials(trials.prepared_setup(SKY, {}), [5])[0].streak_px
     )
 
 
@@ -209,7 +209,7 @@ def test_frames_of_a_closed_loop_have_the_streaks_of_their_lights_in_the_true_mo
 ):
     """The LEDs of each frame, projected from where the camera is as its exposure opens and closes."""
     base = {"exposure.frames": 3, "vehicle.imu": {}, "filter": {"start_deg": 0.1}}
-    setup = setups.prepared_setup(replace(DOME, base=base, trial={"kind": "flight"}), {})
+    setup = trials.prepared_setup(replace(DOME, base=base, trial={"kind": "flight"}), {})
     flight = trials.trial_flight(setup, 4)
     streaks_px = [
         outcome.streak_px for _, outcome in trials.flight_outcomes(flight, setup.estimator)
@@ -238,7 +238,7 @@ def median_path_px(flight: Flight, index: int) -> float:
 def test_each_row_has_the_attitude_of_its_trial() -> None:
     """The quaternion is that of the draw; under the dome tilt and azimuth are those of the body's axis."""
     for spec in (SKY, DOME):
-        setup = setups.prepared_setup(spec, {})
+        setup = trials.prepared_setup(spec, {})
         drawn = trials.random_attitude(setup, trials.streams(setup, 8)[0])
         (outcome,) = trials.run_centroid_trials(setup, [8])
         wxyz = [getattr(outcome, f"lab_from_body_{axis}") for axis in "wxyz"]

@@ -17,8 +17,13 @@ from skysim.core.errors import InputError
 from skysim.experiments.study import plan, search, study_file
 from skysim.experiments.study.execution import engines, runner, store
 from skysim.experiments.study.execution.outcomes import FAILED, Outcome
-from skysim.experiments.study.execution.setups import code_version, seed_of
-from skysim.experiments.study.execution.trials import REFUSED, Row, TrialJob
+from skysim.experiments.study.execution.trials import (
+    REFUSED,
+    Row,
+    TrialJob,
+    code_version,
+    seed_of,
+)
 from skysim.experiments.study.factors import Point, Settings
 from skysim.experiments.study.report.study_report import front_table
 from skysim.results.files.parts import find_prices, parts_list, read_prices

@@ -20,10 +20,9 @@ from hypothesis import strategies as st
 
 from skysim.core.errors import InputError
 from skysim.experiments.study import plan, study_file
-from skysim.experiments.study.execution import runner, setups, store, trials
+from skysim.experiments.study.execution import runner, store, trials
 from skysim.experiments.study.execution.outcomes import Outcome
-from skysim.experiments.study.execution.setups import TrialSetup
-from skysim.experiments.study.execution.trials import Row
+from skysim.experiments.study.execution.trials import Row, TrialSetup
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.report import maps
 from tests.helpers.study_stores import STRAYS, contents, done, queue_of
@@ -391,7 +390,7 @@ def test_trials_that_raise_become_rows_up_to_a_limit(
     path = tmp_path / "fragile.sqlite"
     study_plan = other(study_plan, paired="false")
     seeds = [
-        setups.seed_of(study_plan.spec, *divmod(trial, 40))
+        trials.seed_of(study_plan.spec, *divmod(trial, 40))
         for trial in range(study_plan.trials)
     ]
     bad = [trial for trial, seed in enumerate(seeds) if seed % 4 == 0]

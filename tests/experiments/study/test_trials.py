@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.paths import SCENES
 from skysim.experiments.study import plan
-from skysim.experiments.study.execution import detections, setups, store, trials
+from skysim.experiments.study.execution import detections, store, trials
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial, TrialSpec
 from skysim.simulation.exposure import render_at_rest
 from skysim.sources.ephemeris import observe_from, place
@@ -26,9 +26,8 @@ DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)
 
 def test_a_trial_does_not_depend_on_earlier_trials():
     settings = {"trial.false_lights": 3}
-    first = trials.run_segments(SKY, (trials.Segment(5, settings, 500, range(0, 20)),))
-    again = trials.run_segments(
-        SKY,
+    first = trials.TrialJob(SKY).run((trials.Segment(5, settings, 500, range(0, 20)),))
+    again = trials.TrialJob(SKY).run(
         (
             trials.Segment(5, settings, 513, range(13, 14)),
             trials.Segment(5, settings, 500, range(1)),
@@ -39,33 +38,33 @@ def test_a_trial_does_not_depend_on_earlier_trials():
 
 @pytest.mark.parametrize("spec", [SKY, DOME], ids=["sky", "dome"])
 def test_trials_without_noise_are_solved(spec: TrialSpec) -> None:
-    for row in trials.run_segments(
-        spec, (trials.Segment(0, {"trial.noise_px": 0.0}, 0, range(3)),)
+    for row in trials.TrialJob(spec).run(
+        (trials.Segment(0, {"trial.noise_px": 0.0}, 0, range(3)),)
     ):
         assert (row.error, row.outcome.status, row.outcome.wrong) == (None, "solved", 0)
 
 
 def test_points_share_attitude_and_noise_by_default():
     unpaired = replace(SKY, paired=False)
-    assert setups.seed_of(SKY, 1, 7) == setups.seed_of(SKY, 2, 7) != setups.seed_of(SKY, 1, 8)
-    assert setups.seed_of(unpaired, 1, 7) != setups.seed_of(unpaired, 2, 7)
+    assert trials.seed_of(SKY, 1, 7) == trials.seed_of(SKY, 2, 7) != trials.seed_of(SKY, 1, 8)
+    assert trials.seed_of(unpaired, 1, 7) != trials.seed_of(unpaired, 2, 7)
 
 
 def test_an_exception_of_a_trial_is_in_its_row_with_the_seed():
-    row = trials.run_segments(
-        SKY, (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),)
+    row = trials.TrialJob(SKY).run(
+        (trials.Segment(0, {"camera.focal_length": "-1 mm"}, 0, range(1)),)
     )[0]
     assert row.outcome.status == "failed"
     assert row.outcome.frames == 0
     assert "camera.focal_length" in row.error
-    assert row.seed == setups.seed_of(SKY, 0, 0)
+    assert row.seed == trials.seed_of(SKY, 0, 0)
 
 
 @pytest.mark.parametrize(("spec", "key"), [(SKY, "trial.dec_deg"), (DOME, "trial.tilt_deg")])
 def test_attitudes_are_uniform_over_the_allowed_range(spec, key):
     """Boresights by area, turns about them evenly: Kolmogorov and Smirnov's test, one in 10^4."""
     low, high = (-60.0, 30.0) if spec is SKY else (10.0, 30.0)
-    ready = setups.prepared_setup(spec, {key: [low, high]})
+    ready = trials.prepared_setup(spec, {key: [low, high]})
     rng = np.random.default_rng(3)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     if spec is SKY:
@@ -87,7 +86,7 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
     """Of the site at the scene's start, by astropy's AltAz."""
     site = {"latitude_deg": 53.1, "longitude_deg": 8.8}
     near = {"body": "zenith", "off_deg": [57.0, 63.0]}
-    ready = setups.prepared_setup(
+    ready = trials.prepared_setup(
         SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near}
     )
     rng = np.random.default_rng(4)
@@ -108,7 +107,7 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
 def test_attitudes_near_a_body_are_uniform_about_it():
     """By the cosine of the angle from the Moon's place and by the angle around it."""
     near = {"body": "moon", "off_deg": [2.0, 8.0]}
-    ready = setups.prepared_setup(
+    ready = trials.prepared_setup(
         SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near}
     )
     rng = np.random.default_rng(3)
@@ -129,7 +128,7 @@ def test_attitudes_near_a_body_are_uniform_about_it():
 
 def test_the_roll_about_the_boresight_is_uniform():
     """The body's x axis against the meridian through the boresight; under the dome against its own lean."""
-    ready = setups.prepared_setup(DOME, {"trial.tilt_deg": 20})
+    ready = trials.prepared_setup(DOME, {"trial.tilt_deg": 20})
     rng = np.random.default_rng(4)
     drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
     seen = drawn.inv().apply([0, 0, 1])
@@ -152,7 +151,7 @@ def test_three_successive_rotations_match_scipy(angles):
 @pytest.mark.parametrize("spec", [SKY, DOME])
 def test_lights_of_a_trial_match_the_renderer_s_positions_and_brightness(spec):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
-    ready = setups.prepared_setup(spec, {"background": []})
+    ready = trials.prepared_setup(spec, {"background": []})
     lab = ready.lab
     lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
     _, truth = render_at_rest(lab.camera, lab_from_body)
@@ -175,7 +174,7 @@ def test_lights_of_a_trial_match_the_renderer_s_positions_and_brightness(spec):
 
 def test_injected_faults_have_their_declared_size():
     """Noise, share missed, false lights: mean and spread over many fields."""
-    ready = setups.prepared_setup(SKY, {})
+    ready = trials.prepared_setup(SKY, {})
     trial = CentroidTrial(
         kind="centroids", noise_px=0.3, missing=0.25, false_share=0.5, magnitude_sigma=0.0
     )
@@ -197,7 +196,7 @@ def test_injected_faults_have_their_declared_size():
 
 
 def test_a_limited_number_of_lights_keeps_the_brightest():
-    ready = setups.prepared_setup(SKY, {})
+    ready = trials.prepared_setup(SKY, {})
     trial = CentroidTrial(kind="centroids", noise_px=0.0, lights=3, magnitude_sigma=0.0)
     seen = detections.simulate_detections(
         trial, np.zeros((9, 2)), np.arange(9.0), ready.lab.scene, np.random.default_rng(1)
@@ -207,7 +206,7 @@ def test_a_limited_number_of_lights_keeps_the_brightest():
 
 
 def test_another_noise_seed_keeps_the_attitude():
-    prepared = [setups.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
+    prepared = [trials.prepared_setup(SKY, {"trial.noise_seed": n}) for n in (0, 1)]
     (first, seen), (again, other) = (
         trials.solved_centroids(ready, [12])[0] for ready in prepared
     )
@@ -223,7 +222,7 @@ def coded(settings: dict[str, Any], count: int) -> list[Any]:
     """Outcomes of trials under the spiral of 400 coded LEDs."""
     return [
         row.outcome
-        for row in trials.run_segments(CODED, (trials.Segment(0, settings, 0, range(count)),))
+        for row in trials.TrialJob(CODED).run((trials.Segment(0, settings, 0, range(count)),))
     ]
 
 
@@ -237,7 +236,7 @@ CODES = [
 @pytest.mark.parametrize("code", CODES)
 def test_lights_of_a_coded_trial_are_as_bright_as_rendered_ones(code):
     """Of frame 7, over the mean light of each LED: bits, edges of bits, pulses."""
-    ready = setups.prepared_setup(CODED, {"light.led.code": code})
+    ready = trials.prepared_setup(CODED, {"light.led.code": code})
     lab = ready.lab.in_run(5)
     lab_from_body = Rotation.from_rotvec([0.1, 0.05, 1.0])
     ((rows, xy_px, electrons),) = detections.visible_rows(
@@ -283,8 +282,8 @@ def test_centroid_trials_have_the_theoretical_error():
             "tracker.limit_mag": 5.5,
         },
     )
-    rows = trials.run_segments(
-        spec, (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),)
+    rows = trials.TrialJob(spec).run(
+        (trials.Segment(0, {"trial.noise_px": 0.2}, 0, range(400)),)
     )
     nees = np.array(
         [row.outcome.nees for row in rows if row.outcome.solved and not row.outcome.wrong]
@@ -297,7 +296,7 @@ def test_centroid_trials_have_the_theoretical_error():
 def test_a_rotating_frame_is_smeared_by_the_gyro_s_rate():
     """Streak length in the truth against rate times exposure, at the middle of the field."""
     spec = replace(SKY, trial={"kind": "frames", "rate_deg_s": 4.0, "gyro": True})
-    ready = setups.prepared_setup(spec, {})
+    ready = trials.prepared_setup(spec, {})
     assert isinstance(ready.trial, FrameTrial)
     _, truth, told_px = trials.render_trial_frame(ready, 77)
     wanted = (
@@ -317,7 +316,7 @@ def test_a_flight_counts_its_frames_after_it_settled():
     spec = replace(
         DOME, base={"exposure.frames": 6}, trial={"kind": "flight", "settle": "2.1 s"}
     )
-    ready = setups.prepared_setup(spec, {})
+    ready = trials.prepared_setup(spec, {})
     came = trials.run_flight_trial(ready, 5)
     # 2 Hz from 1 s on: 1, 1.5 and 2 s are before.
     assert came.frames == 3
@@ -335,7 +334,7 @@ def test_a_flights_filter_is_scored_at_every_tick():
         "motion.control": {"law": "pid", "feedback": "filter"},
     }
     spec = replace(DOME, base=settings, trial={"kind": "flight"})
-    ready = setups.prepared_setup(spec, {})
+    ready = trials.prepared_setup(spec, {})
     came = trials.run_flight_trial(ready, 5)
     assert came.frames == came.solved == 4
     assert 0 < came.filter_arcsec < came.filter_worst_arcsec < 600
@@ -351,14 +350,14 @@ def test_a_flights_filter_is_scored_at_every_tick():
 
 @pytest.mark.slow
 def test_a_lab_is_reused_if_only_the_trial_differs():
-    first = setups.prepared_setup(SKY, {"trial.noise_px": 0.1})
-    other = setups.prepared_setup(SKY, {"trial.noise_px": 0.2})
+    first = trials.prepared_setup(SKY, {"trial.noise_px": 0.1})
+    other = trials.prepared_setup(SKY, {"trial.noise_px": 0.2})
     assert first.lab is other.lab
-    assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is first
+    assert trials.prepared_setup(SKY, {"trial.noise_px": 0.1}) is first
     assert other.trial.noise_px == 0.2
-    for n in range(setups.CACHE_SIZE):
-        setups.prepared_setup(SKY, {"camera.focal_length": f"{20 + n} mm"})
-    assert setups.prepared_setup(SKY, {"trial.noise_px": 0.1}) is not first
+    for n in range(trials.CACHE_SIZE):
+        trials.prepared_setup(SKY, {"camera.focal_length": f"{20 + n} mm"})
+    assert trials.prepared_setup(SKY, {"trial.noise_px": 0.1}) is not first
 
 
 def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
@@ -366,14 +365,14 @@ def test_the_scenes_hash_is_of_its_values_and_of_its_files(tmp_path):
     text = (SCENES / "vehicles" / "shefex2.xml").read_text()
     model.write_text(text)
     hashes = [
-        setups.scene_hash(plan.resolve_point(SKY, sets)[0])
+        trials.scene_hash(plan.resolve_point(SKY, sets)[0])
         for sets in ({}, {"camera.f_number": 1.5}, {})
     ]
     assert hashes[0] == hashes[2] != hashes[1]
     own = {"vehicle.model": str(model)}
-    first = setups.scene_hash(plan.resolve_point(SKY, own)[0])
+    first = trials.scene_hash(plan.resolve_point(SKY, own)[0])
     model.write_text(text.replace("<mujoco", "<!-- other --><mujoco", 1))
-    assert setups.scene_hash(plan.resolve_point(SKY, own)[0]) != first
+    assert trials.scene_hash(plan.resolve_point(SKY, own)[0]) != first
 
 
 # --- the axis of the rate, and a flight's start ---------------------------------------------------------------
@@ -391,8 +390,8 @@ FRAMES = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames", "rate_deg_s": 2.0},
 )
 def test_a_frame_rotates_about_the_named_axis(axis, frame, expected):
     """The truth's rate at mid-exposure, in that frame; the attitude and the noise are those of any other axis."""
-    usual = setups.prepared_setup(FRAMES, {})
-    ready = setups.prepared_setup(FRAMES, {"trial.rate_axis": axis})
+    usual = trials.prepared_setup(FRAMES, {})
+    ready = trials.prepared_setup(FRAMES, {"trial.rate_axis": axis})
     _, before, _ = trials.render_trial_frame(usual, 7)
     _, truth, _ = trials.render_trial_frame(ready, 7)
     rate = truth.rate_cam_rad_s
@@ -405,7 +404,7 @@ def test_a_frame_rotates_about_the_named_axis(axis, frame, expected):
 
 def test_a_rotation_about_the_boresight_keeps_its_star_in_place():
     """Streaks grow with the distance from the image's center: rate x exposure x distance."""
-    ready = setups.prepared_setup(
+    ready = trials.prepared_setup(
         FRAMES, {"trial.rate_axis": "boresight", "trial.rate_deg_s": 20.0}
     )
     _, truth, streak_px = trials.render_trial_frame(ready, 3)
@@ -425,11 +424,11 @@ def test_a_rotation_about_the_boresight_keeps_its_star_in_place():
 def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     """Start attitudes are uniform, drawn from the same stream as those of other trials."""
     trial = {"kind": "flight", "start": "random"}
-    ready = setups.prepared_setup(
+    ready = trials.prepared_setup(
         TrialSpec(name, ".", 1, {"exposure.frames": 1}, trial, True), {}
     )
     kind = {"kind": "frames"}
-    other = setups.prepared_setup(
+    other = trials.prepared_setup(
         TrialSpec(name, ".", 1, {"exposure.frames": 1}, kind, True), {}
     )
     starts = [trials.trial_flight(ready, seed).state.lab_from_body for seed in (5, 6, 5)]
@@ -447,19 +446,19 @@ def test_a_flight_with_a_random_start_starts_there():
     changes = {"exposure.frames": 2, "exposure.first": "0.2 s"}
     trial = {"kind": "flight", "start": {"tilt_deg": [5, 12]}}
     spec = TrialSpec("afit_simsat", ".", 1, changes, trial, True)
-    ready = setups.prepared_setup(spec, {})
+    ready = trials.prepared_setup(spec, {})
     flown = trials.trial_flight(ready, 9).simulate_motion().trajectory()
     tilt_deg = np.degrees(np.arccos(flown.lab_from_body.as_matrix()[:, 2, 2]))
     assert 5 < tilt_deg[0] < 12
     assert tilt_deg[-1] == pytest.approx(tilt_deg[0], abs=0.2)  # held for a second
-    (row,) = trials.run_segments(spec, (trials.Segment(0, {}, 0, range(1)),))
+    (row,) = trials.TrialJob(spec).run((trials.Segment(0, {}, 0, range(1)),))
     assert row.error is None
     assert row.outcome.frames == 2
 
 
 def rendered(settings: dict[str, Any], seed: int = 5) -> Any:
     """The truth of a frame trial of the shipped scene with stars."""
-    return trials.render_trial_frame(setups.prepared_setup(AT_REST, settings), seed)[1]
+    return trials.render_trial_frame(trials.prepared_setup(AT_REST, settings), seed)[1]
 
 
 AT_REST = TrialSpec("shefex2", ".", 1, {}, {"kind": "frames"}, True)
@@ -499,7 +498,7 @@ def test_accelerated_lights_are_at_their_predicted_positions():
 
 def tracked_statuses(settings: dict[str, Any], seeds: range) -> list[str]:
     """Statuses of frames in tracking mode after two of the same motion."""
-    setup = setups.prepared_setup(AT_REST, {"trial.tracked": 2} | settings)
+    setup = trials.prepared_setup(AT_REST, {"trial.tracked": 2} | settings)
     return [trials.run_frame_trial(setup, seed).status for seed in seeds]
 
 
@@ -529,7 +528,7 @@ def test_a_tracked_frame_has_the_motion_of_its_time():
     settings = {"trial.rate_deg_s": 2.0}
     truth = rendered(settings | {"trial.tracked": 2})
     assert (truth.cam_from_lab * rendered(settings).cam_from_lab.inv()).magnitude() < 1e-12
-    setup = setups.prepared_setup(AT_REST, settings | {"trial.tracked": 2})
+    setup = trials.prepared_setup(AT_REST, settings | {"trial.tracked": 2})
     moving = trials.moving_camera(setup, 5)
     step = trials.rotation_between(moving, truth.t_s - 0.1, truth.t_s)
     assert np.degrees(step.magnitude()) == pytest.approx(0.2, rel=1e-9)
@@ -548,7 +547,7 @@ def test_a_flight_in_the_dark_ends_with_the_exposure_that_its_control_has_reache
         "exposure.frames": frames,
     }
     flights = replace(SKY, base=settings, trial={"kind": "flight"})
-    came = trials.run_flight_trial(setups.prepared_setup(flights, {}), 5)
+    came = trials.run_flight_trial(trials.prepared_setup(flights, {}), 5)
     assert came.exposure_ms == pytest.approx(exposure_ms, abs=1e-9)
 
 
@@ -558,7 +557,7 @@ def test_the_time_of_a_detection_is_stored_beside_the_trial_and_is_not_compared(
     for name in ("sequential", "maximum"):
         settings = {"tracker.detector": name}
         spec = replace(SKY, trial={"kind": "frames"})
-        rows[name] = trials.run_segments(spec, (trials.Segment(0, settings, 0, range(4)),))
+        rows[name] = trials.TrialJob(spec).run((trials.Segment(0, settings, 0, range(4)),))
     # Every object costs the maximum search another pass over the image.
     sequential, maximum = ([row.outcome.detect_ms for row in each] for each in rows.values())
     assert np.median(maximum) > 3 * np.median(sequential) > 0

@@ -9,7 +9,7 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.experiments.study import study_file, unused_options
 from skysim.experiments.study.execution import trials
-from skysim.experiments.study.execution.setups import build_setup
+from skysim.experiments.study.execution.trials import build_setup
 from skysim.experiments.study.plan import CentroidTrial, FrameTrial
 from skysim.scene.loader import load
 

@@ -28,7 +28,7 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.types import Record, frozen
 from skysim.experiments.study import study_file
-from skysim.experiments.study.execution import runner, setups, store, trials
+from skysim.experiments.study.execution import runner, store, trials
 from skysim.results import plots, scoring
 
 
@@ -102,7 +102,7 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     with store.open_store(folder / store.STORE) as stored:
         segment = runner.segment_of(plan, stored, trial)
     (row,) = trials.run_block(plan.spec, segment)
-    setup = setups.prepared_setup(plan.spec, segment.settings)
+    setup = trials.prepared_setup(plan.spec, segment.settings)
     lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
     result = workbench.tracker_result(lab, setup.estimator, frame, truth, report)

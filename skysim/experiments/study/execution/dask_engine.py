@@ -28,8 +28,7 @@ from skysim.experiments.study.execution.engines import (
     run_timed,
     split_chunk,
 )
-from skysim.experiments.study.execution.setups import code_version
-from skysim.experiments.study.execution.trials import Segment
+from skysim.experiments.study.execution.trials import Segment, code_version
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed

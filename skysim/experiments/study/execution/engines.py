@@ -17,8 +17,7 @@ from typing import Any, Protocol
 
 from skysim.core.errors import InputError
 from skysim.experiments.study.execution import workers
-from skysim.experiments.study.execution.setups import code_version
-from skysim.experiments.study.execution.trials import Segment, divided
+from skysim.experiments.study.execution.trials import Segment, code_version, divided
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies

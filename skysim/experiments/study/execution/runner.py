@@ -20,14 +20,17 @@ from skysim.core.yaml_reader import OverrideTexts
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.outcomes import FIELDS
-from skysim.experiments.study.execution.setups import (
+from skysim.experiments.study.execution.store import Store, to_sql
+from skysim.experiments.study.execution.trials import (
+    REFUSED,
+    Row,
+    Segment,
+    TrialJob,
     TrialSetup,
     code_version,
     prepared_setup,
     scene_hash,
 )
-from skysim.experiments.study.execution.store import Store, to_sql
-from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import (
     Budget,
