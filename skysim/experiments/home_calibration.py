@@ -43,7 +43,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.core.types import Floats, Ints, Record, normalized
-from skysim.experiments.dome_survey import survey_images
+from skysim.experiments.dome_survey import survey_procedure
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.results.plots import INK, png
 from skysim.results.report import (
@@ -169,10 +169,10 @@ def measure_folder(folder: Path, scene: Scene) -> tuple[CalibrationPrior, list[H
     """Measure the images of a folder with the IMU's attitudes in its `attitudes.csv`. Raises InputError."""
     known = assumed(build_lab(scene))
     threshold_dn = intensity_threshold_dn(scene)
-    attitudes = survey_images.read_attitudes(folder / survey_images.ATTITUDES)
+    attitudes = survey_procedure.read_attitudes(folder / survey_procedure.ATTITUDES)
     frames = []
     for name, lab_from_body in attitudes.items():
-        pixels = survey_images.pixels_of(folder / name, known.camera)
+        pixels = survey_procedure.pixels_of(folder / name, known.camera)
         frames.append(HeldFrame(lab_from_body, *measure(pixels, threshold_dn)))
     return known, frames
 

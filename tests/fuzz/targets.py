@@ -35,7 +35,7 @@ from skysim.dynamics.profile_samples import check_samples
 from skysim.dynamics.profiles import read_profile
 from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.experiments.characterize.frame_files import read_settings
-from skysim.experiments.dome_survey import survey_images
+from skysim.experiments.dome_survey import survey_procedure
 from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import store
 from skysim.results.files import recording
@@ -140,7 +140,7 @@ def calibrations(data: bytes) -> None:
 def tables(data: bytes) -> None:
     """CSV tables: LEDs, points of a dome, attitudes, exposures, a curve over wavelength, a PSF, prices."""
     path = write_file(data, "table.csv")
-    rejects(lambda: survey_images.read_attitudes(path), InputError)
+    rejects(lambda: survey_procedure.read_attitudes(path), InputError)
     rejects(lambda: read_settings(path), InputError)
     rejects(lambda: listed.read_csv(path), InputError)
     rejects(

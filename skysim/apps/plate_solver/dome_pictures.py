@@ -147,7 +147,7 @@ def make_dome_solver(
     stages
         Names of algorithms by stage; the scene's for the others
     """
-    from skysim.experiments.dome_survey import survey_frames, survey_images
+    from skysim.experiments.dome_survey import survey_frames, survey_procedure
     from skysim.experiments.tracker_comparison import with_config
     from skysim.scene import loader
     from skysim.simulation.lab import build_lab
@@ -174,7 +174,7 @@ def make_dome_solver(
     if path:
         camera, leds, lever = onboard_model.surveyed_dome(lab.scene, str(path), leds, lever)
     settings = factory.assumed_settings(lab.scene)
-    tracker = survey_images.dome_tracker(camera, leds, lever, settings)
+    tracker = survey_procedure.dome_tracker(camera, leds, lever, settings)
     known = KnownCamera(camera, 0.0, scene.camera.detector)
     return DomeSolver(tracker, known, len(prior.leds.id))
 

@@ -26,7 +26,6 @@ from skysim.experiments.dome_survey.survey_findings import (
     rows_of_columns,
 )
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior
-from skysim.experiments.dome_survey.survey_images import SOLVED
 from skysim.results import metrics, scoring
 from skysim.results.plots import INK, png
 from skysim.results.report import (
@@ -47,6 +46,7 @@ from skysim.simulation.lab import Lab
 from skysim.tracking import factory
 from skysim.tracking.onboard_model import rows_of
 
+SOLVED = "solved_attitudes.csv"
 CELLS = 8  # number of cells across the chip in which residuals are averaged
 BINS = 60
 TAIL = 0.005  # fraction of the residuals beyond each end of the histogram

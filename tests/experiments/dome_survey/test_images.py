@@ -23,7 +23,6 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats
 from skysim.experiments.dome_survey import (
     survey_frames,
-    survey_images,
     survey_procedure,
 )
 from skysim.scene import loader
@@ -241,7 +240,7 @@ def test_without_an_imu_the_tracker_identifies_the_images(
     """LEDs that differ in place alone, to a millimeter: nearly all images, and the same dome."""
     alone = folder / "alone"
     shutil.copytree(frames, alone)
-    (alone / survey_images.ATTITUDES).unlink()
+    (alone / survey_procedure.ATTITUDES).unlink()
     found = surveyed(folder, alone, "lost")
     assert found["tied"] > 0.8 * STOPS
     assert found["surveyed"] > 0.8 * result["surveyed"]
@@ -268,7 +267,7 @@ def test_a_watch_ends_with_the_survey_of_the_images_at_hand(
     arriving.mkdir()
 
     def drop() -> None:
-        shutil.copy(frames / survey_images.ATTITUDES, arriving)
+        shutil.copy(frames / survey_procedure.ATTITUDES, arriving)
         (arriving / "noise.png").write_bytes(b"no image")
         for path in sorted(frames.glob("*.fits")):
             shutil.copy(path, arriving / f".{path.name}")
@@ -282,7 +281,7 @@ def test_a_watch_ends_with_the_survey_of_the_images_at_hand(
             raise KeyboardInterrupt
 
     rested: list[bool] = []
-    monkeypatch.setattr(survey_images.time, "sleep", wait)
+    monkeypatch.setattr(survey_procedure.time, "sleep", wait)
     dropping.start()
     words = [
         "survey",
@@ -395,10 +394,10 @@ HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"
 
 def test_written_attitudes_are_read_unchanged(tmp_path: Path) -> None:
     held = survey_frames.from_angles(np.array([[1.0, -20.0, 170.0], [0.5, 3.0, -90.0]]))
-    survey_images.write_attitudes(
+    survey_procedure.write_attitudes(
         tmp_path / "a.csv", ["b.fits", "a.fits"], held, {"leds": [3, 4]}
     )
-    read = survey_images.read_attitudes(tmp_path / "a.csv")
+    read = survey_procedure.read_attitudes(tmp_path / "a.csv")
     assert list(read) == ["b.fits", "a.fits"]
     # Four decimals.
     assert (Rotation.concatenate(list(read.values())) * held.inv()).magnitude().max() < 2e-6
@@ -420,8 +419,8 @@ def test_solved_attitudes_are_written_with_covariances_and_read_as_an_imu_s(
     }
     unknown = dict.fromkeys(row) | {"file": "a.fits", "status": "not identified"}
     path = tmp_path / "solved.csv"
-    survey_images.write_solved(path, [unknown, row])
-    assert list(survey_images.read_attitudes(path)) == ["b.fits"]
+    survey_procedure.write_solved(path, [unknown, row])
+    assert list(survey_procedure.read_attitudes(path)) == ["b.fits"]
     head, only = (line.split(",") for line in path.read_text().splitlines())
     found = dict(zip(head, only, strict=True))
     assert [float(found[f"cam_from_lab_{one}"]) for one in "xyzw"] == [0.1, 0.2, 0.3, 0.9]
@@ -449,7 +448,7 @@ def test_faulty_attitudes_are_refused_in_one_line(
 ) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError) as refused:
-        survey_images.read_attitudes(tmp_path / "a.csv")
+        survey_procedure.read_attitudes(tmp_path / "a.csv")
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 
@@ -457,7 +456,7 @@ def test_faulty_attitudes_are_refused_in_one_line(
 def test_of_two_formats_of_one_image_one_is_read(tmp_path: Path) -> None:
     for name in ("b.png", "a.png", "a.fits", "c.jpg", "notes.txt", ".d.png"):
         (tmp_path / name).touch()
-    assert [path.name for path in survey_images.image_files(tmp_path)] == [
+    assert [path.name for path in survey_procedure.image_files(tmp_path)] == [
         "a.fits",
         "b.png",
         "c.jpg",

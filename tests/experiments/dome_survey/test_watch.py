@@ -13,7 +13,7 @@ import pytest
 from estimator.core.camera import Camera
 from estimator.trackers.pipeline import Settings
 from skysim.core.errors import InputError
-from skysim.experiments.dome_survey.survey_images import ATTITUDES, WatchedFolder
+from skysim.experiments.dome_survey.survey_procedure import ATTITUDES, WatchedFolder
 
 CAMERA = Camera(64, 48, 100.0, (31.5, 23.5))
 HEAD = "file,roll_deg,pitch_deg,yaw_deg\n"

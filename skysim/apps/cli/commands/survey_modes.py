@@ -16,7 +16,6 @@ from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
     survey_frames,
-    survey_images,
     survey_procedure,
     survey_report,
 )
@@ -172,7 +171,7 @@ def simulated(request: Request, checks: int, frames_to: Path | None) -> Record:
     observations = list(progress(taken, len(plan.shown), "rendering"))
     with adjusting(request, observations, before, plan.model.sigma_px) as update:
         run = adjust.run_survey(observations, before, update)
-    names = survey_images.frame_names(len(observations))
+    names = survey_procedure.frame_names(len(observations))
     statistics = write_results(request, run, before, lab, names)
     tracker = factory.build_tracker(
         survey_frames.with_map(lab.scene, statistics["map"]),
@@ -206,11 +205,11 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
     if watch:
         pictures = followed(request, images, before, stages)
     else:
-        total = len(survey_images.image_files(images))
+        total = len(survey_procedure.image_files(images))
         pictures = list(
-            progress(survey_images.read_images(images, camera, stages), total, "reading")
+            progress(survey_procedure.read_images(images, camera, stages), total, "reading")
         )
-    found = survey_images.frames_with_attitude(pictures, before, stages)
+    found = survey_procedure.frames_with_attitude(pictures, before, stages)
     with adjusting(request, found, before, None) as update:
         run = survey_procedure.survey_images(pictures, found, before, stages, update)
     names = [picture.name for picture in pictures]
@@ -220,17 +219,17 @@ def from_images(request: Request, images: Path, camera_file: Path, watch: bool) 
 
 def followed(
     request: Request, images: Path, before: CalibrationPrior, stages: Settings
-) -> list[survey_images.SurveyImage]:
+) -> list[survey_procedure.SurveyImage]:
     """The images of a folder, read while they are taken, until there are enough or Ctrl-C; print the coverage."""
 
-    watched = survey_images.WatchedFolder(images, before.camera, stages)
+    watched = survey_procedure.WatchedFolder(images, before.camera, stages)
     with suppress(KeyboardInterrupt):
         for news in watched.arrivals(request.frames):
             for complaint in news.complaints:
                 print_error(str(complaint))
             if news.read and not request.quiet:
                 pictures = watched.pictures
-                found = survey_images.frames_with_attitude(pictures, before, stages)
+                found = survey_procedure.frames_with_attitude(pictures, before, stages)
                 print(
                     f"{len(pictures)} of {request.frames} images, {len(found)} with an attitude"
                 )
@@ -309,7 +308,7 @@ def write_results(
         "map": str(path),
         "picture": str(picture),
     }
-    survey_images.write_solved(folder / survey_images.SOLVED, statistics["attitudes"])
+    survey_procedure.write_solved(folder / survey_report.SOLVED, statistics["attitudes"])
     further = survey_frames.from_rows(statistics["next"])
     errors = survey_report.led_errors(run.survey, before, lab) if lab else None
     files.write_bytes(
