@@ -24,7 +24,7 @@ from benchmarks.timing import figure, verdict, versus
 from skysim.camera.detector import AddedCharge
 from skysim.core.errors import InputError
 from skysim.experiments import dataset_run, dataset_shards
-from skysim.experiments.dataset_labels import label_frame, labeller
+from skysim.experiments.dataset_shards import label_frame, labeller
 from skysim.experiments.study import study_file as study_loader
 from skysim.experiments.study.execution import engines, runner, store, trials
 from skysim.experiments.study.plan import Plan

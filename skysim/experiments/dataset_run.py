@@ -13,26 +13,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, check_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Record
 from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
-from skysim.experiments.dataset_labels import LabelledFrame, label_frame, labeller
 from skysim.experiments.dataset_shards import (
-    ZARR,
-    ZARR_ARRAY,
+    EXTRA,
+    LabelledFrame,
     Storage,
     add_frame,
     coco_annotations,
     coco_file,
     coco_image,
-    create_zarr,
     frame_labels,
     index_table,
+    label_frame,
+    labeller,
     shard_name,
     sources_table,
-    write_zarr,
 )
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution.engines import Chunk, Engine
@@ -263,6 +265,53 @@ class ShardQueue:
 
     def report_time(self, chunk: Chunk, seconds: float) -> None:
         """Do nothing: the size of a shard is fixed by the plan."""
+
+
+# The images of all frames as one array.
+
+
+ZARR = "images.zarr"
+ZARR_ARRAY = "images"
+
+
+def require_zarr() -> Any:
+    """The package zarr. Raises InputError."""
+    try:
+        import zarr
+    except ImportError:
+        raise InputError("dataset.formats", f"zarr {EXTRA}") from None
+    return zarr
+
+
+def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray) -> None:
+    """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
+    shape = image.shape
+    group = require_zarr().create_group(
+        storage.zarr_store(ZARR), zarr_format=3, overwrite=True
+    )
+    group.create_array(
+        ZARR_ARRAY,
+        shape=(frames, *shape),
+        chunks=(1, *shape),
+        shards=(per_shard, *shape),
+        dtype=image.dtype,
+        dimension_names=("frame", "y", "x"),
+        attributes={"units": "DN"},
+    )
+
+
+def write_zarr(storage: Storage, first: int, images: list[NDArray], shard: int) -> None:
+    """Write the images of one shard, which is one object. Raises InputError for an image of another size."""
+    array = require_zarr().open_group(storage.zarr_store(ZARR), mode="r+")[ZARR_ARRAY]
+    for n, image in enumerate(images):
+        if image.shape != array.shape[1:] or image.dtype != array.dtype:
+            raise InputError(
+                "dataset.formats",
+                f"zarr: frame {first + n} of shard {shard} is {image.shape[1]}x{image.shape[0]} {image.dtype}, the"
+                f" first one {array.shape[2]}x{array.shape[1]} {array.dtype}",
+                "one size, or webdataset",
+            )
+    array[first : first + len(images)] = np.stack(images)
 
 
 # On the workers.

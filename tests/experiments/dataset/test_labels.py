@@ -13,7 +13,7 @@ from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
 from skysim.core.types import SourceTruth
 from skysim.core.yaml_reader import parse_yaml
-from skysim.experiments import dataset_labels, dataset_shards
+from skysim.experiments import dataset_shards
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.trials import TrialSetup, prepared_setup
 from skysim.experiments.study.plan import TrialSpec
@@ -52,7 +52,7 @@ def test_run_lengths_encode_the_mask_by_columns() -> None:
     masks = [rng.random((7, 5)) < share for share in (0.1, 0.5, 0.9) for _ in range(20)]
     masks += [np.zeros((3, 4), bool), np.ones((3, 4), bool)]
     for mask in masks:
-        counts = dataset_labels.run_lengths(mask)
+        counts = dataset_shards.run_lengths(mask)
         assert sum(counts) == mask.size
         assert min(counts[1:], default=1) > 0
         np.testing.assert_array_equal(decoded(counts, mask.shape), mask)
@@ -69,14 +69,14 @@ def test_the_width_of_a_streak_is_its_blur(sigma_px: float, streak_px: float) ->
     light[75, 200 - round(fine * streak_px / 2) : 201 + round(fine * streak_px / 2)] = 1
     light = gaussian_filter(light, fine * sigma_px)
     area_px = light.sum() ** 2 / (light**2).sum() / fine**2
-    found = dataset_labels.across_sigma_px(np.array([area_px]), np.array([streak_px]))[0]
+    found = dataset_shards.across_sigma_px(np.array([area_px]), np.array([streak_px]))[0]
     assert found == pytest.approx(sigma_px, rel=0.08)
 
 
 def test_streak_vectors_match_the_rotating_camera() -> None:
     """Stars' directions from mid-exposure pixels by the estimator's camera, turned by the rate over the exposure."""
     setup = setup_with(trial={"rate_deg_s": 3.0})
-    one = dataset_labels.label_frame(setup, 5)
+    one = dataset_shards.label_frame(setup, 5)
     camera: Camera = assumed_camera(setup.lab.scene)
     rows = one.sources
     rate = one.truth.rate_cam_rad_s
@@ -98,7 +98,7 @@ def test_bright_sources_are_detected_where_their_light_is() -> None:
     setup = setup_with()
     checked = 0
     for seed in (5, 6, 9):
-        rows = dataset_labels.label_frame(setup, seed).sources
+        rows = dataset_shards.label_frame(setup, seed).sources
         xy = np.column_stack([rows["flux_x_px"], rows["flux_y_px"]])
         inside = ((xy > 6) & (xy < np.array([WIDTH, HEIGHT]) - 7)).all(axis=1)
         near = (np.linalg.norm(xy[:, None] - xy, axis=2) < 12) & (rows["snr"] > 3)
@@ -114,13 +114,13 @@ def test_bright_sources_are_detected_where_their_light_is() -> None:
 
 def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
     """This holds even if rounding gives a streak of 1e-14 pixels."""
-    rows = np.zeros(3, dataset_labels.SOURCE)
+    rows = np.zeros(3, dataset_shards.SOURCE)
     rows["flux_x_px"] = 10
     rows["flux_y_px"] = 20
     rows["streak_x_px"] = [0, 1e-14, -1e-14]
     rows["sigma_px"] = 0.7
     for box, outline in zip(
-        *dataset_shards.outlines(dataset_labels.image_extents(rows, Window(0, 1), 100)),
+        *dataset_shards.outlines(dataset_shards.image_extents(rows, Window(0, 1), 100)),
         strict=True,
     ):
         assert box == pytest.approx([10.5 - 2.1, 20.5 - 2.1, 4.2, 4.2])
@@ -152,12 +152,12 @@ def test_the_outline_of_the_moon_is_about_its_saturated_disc(
         MOON | shutter, {"near": {"body": "moon", "off_deg": [0, 0.3]}, "rate_deg_s": 10}
     )
     for seed in (1, 2, 5):  # both limbs, far from the middle row
-        one = dataset_labels.label_frame(setup, seed)
-        moon = one.sources["radius_px"] > dataset_labels.DISC_PX
+        one = dataset_shards.label_frame(setup, seed)
+        moon = one.sources["radius_px"] > dataset_shards.DISC_PX
         assert moon.sum() == 1
         corner = dataset_shards.outlines(one.extents.of(moon))[1].reshape(4, 2) - 0.5
         sides = corner[1] - corner[0], corner[3] - corner[0]
-        y, x = np.nonzero(decoded(one.masks[dataset_labels.SATURATED], (HEIGHT, WIDTH)))
+        y, x = np.nonzero(decoded(one.masks[dataset_shards.SATURATED], (HEIGHT, WIDTH)))
         near = np.hypot(x - one.sources["x_px"][moon], y - one.sources["y_px"][moon]) < 80
         inside = np.column_stack([x, y])[near] - corner[0]
         for side in sides:
@@ -174,7 +174,7 @@ def test_a_detection_belongs_to_the_brightest_nearby_source_alone() -> None:
         np.arange(3), xy, xy, np.array([1.0, 9, 4]), one, 0 * one, one, np.rint(xy).astype(int), one > 2, one,
         np.zeros((3, 2)),
     )  # fmt: skip
-    rows, unmatched = dataset_labels.source_rows(truth, np.array([[10.2, 10.0], [80, 80]]))
+    rows, unmatched = dataset_shards.source_rows(truth, np.array([[10.2, 10.0], [80, 80]]))
     assert rows["id"].tolist() == [1, 2, 0]
     assert rows["detected"].tolist() == [True, False, False]
     np.testing.assert_array_equal(unmatched, [[80, 80]])
@@ -183,7 +183,7 @@ def test_a_detection_belongs_to_the_brightest_nearby_source_alone() -> None:
 def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     """Both frames have the same photons and the same noise; a count is 10 electrons, and the threshold 15."""
     with_, without = (
-        dataset_labels.label_frame(setup_with(more), 4) for more in (PARTICLE, {})
+        dataset_shards.label_frame(setup_with(more), 4) for more in (PARTICLE, {})
     )
     assert PARTICLES not in without.masks
     mask = decoded(with_.masks[PARTICLES], (HEIGHT, WIDTH))
@@ -206,7 +206,7 @@ def test_labels_do_not_change_the_frame_of_the_trial() -> None:
     setup = setup_with(PARTICLE)
     frame, truth, _ = trials.render_trial_frame(setup, 4)
     image = frame.image_dn.copy()
-    one = dataset_labels.label_frame(setup, 4)
+    one = dataset_shards.label_frame(setup, 4)
     np.testing.assert_array_equal(one.frame.image_dn, image)
     np.testing.assert_array_equal(np.sort(one.sources["id"]), np.sort(truth.sources.id))
 
@@ -216,14 +216,14 @@ def test_saturated_pixels_are_those_whose_charge_exceeds_the_well() -> None:
     base = dict.fromkeys(("camera.detector.cti_parallel", "camera.detector.cti_serial"), 0.0)
     base |= {"camera.detector.blooming": "none"}
     well_e = 1500
-    shallow = dataset_labels.label_frame(
+    shallow = dataset_shards.label_frame(
         setup_with(base | {"camera.detector.full_well_e": well_e}), 5
     )
     deep = setup_with(base)
-    mask = decoded(shallow.masks[dataset_labels.SATURATED], (HEIGHT, WIDTH))
+    mask = decoded(shallow.masks[dataset_shards.SATURATED], (HEIGHT, WIDTH))
     config = deep.lab.scene.camera.detector
     charge_e = (
-        dataset_labels.label_frame(deep, 5).frame.image_dn.astype(float) - config.offset_dn
+        dataset_shards.label_frame(deep, 5).frame.image_dn.astype(float) - config.offset_dn
     ) * config.gain_e_dn
     noise_e = config.read_noise_e
     assert mask.sum() > 3

@@ -182,7 +182,7 @@ def test_numbers_with_two_decimals_are_written_as_by_json() -> None:
 
 
 def test_the_box_of_a_mask_is_about_its_pixels() -> None:
-    from skysim.experiments.dataset_labels import run_lengths
+    from skysim.experiments.dataset_shards import run_lengths
 
     rng = np.random.default_rng(1)
     for share in (0.02, 0.3):
