@@ -17,7 +17,6 @@ from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_image
 from skysim.core.types import Frame, Ints, Telemetry, Truth
 from skysim.core.yaml_reader import OverrideTexts
-from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.engines import Chunk, Engine, Pool, Serial
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.store import Store, to_sql
@@ -28,8 +27,13 @@ from skysim.experiments.study.execution.trials import (
     TrialJob,
     TrialSetup,
     code_version,
+    lost_in_space,
     prepared_setup,
+    render_trial_frame,
+    run_block,
     scene_hash,
+    solved_centroids,
+    trial_flight,
 )
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.plan import (
@@ -393,7 +397,7 @@ def replay(
     rendered before it are also written.
     """
     segment = segment_of(plan, store, trial)
-    (row,) = trials.run_block(plan.spec, segment)
+    (row,) = run_block(plan.spec, segment)
     reasons: list[str] = []
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
     now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
@@ -429,7 +433,7 @@ def replay_flight(
     setup: TrialSetup, seed: int, folder: Path, command: str, draw: Draw | None
 ) -> list[str]:
     """Fly a trial again and write its frames, solutions, telemetry, report and pictures. Returns what went wrong."""
-    with trials.trial_flight(setup, seed) as flight:
+    with trial_flight(setup, seed) as flight:
         recorder = Recorder(folder, flight.lab.camera)
         for shot in flight.shots(cameras=[0]):
             recorder.add(scoring.Score(shot))
@@ -458,18 +462,18 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
             kind="frames",
             **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
         )
-        frame, truth, _ = trials.render_trial_frame(setup._replace(trial=frame_trial), seed)
+        frame, truth, _ = render_trial_frame(setup._replace(trial=frame_trial), seed)
         return (
             frame,
             truth,
-            solve_or_failed(lambda: trials.solved_centroids(setup, [seed])[0][1]),
+            solve_or_failed(lambda: solved_centroids(setup, [seed])[0][1]),
         )
     if isinstance(trial, FlightTrial):
-        with trials.trial_flight(setup, seed) as flight:
+        with trial_flight(setup, seed) as flight:
             shot = next(flight.shots(cameras=[0]))
             return shot.frame, shot.truth, shot.solution
-    frame, truth, streak_px = trials.render_trial_frame(setup, seed)
-    solve = partial(trials.lost_in_space, setup, frame, truth, streak_px)
+    frame, truth, streak_px = render_trial_frame(setup, seed)
+    solve = partial(lost_in_space, setup, frame, truth, streak_px)
     return frame, truth, solve_or_failed(solve)
 
 
