@@ -16,7 +16,6 @@ from skysim.core.paths import SCENES, shipped_files
 from skysim.dynamics import multibody
 from skysim.experiments.study.execution.trials import TrialSetup, run_frame_trial
 from skysim.experiments.study.plan import FrameTrial
-from skysim.experiments.tracker_comparison import with_config
 from skysim.results import metrics
 from skysim.results.run import render
 from skysim.scene import loader
@@ -281,11 +280,11 @@ def test_the_claimed_error_matches_the_actual_error(name: str) -> None:
     outcomes = []
     rng = np.random.default_rng(300)
     for survey in range(SURVEYS):
-        scene = with_config(lab.scene, "tracker.survey", seed=survey)
+        scene = lab.scene.with_values("tracker.survey", seed=survey)
         if isinstance(scene.light, CollimatedDisplayConfig):
             dec_deg = np.degrees(np.arcsin(rng.uniform(-1, 1)))
-            scene = with_config(
-                scene, "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg
+            scene = scene.with_values(
+                "light", axis_ra_deg=rng.uniform(0, 360), axis_dec_deg=dec_deg
             )
             lab = build_lab(scene)
         if survey == 0 or not isinstance(scene.light, StarsConfig):

@@ -9,7 +9,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, Self, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -285,6 +285,13 @@ class ConfigModel(BaseModel):
         for kind in reversed(type(self).__mro__):
             if check := vars(kind).get("check"):
                 check(self)
+
+    def with_values(self, section: str = "", /, **values: Any) -> Self:
+        """A copy with other values, of a section if it is named, which may be nested as `light.led`; not validated."""
+        head, _, rest = section.partition(".")
+        if head:
+            values = {head: getattr(self, head).with_values(rest, **values)}
+        return self.model_copy(update=values)
 
 
 def keeps_null(field: FieldInfo) -> bool:

@@ -23,7 +23,6 @@ from skysim.core.types import Floats, Record
 from skysim.core.units import quantities_within
 from skysim.dynamics import imu, multibody
 from skysim.dynamics.multibody import VehicleModel
-from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS, MotionConfig
 from skysim.simulation.flight import Flight, Progress, open_flight
@@ -360,9 +359,7 @@ def excited_by_wheels(
         kept = {"bandwidth_rad_s", "damping", "integral_rad_s", "rate_hz"}
         law |= control.model_dump(include=kept)
     motion = MotionConfig.model_validate({"control": law, "maneuver": legs[1:]})
-    return with_config(scene, "vehicle.wheels", start_rpm=()).model_copy(
-        update={"motion": motion}
-    )
+    return scene.with_values("vehicle.wheels", start_rpm=()).with_values(motion=motion)
 
 
 def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
@@ -373,13 +370,13 @@ def excited_by_swing(scene: Scene, tilt_deg: float, number: int) -> Scene:
         "yaw_deg": YAWS_DEG[number % len(YAWS_DEG)],
     }
     motion = MotionConfig.model_validate({"start": start})
-    return scene.model_copy(update={"motion": motion})
+    return scene.with_values(motion=motion)
 
 
 def with_frames(scene: Scene, duration_s: float) -> Scene:
     """The scene with as many frames, two at least, as its frame rate gives in a duration."""
     frames = max(int((duration_s - scene.exposure.first_s) * scene.exposure.rate_hz), 2)
-    return with_config(scene, "exposure", frames=frames)
+    return scene.with_values("exposure", frames=frames)
 
 
 def fly(

@@ -41,7 +41,6 @@ from skysim.experiments.balance_flight import (
     largest_tilt_deg,
     with_frames,
 )
-from skysim.experiments.tracker_comparison import with_config
 from skysim.results.plots import png
 from skysim.results.report import (
     Block,
@@ -211,15 +210,15 @@ def balance(
 
 def assumed(scene: Scene, uncertainty: Uncertainty) -> Assumptions:
     """The assumptions on the vehicle with its trim masses at zero."""
-    at_zero = with_config(scene, "vehicle", trim=None) if scene.vehicle.trim else scene
+    at_zero = scene.with_values("vehicle", trim=None) if scene.vehicle.trim else scene
     return draw_assumptions(scene, build(at_zero.vehicle), uncertainty)
 
 
 def in_flight(scene: Scene, plan: BalancePlan, number: int, position_m: Floats) -> Scene:
     """The scene of one flight: trim masses in their places, excitation, frames all the time, and its own noise."""
-    scene = scene.model_copy(update={"seed": scene.seed + number})
+    scene = scene.with_values(seed=scene.seed + number)
     if scene.vehicle.trim:
-        scene = with_config(scene, "vehicle.trim", position_m=tuple(map(float, position_m)))
+        scene = scene.with_values("vehicle.trim", position_m=tuple(map(float, position_m)))
     if plan.excite == "swing":
         return with_frames(
             excited_by_swing(scene, plan.tilt_deg, number),

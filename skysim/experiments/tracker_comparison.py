@@ -3,33 +3,19 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
 from skysim.core.types import Frame, FrameRow, Record, Truth
-from skysim.core.units import ConfigModel
 from skysim.results import metrics, scoring
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 from skysim.simulation.lab import Lab, build_tracker
 from skysim.tracking import factory
 from skysim.tracking.tracker_interface import FAILED, SOLVED
-
-# Copies of scenes with some keys replaced.
-
-
-Config = TypeVar("Config", bound=ConfigModel)
-
-
-def with_config(config: Config, section: str, **values: Any) -> Config:
-    """Copy a scene with values of a section replaced, without validation; `section` may be nested, as `light.led`."""
-    head, _, rest = section.partition(".")
-    inner = getattr(config, head)
-    changed = with_config(inner, rest, **values) if rest else inner.model_copy(update=values)
-    return config.model_copy(update={head: changed})
 
 
 class TrackerScore(NamedTuple):
@@ -78,7 +64,7 @@ def build_trackers(
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise InputError("trackers", f"{repeated[0]} is given twice", "once")
-    scenes = {name: with_config(lab.scene, "tracker", name=name) for name in names}
+    scenes = {name: lab.scene.with_values("tracker", name=name) for name in names}
     return {
         name: build_tracker(lab.with_scene(scene).camera, programs)
         for name, scene in scenes.items()

@@ -225,10 +225,9 @@ class Scene(ConfigModel, metaclass=SceneKind):
         sky = self.light.kind == "stars"
         tracker = self.tracker
         # Survey errors and maps need LEDs; without LEDs only the focal length is surveyed.
-        lens = {"focal_length_sigma_m": 0.0, "seed": 0}
         survey = tracker.survey
         if survey.focal_length_sigma_m:
-            survey = survey.model_copy(update=lens)
+            survey = survey.with_values(focal_length_sigma_m=0.0, seed=0)
         if not self.dome and (survey != SurveyErrorsConfig() or tracker.map):
             key = "map" if tracker.map else "survey"
             raise InputError(
@@ -283,11 +282,11 @@ class Scene(ConfigModel, metaclass=SceneKind):
             key = f"light.layout.{'points.' if nested else ''}camera"
             raise InputError(key, "missing", "that, or vehicle.camera")
         field_deg = self.camera.calibration().field_deg[:2]
-        points = points.model_copy(
-            update={"camera_m": camera_m, "field_deg": points.field_deg or field_deg}
+        points = points.with_values(
+            camera_m=camera_m, field_deg=points.field_deg or field_deg
         )
-        layout = dome.layout.model_copy(update={"points": points}) if nested else points
-        return self.model_copy(update={"light": dome.model_copy(update={"layout": layout})})
+        layout = dome.layout.with_values(points=points) if nested else points
+        return self.with_values("light", layout=layout)
 
     @model_validator(mode="after")
     def check_sky(self) -> "Scene":
@@ -493,25 +492,22 @@ class Scene(ConfigModel, metaclass=SceneKind):
         main = self.camera
         camera = head.camera or main
         if camera.detector.hardware_seed == main.detector.hardware_seed:
-            unit = {"hardware_seed": main.detector.hardware_seed + n + 1}
-            camera = camera.model_copy(
-                update={"detector": camera.detector.model_copy(update=unit)}
-            )
-        thermal = self.thermal and self.thermal.model_copy(
-            update={"mount_arcsec_k": head.mount_arcsec_k}
+            unit = main.detector.hardware_seed + n + 1
+            camera = camera.with_values("detector", hardware_seed=unit)
+        thermal = self.thermal and self.thermal.with_values(
+            mount_arcsec_k=head.mount_arcsec_k
         )
         if thermal and not thermal.has_effect:
             thermal = None
-        sections = {
-            "seed": derived_seed(self.seed, HEAD_SEED, n),
-            "vehicle": self.vehicle.model_copy(update={"camera_m": head.position_m}),
-            "camera": camera,
-            "tracker": head.tracker or self.tracker,
-            "exposure": head.exposure or self.exposure,
-            "thermal": thermal,
-            "heads": (),
-        }
-        return self.model_copy(update=sections)
+        return self.with_values(
+            seed=derived_seed(self.seed, HEAD_SEED, n),
+            vehicle=self.vehicle.with_values(camera_m=head.position_m),
+            camera=camera,
+            tracker=head.tracker or self.tracker,
+            exposure=head.exposure or self.exposure,
+            thermal=thermal,
+            heads=(),
+        )
 
     @property
     def summary(self) -> list[tuple[str, str]]:

@@ -100,8 +100,8 @@ def with_parts(
     if controller is not None:
         check_controller(controller)
         law = controller if isinstance(controller, str) else name_of(controller)
-        config = (motion.control or ControlConfig()).model_copy(update={"law": law})
-        motion = motion.model_copy(update={"control": config})
+        config = (motion.control or ControlConfig()).with_values(law=law)
+        motion = motion.with_values(control=config)
         programs = programs if law is controller else {**programs, law: controller}
     is_named = isinstance(profile, str | Path)
     if profile is not None:
@@ -109,19 +109,17 @@ def with_parts(
         if is_named and not is_file(Path(profile)):
             raise InputError("profile", f"{profile} is not a file", "a file, or a table")
         file = str(profile) if is_named else GIVEN_TABLE
-        along = {
-            "start": "profile",
-            "rate_deg_s": (0.0, 0.0, 0.0),
-            "maneuver": (ProfileConfig.model_construct(kind="profile", file=file),),
-            "control": motion.control or ControlConfig(law=PRESCRIBED),
-        }
-        motion = motion.model_copy(update=along)
-    scene = scene.model_copy(update={"motion": motion})
+        motion = motion.with_values(
+            start="profile",
+            rate_deg_s=(0.0, 0.0, 0.0),
+            maneuver=(ProfileConfig.model_construct(kind="profile", file=file),),
+            control=motion.control or ControlConfig(law=PRESCRIBED),
+        )
+    scene = scene.with_values(motion=motion)
     if tracker is not None:
         name = tracker if isinstance(tracker, str) else name_of(tracker)
         estimator = None if name is tracker else factory.tracker_of(name, tracker)
-        named = scene.tracker.model_copy(update={"name": name})
-        scene = scene.model_copy(update={"tracker": named})
+        scene = scene.with_values("tracker", name=name)
     table = None if is_named else profile
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {
@@ -291,7 +289,7 @@ class Lab:
 
     def in_run(self, seed: int) -> "Lab":
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""
-        lab = self.with_scene(self.scene.model_copy(update={"seed": seed}))
+        lab = self.with_scene(self.scene.with_values(seed=seed))
         return replace(
             lab, cameras=tuple(replace(camera, run_seed=seed) for camera in lab.cameras)
         )

@@ -176,8 +176,7 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
     if control is None or scene.motion.is_prescribed:
         return None
     # The torque is given, so the control law does not matter.
-    pid = control.model_copy(update={"law": "pid"})
-    motion = scene.motion.model_copy(update={"control": pid})
+    pid = scene.with_values("motion.control", law="pid")
     reference = lab.reference
     period_s = max(FORECAST_S, lab.duration_s / FORECAST_PERIODS)
     vehicle = lab.vehicle
@@ -185,7 +184,7 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
     angles = start.angles_rad.copy()
     speeds = start.speeds_rad_s.copy()
     t_s = np.arange(0.0, lab.duration_s, period_s)
-    computer = FlightComputer(scene.model_copy(update={"motion": motion}), vehicle, reference)
+    computer = FlightComputer(pid, vehicle, reference)
     disturbances = build_disturbances(lab, (), period_s)
     needed = np.zeros((len(t_s), 3))
     given = np.zeros((len(t_s), 3))
@@ -247,13 +246,9 @@ def flown_saturation(lab: Lab) -> str:
     control = scene.motion.control
     assert control is not None
     law = control.law if control.law in BUILT_IN_LAWS else "pid"
-    control = control.model_copy(update={"law": law, "feedback": "truth"})
-    sections = {
-        "motion": scene.motion.model_copy(update={"control": control}),
-        "vehicle": scene.vehicle.model_copy(update={"imu": None}),
-        "filter": None,
-    }
-    lab = replace(lab, scene=scene.model_copy(update=sections))
+    scene = scene.with_values("motion.control", law=law, feedback="truth")
+    scene = scene.with_values("vehicle", imu=None).with_values(filter=None)
+    lab = replace(lab, scene=scene)
     motion = Motion(lab, NO_PROGRAMS, min(lab.duration_s, FLOWN_S))
     while motion.simulation.steps_left:
         motion.advance(motion.period_steps)

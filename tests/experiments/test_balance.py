@@ -18,7 +18,6 @@ from skysim.core.types import Floats
 from skysim.dynamics import guidance, multibody
 from skysim.experiments import balance_flight, balance_procedure
 from skysim.experiments.balance_procedure import BalancePlan
-from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
@@ -139,7 +138,7 @@ def test_trim_masses_move_to_cancel_the_moment() -> None:
     moment = vehicle.mass.mass_kg * vehicle.mass.center_m
     position_m = balance_procedure.balanced_position_m(vehicle, moment, scene)
     moved = multibody.build(
-        with_config(scene, "vehicle.trim", position_m=tuple(position_m)).vehicle
+        scene.with_values("vehicle.trim", position_m=tuple(position_m)).vehicle
     )
     np.testing.assert_allclose(moved.mass.center_m, 0, atol=1e-10)
     assert np.abs(position_m - vehicle.trims.position_m).max() > 1e-3

@@ -127,10 +127,8 @@ def load(
     LOADED.append((name, values))
     scene = load_scene(name, values, refuses_unused=not trackers)
     if trackers:
-        each = [scene.tracker.model_copy(update={"name": tracker}) for tracker in trackers]
-        unused.check_overrides(
-            [scene.model_copy(update={"tracker": tracker}) for tracker in each], values
-        )
+        each = [scene.with_values("tracker", name=tracker) for tracker in trackers]
+        unused.check_overrides(each, values)
     return scene
 
 

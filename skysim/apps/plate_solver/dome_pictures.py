@@ -148,7 +148,6 @@ def make_dome_solver(
         Names of algorithms by stage; the scene's for the others
     """
     from skysim.experiments.dome_survey import survey_frames, survey_procedure
-    from skysim.experiments.tracker_comparison import with_config
     from skysim.scene import loader
     from skysim.simulation.lab import build_lab
     from skysim.tracking import factory, onboard_model
@@ -159,7 +158,7 @@ def make_dome_solver(
     if light is None:
         raise InputError("solve.dome", f"the light of {dome} is {scene.light.kind}", "a dome")
     # 1. The lists without simulated errors. One picture is too few for codes.
-    own = with_config(scene, "tracker", name=OWN, decoder=None, **(stages or {}))
+    own = scene.with_values("tracker", name=OWN, decoder=None, **(stages or {}))
     lab = build_lab(survey_frames.as_listed(own))
     sigma = onboard_model.assumed_camera(scene).focal_sigma
     camera = replace(onboard_model.assumed_camera(lab.scene), focal_sigma=sigma)

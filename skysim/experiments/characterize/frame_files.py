@@ -235,8 +235,8 @@ def capacity_e(config: DetectorConfig) -> float:
 
 def frames_of(camera: CameraConfig, shot: PlannedFrame, seed: int) -> Iterator[Numbers]:
     """The frames of a shot by the simulated detector in uniform light."""
-    at_it = camera.detector.model_copy(update={"temperature_c": shot.temperature_c})
-    made = detector.Detector.from_camera(camera.model_copy(update={"detector": at_it}))
+    at_it = camera.with_values("detector", temperature_c=shot.temperature_c)
+    made = detector.Detector.from_camera(at_it)
     key = (
         int(shot.kind == "flats"),
         round(1e6 * shot.exposure_s),

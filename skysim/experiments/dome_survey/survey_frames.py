@@ -23,7 +23,6 @@ from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Floats, Frame, Ints, Sources, Truth, around_z, frozen
 from skysim.core.units import quantities_within
-from skysim.experiments.tracker_comparison import with_config
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
 from skysim.scene.sections.tracker import SurveyErrorsConfig
@@ -237,8 +236,7 @@ def assumed(prior: CalibrationPrior) -> Assumed:
 
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
     """The scene with the onboard model before a survey: errors of this size, drawn with `tracker.survey.seed`."""
-    return with_config(
-        with_map(scene, None),
+    return with_map(scene, None).with_values(
         "tracker.survey",
         led_sigma_m=uncertainty.led_sigma_m,
         lever_sigma_m=uncertainty.lever_sigma_m,
@@ -248,16 +246,15 @@ def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:
 
 def as_listed(scene: Scene) -> Scene:
     """The scene whose tracker assumes the LEDs of the list and the vehicle's lever, without simulated errors."""
-    return with_config(scene, "tracker", survey=SurveyErrorsConfig(), map=None)
+    return scene.with_values("tracker", survey=SurveyErrorsConfig(), map=None)
 
 
 def with_map(scene: Scene, path: str | None) -> Scene:
     """The scene whose tracker uses the map file of a surveyed dome, if any, without random errors of a survey."""
-    scene = with_config(
-        scene, "tracker.survey", led_sigma_m=0.0, lever_sigma_m=0.0, focal_length_sigma_m=0.0
+    scene = scene.with_values(
+        "tracker.survey", led_sigma_m=0.0, lever_sigma_m=0.0, focal_length_sigma_m=0.0
     )
-    return with_config(
-        scene,
+    return scene.with_values(
         "tracker",
         assumed_focal_length_m=None,
         assumed_camera_body_m=None,

@@ -56,7 +56,6 @@ from skysim.experiments.dome_survey.survey_frames import (
     with_survey_errors,
 )
 from skysim.experiments.dome_survey.survey_report import led_errors
-from skysim.experiments.tracker_comparison import with_config
 from skysim.results.files import recording
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
@@ -496,7 +495,7 @@ def in_survey(lab: Lab, n: int) -> Lab:
     again = lab.in_run(scene.seed + n)
     return replace(
         again,
-        scene=with_config(again.scene, "tracker.survey", seed=scene.tracker.survey.seed + n),
+        scene=again.scene.with_values("tracker.survey", seed=scene.tracker.survey.seed + n),
     )
 
 

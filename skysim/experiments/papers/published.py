@@ -118,7 +118,7 @@ def experiments() -> dict[str, Experiment]:
         for id, experiment in paper.experiments.items():
             if id in by_id:
                 raise InputError(path, f"experiments.{id} is defined in two files")
-            by_id[id] = experiment.model_copy(update={"paper": paper.paper})
+            by_id[id] = experiment.with_values(paper=paper.paper)
     return by_id
 
 

@@ -339,9 +339,7 @@ def tape(design: DomeDesign) -> Quantities:
     """LED tape, cut between LEDs: a pitch of it for each, also for those that are covered."""
     layout = design.light.layout
     assert isinstance(layout, StringConfig)
-    wound = wind(
-        layout.model_copy(update={"pitch_error": 0.0, "glue_scatter_m": 0.0}), design.surface
-    )
+    wound = wind(layout.with_values(pitch_error=0.0, glue_scatter_m=0.0), design.surface)
     length_m = layout.pitch_m * len(wound.place_m)
     kind = "tape_addressable" if is_addressable(design) else "tape"
     wire_m = nearest_m(design.to_rim_m(wound.place_m), wound.tape).sum()

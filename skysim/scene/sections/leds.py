@@ -381,7 +381,7 @@ class LedConfig(LedLightConfig):
 
     def of_type(self, name: str) -> "LedConfig":
         """The LED with brightness and color of one of its types; itself for an empty name."""
-        return self.model_copy(update=dict(self.types[name])) if name else self
+        return self.with_values(**dict(self.types[name])) if name else self
 
     def check(self) -> None:
         if self.code and self.code.kind != "cyclic" and self.code.bit_time_s != "frame":

@@ -102,7 +102,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
     if scene.dome:
         dome = onboard_dome(scene, scene.dome, lab.camera.mount, lab.camera.sources)
     lights, direction_error, faintest_mag, epoch_jyear = known_lights(lab, camera, dome)
-    config = scene.camera.model_copy(update={"distortion": believed.distortion})
+    config = scene.camera.with_values(distortion=believed.distortion)
     focal_error = believed.focal_px / scene.camera.focal_px - 1
     assumed_m = tracker.assumed_camera_body_m
     lever_error_m = np.zeros(3)

@@ -145,13 +145,9 @@ def panel_surface(config: layouts.LcdConfig, surface: Any) -> Plane:
 
 def ideal_led(led: leds.LedConfig) -> leds.LedConfig:
     """The LED as new, on direct current, without scatter: its strength is the level that a layout gives a star."""
-    ideal = {
-        "drive": leds.DirectConfig(kind="direct"),
-        "scatter": 0.0,
-        "color_scatter_m": 0.0,
-        "aging": None,
-    }
-    return led.model_copy(update=ideal)
+    return led.with_values(
+        drive=leds.DirectConfig(kind="direct"), scatter=0.0, color_scatter_m=0.0, aging=None
+    )
 
 
 def panel_strength_e_s_sr(led: leds.LedConfig, band: Band) -> float:

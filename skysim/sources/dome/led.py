@@ -141,8 +141,7 @@ def color_factors(led: LedConfig, band: Band, normal: Floats) -> Floats:
     """
     peak_m, grid_m = peaks_m(led, normal)
     strengths = [
-        full_strength_e_s_sr(led.model_copy(update={"spectrum": one}), band)
-        for one in grid_m.tolist()
+        full_strength_e_s_sr(led.with_values(spectrum=one), band) for one in grid_m.tolist()
     ]
     return np.interp(peak_m, grid_m, strengths) / full_strength_e_s_sr(led, band)
 

@@ -30,7 +30,6 @@ from skysim.experiments.dome_survey import (
     survey_procedure,
 )
 from skysim.experiments.dome_survey.survey_frames import SurveyFrame
-from skysim.experiments.tracker_comparison import with_config
 from skysim.scene import loader
 from skysim.simulation.lab import Lab, build_lab, build_tracker
 from skysim.tracking import dome_map_file, factory
@@ -455,7 +454,7 @@ def test_a_survey_s_seed_draws_list_lever_and_focal_length(folder: Path) -> None
         survey_frames.calibration_prior(
             build_lab(
                 survey_frames.with_survey_errors(
-                    with_config(scene, "tracker.survey", seed=seed), UNCERTAINTY
+                    scene.with_values("tracker.survey", seed=seed), UNCERTAINTY
                 )
             )
         )

@@ -104,7 +104,6 @@ def survey(
     """
     from skysim.apps.cli.commands import survey_modes
     from skysim.experiments.dome_survey.survey_frames import survey_uncertainty
-    from skysim.experiments.tracker_comparison import with_config
 
     limited = given_options(
         frames=frames, attitudes=attitudes, next=next_, frames_to=frames_to, checks=checks
@@ -113,7 +112,7 @@ def survey(
     loaded = load(scene, set_, seed)
     if seed is not None:
         # The list, the lever and the focal length before a survey are drawn by the command, not by the scene.
-        loaded = with_config(loaded, "tracker.survey", seed=seed)
+        loaded = loaded.with_values("tracker.survey", seed=seed)
     request = survey_modes.Request(
         loaded,
         survey_uncertainty(imu_sigma, led_sigma, lever_sigma, focal_error, distortion),

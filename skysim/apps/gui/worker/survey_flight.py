@@ -64,10 +64,7 @@ class Survey:
 
     def is_of(self, scene: Scene) -> bool:
         """Whether a scene is the surveyed one, apart from its sections `motion` and `exposure`."""
-        return (
-            self.scene.model_copy(update={"motion": scene.motion, "exposure": scene.exposure})
-            == scene
-        )
+        return self.scene.with_values(motion=scene.motion, exposure=scene.exposure) == scene
 
     def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
         """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.

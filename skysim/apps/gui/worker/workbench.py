@@ -83,16 +83,13 @@ class Workbench:
         scene = load(name, overrides)
         if before and before.scene == scene:
             return before
-        if before and before.scene.model_copy(update={"tracker": scene.tracker}) == scene:
+        if before and before.scene.with_values(tracker=scene.tracker) == scene:
             lab = before.lab.with_scene(scene)
             return replace(before, scene=scene, lab=lab, estimator=warm_tracker(lab))
         lab = build_lab(scene)
         same = (
             before
-            and before.scene.model_copy(
-                update={"tracker": scene.tracker, "camera": scene.camera}
-            )
-            == scene
+            and before.scene.with_values(tracker=scene.tracker, camera=scene.camera) == scene
         )
         lab_from_body = before.lab_from_body if before and same else lab.start
         views = geometry.scene_lens(lab), geometry.lab_geometry(lab)

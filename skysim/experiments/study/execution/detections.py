@@ -167,7 +167,7 @@ def solve_coded(
         0.4 * trial.magnitude_sigma * rng.standard_normal(len(rows))
     )
     # The error of the magnitude is the LED's, equal in all frames, so `simulate_detections` adds none.
-    per_frame = trial.model_copy(update={"magnitude_sigma": 0.0})
+    per_frame = trial.with_values(magnitude_sigma=0.0)
     tracker.last_s = None  # forget the frames of an earlier trial
     first = int(rng.integers(tracker.code.bits))
     for frame in range(first, first + tracker.code.bits):

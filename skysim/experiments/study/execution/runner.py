@@ -260,9 +260,9 @@ def stored_replicates(plan: Plan, store: Store) -> int:
         return 0
     with store.corruption_as_input_error():
         fewer = int(store.meta("replicates") or 0)
-    same = replace(
-        plan, study=plan.study.model_copy(update={"replicates": fewer})
-    ).digest == store.meta("digest")
+    same = replace(plan, study=plan.study.with_values(replicates=fewer)).digest == store.meta(
+        "digest"
+    )
     return fewer if same and 0 < fewer < plan.study.replicates else 0
 
 

@@ -9,7 +9,7 @@ import time
 import traceback
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -31,7 +31,7 @@ from skysim.core import errors, quaternion
 from skysim.core.paths import DATA, ROOT
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth
+from skysim.core.types import Floats, Frame, Mount, Trajectory, Truth, frozen
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study.execution.detections import (
     simulate_detections,
@@ -114,11 +114,7 @@ def build_setup(spec: TrialSpec, settings: Settings) -> TrialSetup:
             return setup._replace(trial=trial)
     # A lab whose scene differs only in section `tracker` has the same hardware.
     cached = (setup.lab for setup in CACHE.setups.values())
-    same = (
-        one
-        for one in cached
-        if one.scene.model_copy(update={"tracker": scene.tracker}) == scene
-    )
+    same = (one for one in cached if one.scene.with_values(tracker=scene.tracker) == scene)
     lab = next(same, None) or build_lab(scene, UserParts(spec.programs))
     lab = lab.with_scene(scene)
     return TrialSetup(
@@ -220,7 +216,7 @@ class Segment(NamedTuple):
 # Running trials.
 
 
-@dataclass(frozen=True)
+@frozen
 class TrialJob:
     """The trials of a study as a job of the engines."""
 

@@ -61,7 +61,7 @@ def design_leds(config: DomeConfig, surface: Surface, band: Band) -> Sources:
     """The LEDs of a dome as designed: without scatter, and without errors of glue, tape and laser."""
     errors = AIMED if getattr(config.layout, "aiming", None) else BUILT
     absent = {key: none for key, none in errors.items() if hasattr(config.layout, key)}
-    layout = config.layout.model_copy(update=absent)
+    layout = config.layout.with_values(**absent)
     return LAYOUTS[layout.kind](layout, surface, ideal_led(config.led), band)
 
 

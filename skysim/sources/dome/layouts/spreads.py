@@ -106,7 +106,7 @@ def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Plac
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
     than a Fibonacci spiral.
     """
-    config_of_places = config.model_copy(update=UNDIMMED)
+    config_of_places = config.with_values(**UNDIMMED)
     reach = optimize.field_reach_rad(config, surface)
     sites = project_from_bearing(
         surface, scattered_cap(optimize.SITES_PER_LED * config.count, reach, rng)
