@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 AXES = ("x", "y", "roll")
+PROCESSES = ("field", "pixel", "scale")  # of the angle that the boresight has turned
 
 
 class State(NamedTuple):
@@ -154,29 +155,31 @@ class ErrorModel:
         first = self.start(rng) if state is None else state
         if axis_rad is None:
             axis_rad = first.axis_rad
-        turned = rate * step_s
-        field, pixel, scale = (
-            correlated(turned / self.constants[f"{name}_deg"], getattr(first, name), rng)
-            for name in ("field", "pixel", "scale")
-        )
-        slow = self.field * field + self.pixel * pixel
-        noise = self.drawn_noise(rate, axis_rad, rng)
-        return first.bias + self.scales(scale) * (slow + noise)
+        walked = self.walk(first, rate * step_s, rng)
+        return self.errors(first.bias, walked, self.drawn_noise(rate, axis_rad, rng))
 
     def step(
         self, state: State, rate_deg_s: float, step_s: float, rng: Any
     ) -> tuple[State, Any]:
         """The state one step later, and its (3,) errors in arcseconds."""
         rate = self.measured_rates(rate_deg_s)
-        turned = float(rate[0]) * step_s
-        later = state
-        for name in ("field", "pixel", "scale"):
-            steps = [0.0, turned / self.constants[f"{name}_deg"]]
-            _, new = correlated(steps, getattr(state, name), rng)
-            later = later._replace(**{name: new})
+        walked = [one[1] for one in self.walk(state, np.append(0.0, rate * step_s), rng)]
         noise = self.drawn_noise(rate, state.axis_rad, rng)[0]
-        slow = self.field * later.field + self.pixel * later.pixel
-        return later, later.bias + self.scales(later.scale) * (slow + noise)
+        later = state._replace(**dict(zip(PROCESSES, walked, strict=True)))
+        return later, self.errors(state.bias, walked, noise)
+
+    def walk(self, first: State, turned_deg: Any, rng: Any) -> list[Any]:
+        """The PROCESSES at N times from a state on, before each of which the boresight turns by (N,) angles."""
+        return [
+            correlated(turned_deg / self.constants[f"{name}_deg"], getattr(first, name), rng)
+            for name in PROCESSES
+        ]
+
+    def errors(self, bias: Any, walked: list[Any], noise: Any) -> Any:
+        """(N, 3) errors of the equation above, (3,) at one time, from its PROCESSES."""
+        field, pixel, scale = walked
+        slow = self.field * field + self.pixel * pixel
+        return bias + self.scales(scale) * (slow + noise)
 
     def correlation(self, angle_deg: float, rate_deg_s: float) -> Any:
         """(3,) correlation of two errors of one unit at a rate, between which the boresight turns by an angle.
@@ -186,8 +189,7 @@ class ErrorModel:
         E[s_k s_l] = exp(-v^2 (1 - r) / 4) for lognormal scales whose normal numbers have the correlation r.
         """
         field, pixel, scale = (
-            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"])
-            for name in ("field", "pixel", "scale")
+            math.exp(-abs(angle_deg) / self.constants[f"{name}_deg"]) for name in PROCESSES
         )
         rate = self.measured_rates(rate_deg_s)
         noise = self.noise_arcsec(rate)[0]
