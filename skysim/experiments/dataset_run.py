@@ -9,7 +9,6 @@ import json
 import tarfile
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, check_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
 from skysim.experiments.dataset_shards import (
     EXTRA,
@@ -68,7 +67,7 @@ DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of ha
 FORMATS = ("webdataset", "zarr", "coco")
 
 
-@dataclass(frozen=True)
+@frozen
 class DatasetPlan:
     """A dataset that can be made on any worker.
 
@@ -235,7 +234,7 @@ class ShardResult(NamedTuple):
     error: str | None = None
 
 
-@dataclass(frozen=True)
+@frozen
 class DatasetJob:
     """The shards of a dataset as a job of the engines; an item is a shard."""
 
