@@ -27,13 +27,13 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.types import (
     ATTITUDES,
-    Bools,
     Floats,
     Frame,
     Ints,
     Record,
     SourceTruth,
     Truth,
+    taken,
 )
 from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
@@ -89,10 +89,6 @@ class Extents(NamedTuple):
     center_px: Floats
     along: Floats
     half_px: Floats
-
-    def of(self, which: Bools) -> Extents:
-        """The rectangles of some sources."""
-        return Extents(*(part[which] for part in self))
 
 
 class LabelledFrame(NamedTuple):
@@ -474,7 +470,7 @@ def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     seen = one.sources["snr"] >= COCO_SNR
     rows = one.sources[seen]
     first = number * 100_000 + 1
-    boxes, corners = outlines(one.extents.of(seen))
+    boxes, corners = outlines(taken(one.extents, seen))
     ids = rows["id"].tolist()
     detected = (("false", "true")[one] for one in rows["detected"].tolist())
     areas = (boxes[:, 2] * boxes[:, 3]).tolist()

@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
-from skysim.core.types import Record, joined
+from skysim.core.types import Record, joined, taken
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
@@ -143,10 +143,10 @@ def draw_transfer(found: MeasuredSensor, fig: Any) -> None:
     black = transfer.values[BLACK]
     curvature = transfer.values[CURVATURE]
     fitted = transfer.points
-    fitted_flats = fitted.take(fitted.lit > 0)
-    beyond = found.flats.take(found.flats.mean_dn > fitted_flats.mean_dn.max())
+    fitted_flats = taken(fitted, fitted.lit > 0)
+    beyond = taken(found.flats, found.flats.mean_dn > fitted_flats.mean_dn.max())
     groups = (
-        ("darks", fitted.take(fitted.lit == 0), {"color": INK[1]}),
+        ("darks", taken(fitted, fitted.lit == 0), {"color": INK[1]}),
         ("flats", fitted_flats, {"color": INK[0]}),
         ("flats beyond the fit", beyond, {"facecolor": "none", "edgecolor": INK[0]}),
     )

@@ -31,7 +31,7 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats, Ints, Singles, frozen
+from skysim.core.types import Bools, Floats, Ints, Singles
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -132,8 +132,7 @@ TRIM = 5.0  # interquartile ranges from the median within which pixels are avera
 SAMPLES = 100_000  # number of pixels from which the quartiles are computed
 
 
-@frozen
-class TransferPoints:
+class TransferPoints(NamedTuple):
     """L levels as input of the fit, (L,) each: mean and temporal variance over the pixels with their standard errors.
 
     Attributes
@@ -154,11 +153,6 @@ class TransferPoints:
     variance_dn2: Floats
     variance_sigma_dn2: Floats
     difference_dn2: Floats
-
-    def take(self, which: Bools | Ints) -> TransferPoints:
-        return TransferPoints(
-            *(getattr(self, name)[which] for name in self.__dataclass_fields__)
-        )
 
 
 @dataclass(eq=False)

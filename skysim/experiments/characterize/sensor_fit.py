@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Bools, Floats, joined
+from skysim.core.types import Bools, Floats, joined, taken
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -122,7 +122,7 @@ def fitted_transfer(
     signal = flat_points.mean_dn - black_dn
     below = signal <= photon_transfer.FIT_RANGE * signal.max()
     fitted = list(compress(flats, below))
-    lit = flat_points.take(below)
+    lit = taken(flat_points, below)
     flicker = photon_transfer.lamp_flicker(lit, black_dn, int(usable.sum()))
     return photon_transfer.fit(joined([dark_points, lit]), flicker), fitted
 
@@ -187,9 +187,9 @@ def full_well(found: MeasuredSensor) -> None:
     signal there, c x of the fit.
     """
     transfer = found.transfer
-    full = found.flats.take(photon_transfer.saturated(found.flats))
+    full = taken(found.flats, photon_transfer.saturated(found.flats))
     if not full.mean_dn.size:
-        full = found.flats.take(np.argsort(-found.flats.mean_dn, kind="stable")[:1])
+        full = taken(found.flats, np.argsort(-found.flats.mean_dn, kind="stable")[:1])
         found.remarks.append(
             f"full well: the flats end at {full.mean_dn[0]:.0f} DN, before the variance turns; allowed: flats to twice"
             f" the longest exposure, {full.exposure_s[0]:.3g} s"

@@ -11,7 +11,7 @@ from estimator.core.camera import Camera
 from skysim.camera import detector
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.types import SourceTruth
+from skysim.core.types import SourceTruth, taken
 from skysim.core.yaml_reader import parse_yaml
 from skysim.experiments import dataset_shards
 from skysim.experiments.study.execution import trials
@@ -155,7 +155,7 @@ def test_the_outline_of_the_moon_is_about_its_saturated_disc(
         one = dataset_shards.label_frame(setup, seed)
         moon = one.sources["radius_px"] > dataset_shards.DISC_PX
         assert moon.sum() == 1
-        corner = dataset_shards.outlines(one.extents.of(moon))[1].reshape(4, 2) - 0.5
+        corner = dataset_shards.outlines(taken(one.extents, moon))[1].reshape(4, 2) - 0.5
         sides = corner[1] - corner[0], corner[3] - corner[0]
         y, x = np.nonzero(decoded(one.masks[dataset_shards.SATURATED], (HEIGHT, WIDTH)))
         near = np.hypot(x - one.sources["x_px"][moon], y - one.sources["y_px"][moon]) < 80
