@@ -12,14 +12,13 @@ float that also has its distribution. `scaled_errors` draws from either.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Floats, frozen
 from skysim.core.units import (
     ConfigModel,
     Duration,
@@ -222,7 +221,7 @@ def in_file(value: float) -> Any:
     return value
 
 
-@dataclass(frozen=True)
+@frozen
 class ErrorSchema:
     """Annotation of a key that is the size of an error: a quantity of some kind, or the section of its tolerance."""
 

@@ -10,7 +10,6 @@ the direction in which the simulated camera sees it:
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import centers_of
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, frozen
 from skysim.scene.sections.layouts import (
     LcdConfig,
     LensDisplayConfig,
@@ -63,7 +62,7 @@ class DisplayPicture(NamedTuple):
     limited: int
 
 
-@dataclass(frozen=True)
+@frozen
 class DisplayPattern:
     """Pictures of what a simulated camera sees, for the display of a bench with a real camera.
 

@@ -4,12 +4,10 @@ Everything is computed for mid-exposure. The site rotates by 15" in a second, wh
 0.02" at an altitude of 15 deg.
 """
 
-from dataclasses import dataclass
-
 from skysim.camera.glow.air_glow import air_glow
 from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, frozen
 from skysim.scene.sections.surroundings import AirGlowConfig
 from skysim.simulation.lights.light import (
     AddedLight,
@@ -23,7 +21,7 @@ from skysim.simulation.lights.light import (
 from skysim.sources.air import Air, Sky
 
 
-@dataclass(frozen=True)
+@frozen
 class AirEffects(Light):
     """Refraction, extinction, scintillation and seeing of all lights before it in the list."""
 
@@ -35,7 +33,7 @@ class AirEffects(Light):
         return beam.changed(lambda lit: seen_through(sky, lit, exposure)).blurred(blur_px)
 
 
-@dataclass(frozen=True)
+@frozen
 class Skyline(Obstacle):
     """The horizon, or the hills of `light.air.horizon`."""
 
@@ -49,7 +47,7 @@ class Skyline(Obstacle):
         )
 
 
-@dataclass(frozen=True)
+@frozen
 class AirGlow(AddedLight):
     """Airglow, moonlight and twilight."""
 

@@ -1,12 +1,11 @@
 """The laboratory around the lights: wall and floor that reflect them, and obstacles that hide them."""
 
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, wall_glow
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, frozen
 from skysim.dynamics import multibody
 from skysim.scene.sections.leds import WarmUpConfig
 from skysim.simulation.lights.light import (
@@ -33,7 +32,7 @@ def images_of(name: str) -> str:
 IMAGES = images_of("LEDs")
 
 
-@dataclass(frozen=True)
+@frozen
 class WallGlow(AddedLight):
     """The glow of wall and floor, which decreases with the strength of the LEDs as they warm up."""
 
@@ -49,7 +48,7 @@ class WallGlow(AddedLight):
         return warm_up_factor(self.warm_up, exposure.t_s) * full
 
 
-@dataclass(frozen=True)
+@frozen
 class Mirror(AddedLight):
     """The images of the LEDs, and of other lights in the laboratory, in the wall."""
 
@@ -80,7 +79,7 @@ class Mirror(AddedLight):
 INWARD_FRACTION = 1e-6
 
 
-@dataclass(frozen=True)
+@frozen
 class Vehicle(Obstacle):
     """The parts of the vehicle, at mid-exposure."""
 
@@ -91,7 +90,7 @@ class Vehicle(Obstacle):
         return Lit("the vehicle", hides=Occluder("the vehicle", hides))
 
 
-@dataclass(frozen=True)
+@frozen
 class DomeWall(Obstacle):
     """The wall of the dome, which hides its own LEDs from a camera outside of it."""
 

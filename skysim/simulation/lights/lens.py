@@ -2,13 +2,13 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from skysim.camera.discs import centers_of
 from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e_s_m2
 from skysim.camera.glow.stray import ghost_optics
+from skysim.core.types import frozen
 from skysim.scene.sections.camera import BaffleConfig, GhostConfig, GlareConfig
 from skysim.simulation.lights.light import (
     AddedLight,
@@ -23,7 +23,7 @@ from skysim.sources.bodies import BodyLight
 STRAY_LIGHT = "stray light"
 
 
-@dataclass(frozen=True)
+@frozen
 class Baffle(AddedLight):
     """Stray light past the baffle from all bodies that nothing hides, and from the Earth, uniform over the detector."""
 
@@ -61,7 +61,7 @@ def stray_e_s(lights: Sequence[Light], exposure: Exposure) -> dict[str, float]:
     return {}
 
 
-@dataclass(frozen=True)
+@frozen
 class Ghosts(AddedLight):
     """Ghost images: pairs of surfaces of the lens reflect light onto the detector a second time."""
 
@@ -72,7 +72,7 @@ class Ghosts(AddedLight):
         return beam._replace(paths=(*beam.paths, *paths))
 
 
-@dataclass(frozen=True)
+@frozen
 class Glare(AddedLight):
     """Veiling glare: light that the lens scatters over the detector."""
 

@@ -317,7 +317,7 @@ class AddedLight(Light):
     only_adds = True
 
 
-@dataclass(frozen=True)
+@frozen
 class KnownLight(Light):
     """The light of a scene from which a tracker can determine the attitude: stars or LEDs.
 

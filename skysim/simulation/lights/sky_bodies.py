@@ -1,10 +1,9 @@
 """The Earth under a camera in orbit, artificial satellites, and Sun, Moon and planets."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from skysim.camera.glow.earth_glow import earth_around, earth_light
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, frozen
 from skysim.scene.sections.light import BodiesConfig
 from skysim.scene.sections.surroundings import EarthConfig, SatellitesConfig
 from skysim.simulation.lights.light import (
@@ -31,7 +30,7 @@ from skysim.sources.satellites import (
 NAME = "the Earth"
 
 
-@dataclass(frozen=True)
+@frozen
 class Earth(Obstacle):
     """The Earth, which hides stars one by one and bodies as a whole, and shines if it has a section `earth`."""
 
@@ -58,7 +57,7 @@ class Earth(Obstacle):
 # Artificial satellites: those of a file, and random ones.
 
 
-@dataclass(frozen=True)
+@frozen
 class Satellites(AddedLight):
     """Artificial satellites that can cross the field: those of a file, then random ones.
 
@@ -102,7 +101,7 @@ class Satellites(AddedLight):
 # Sun, Moon and planets.
 
 
-@dataclass(frozen=True)
+@frozen
 class SolarSystem(Light):
     """The bodies that `light.bodies` selects, as seen from the camera's place."""
 

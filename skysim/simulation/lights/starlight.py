@@ -1,13 +1,13 @@
 """Stars of a catalog, as seen from the ground or from an orbit, and extended light of the scene's `background`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.glow.background import glow_map
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, StarSources
+from skysim.core.types import Floats, StarSources, frozen
 from skysim.scene.sections.light import StarsConfig
 from skysim.scene.sections.surroundings import Glow
 from skysim.simulation.lights.light import (
@@ -21,7 +21,7 @@ from skysim.sources import stars
 from skysim.sources.dome.led import Emitter
 
 
-@dataclass(frozen=True)
+@frozen
 class StarsInOrbit(KnownLight):
     """Stars displaced by the aberration of an orbit, whose velocity turns by a degree in 15 s in a low orbit.
 
@@ -85,7 +85,7 @@ def stars_of(config: StarsConfig, plan: LightPlan) -> KnownLight:
 BACKGROUND = "background"
 
 
-@dataclass(frozen=True)
+@frozen
 class BackgroundLight(AddedLight):
     """Extended light that does not change from frame to frame."""
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from estimator.trackers.pipeline import Settings
@@ -11,7 +11,7 @@ from skysim.apps.cli.terminal import print_error, progress, progress_callback
 from skysim.apps.plate_solver import read_camera
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Record
+from skysim.core.types import Record, frozen
 from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
@@ -40,7 +40,7 @@ from skysim.tracking import dome_map_file, factory
 SHOWN_STOPS = 12  # number of attitudes of a plan that are printed; the file has all
 
 
-@dataclass(frozen=True)
+@frozen
 class Request:
     """The options of the command line."""
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from nicegui import ui
@@ -10,7 +10,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, frozen
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
@@ -61,7 +61,7 @@ window.skysimMoment = (t_s) => {{
 """
 
 
-@dataclass(frozen=True)
+@frozen
 class StripCurve:
     """One curve of a strip.
 
@@ -76,7 +76,7 @@ class StripCurve:
     kind: str = "line"
 
 
-@dataclass(frozen=True)
+@frozen
 class Strip:
     """One chart with its unit in the title.
 

@@ -26,7 +26,7 @@ from skysim.apps.gui.messages import (
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Bools, Floats, Record, frozen
 from skysim.core.yaml_reader import read_yaml
 from skysim.results.plots import CURVES
 
@@ -134,7 +134,7 @@ FRAMES: dict[str, TabFrames] = {}  # frames by tab
 IDLE_S = 2.0  # time without a frame after which a stream ends: a browser has six connections for all tabs
 
 
-@dataclass(frozen=True)
+@frozen
 class ServedFrame:
     """A frame of a tab.
 
