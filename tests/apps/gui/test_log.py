@@ -40,12 +40,12 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     assert view.result is not None
     line, row = log_panel.identification(view, info)
     assert "identify with noise: solved" in line
-    assert f"error {view.result.cross_arcsec:.2f}″ across" in line
+    assert f"error {view.result.row.cross_arcsec:.2f}″ across" in line
     one = dict(zip(log_panel.COLUMNS, row, strict=True))
     np.testing.assert_allclose(
         [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
     )
-    assert float(one["cross_arcsec"]) == pytest.approx(view.result.cross_arcsec, rel=1e-8)
+    assert float(one["cross_arcsec"]) == pytest.approx(view.result.row.cross_arcsec, rel=1e-8)
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
     assert not info.noise

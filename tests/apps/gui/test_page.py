@@ -163,7 +163,7 @@ def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     assert f"{len(truth)} true lights" in page.locator(".lab-frame canvas").get_attribute(
         "aria-label"
     )
-    np.testing.assert_allclose(solution["angles_deg"], angles(page), rtol=0, atol=0.01)
+    np.testing.assert_allclose(solution["estimate_deg"], angles(page), rtol=0, atol=0.01)
     assert cv2.imread(str(kept["figure"])).shape[2] == 3
     assert loader.load(kept["scene"]).model_dump() | {"stem": ""} == loader.load(
         "shefex2"

@@ -144,7 +144,13 @@ def test_a_survey_takes_the_last_frame_of_a_hold_if_the_vehicle_rests(
     flight: Any = SimpleNamespace(
         lab=SimpleNamespace(scene=scene), is_over=True, trajectory=lambda: trajectory
     )
-    views: Any = [SimpleNamespace(t_s=begin, exposure_s=exposure_s) for begin in t_s]
+    views: Any = [
+        SimpleNamespace(
+            result=SimpleNamespace(row=SimpleNamespace(t_s=begin + exposure_s / 2)),
+            exposure_s=exposure_s,
+        )
+        for begin in t_s
+    ]
     assert survey.frames_at_rest(flight, views) == (taken, 2)
 
 

@@ -72,32 +72,32 @@ class LogPanel:
 
 def identification(view: FrameView, info: SceneInfo) -> tuple[str, tuple[Any, ...]]:
     """An identification as a line of text, and as values of COLUMNS; None or NaN where there is no solution."""
-    result = view.result
-    assert result is not None
-    text = f"identify {'with' if info.noise else 'without'} noise: {result.status}"
-    if result.angles_deg is not None:
+    assert view.result is not None
+    row = view.result.row
+    text = f"identify {'with' if info.noise else 'without'} noise: {row.status}"
+    if row.estimate_deg is not None:
         angles = "  ".join(
             f"{name} {angle:.4f}°"
-            for name, angle in zip(info.names, result.angles_deg, strict=True)
+            for name, angle in zip(info.names, row.estimate_deg, strict=True)
         )
         text += (
-            f", {result.identified} of {len(result.detections)}; {angles}; error {result.cross_arcsec:.2f}″ across,"
-            f" {result.roll_arcsec:+.1f}″ about the boresight"
+            f", {row.matched} of {row.detected}; {angles}; error {row.cross_arcsec:.2f}″ across,"
+            f" {row.roll_arcsec:+.1f}″ about the boresight"
         )
-    row = (
+    return text, (
         time.strftime("%H:%M:%S"),
         info.scene.name,
         info.noise,
         info.stages["detector"],
         info.stages["identifier"],
-        result.status,
-        len(result.detections),
-        result.identified,
-        *view.angles_deg,
-        *(result.angles_deg or (None,) * 3),
-        result.cross_arcsec,
-        result.roll_arcsec,
-        *result.sigma_arcsec,
-        result.wrong,
+        row.status,
+        row.detected,
+        row.matched,
+        *row.truth_deg,
+        *(row.estimate_deg or (None,) * 3),
+        row.cross_arcsec,
+        row.roll_arcsec,
+        row.cross_sigma_arcsec,
+        row.roll_sigma_arcsec,
+        row.wrong,
     )
-    return text, row

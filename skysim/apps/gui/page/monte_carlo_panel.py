@@ -361,7 +361,7 @@ class MonteCarloPanel:
             self.page.show_photo(
                 photo, kind="replay", study=self.process.folder.name, trial=number
             )
-            self.page.log(f"replayed trial {number}: {photo.result.status}")
+            self.page.log(f"replayed trial {number}: {photo.result.row.status}")
 
     def list_reports(self) -> None:
         self.reports.clear()
