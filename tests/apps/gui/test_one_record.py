@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+import yaml
+from astropy.table import Table
 
 from skysim.apps.gui.messages import FlightRow
 from skysim.apps.gui.page.run_panel import flight_table
@@ -66,3 +73,64 @@ def test_a_wrong_attitude_is_counted_in_the_flight_s_line() -> None:
     refused = solution((), "too few").row
     rows = [FlightRow(row, 5, np.nan, np.nan) for row in (fine, wrong, refused)]
     assert rms_line(rows).startswith("2 of 3 frames solved, 1 wrong;")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_an_exported_scene_rests_at_the_shown_attitude(name: str, tmp_path: Path) -> None:
+    overrides = FEWER.get(name, {})
+    worker = Worker()
+    worker.open(name, overrides, False)
+    shown = worker.move(0.01, 0.01, 1.0, False)
+    path = tmp_path / "scene.yaml"
+    path.write_bytes(worker.export()["scene.yaml"])
+    again = Worker()
+    _, view = again.open(str(path), {}, False)
+    np.testing.assert_allclose(view.angles_deg, shown.angles_deg, rtol=0, atol=1e-9)
+    # Also in flight: nothing moves it.
+    flight = open_flight(loader.load(str(path), {"exposure.frames": "1"}))
+    (shot, *_) = flight.shots(solves=False)
+    truth_deg = scoring.true_angles_deg(shot.camera, shot.truth)
+    np.testing.assert_allclose(truth_deg, shown.angles_deg, rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_exported_command_and_python_show_the_same_frame(tmp_path: Path) -> None:
+    worker = Worker()
+    worker.open("afit_simsat_ideal", {"exposure.frames": "1"}, True)
+    shown = worker.point((3.0, 2.0, 1.0), True)
+    files = worker.export()
+    command = shlex.split(files["command.txt"].decode())
+    out = tmp_path / "out"
+    subprocess.run([sys.executable, "-m", *command, "--out", out], check=True, cwd=tmp_path)
+    (row,) = Table.read(out / "solutions.ecsv")
+    np.testing.assert_allclose(
+        [row["true_roll_deg"], row["true_pitch_deg"], row["true_yaw_deg"]],
+        shown.angles_deg,
+        rtol=0,
+        atol=1e-6,
+    )
+    printed = subprocess.run(
+        [sys.executable, "-c", files["scene.py"]],
+        check=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert printed.stdout.startswith("<frame 0: solved")
+
+
+@pytest.mark.slow
+def test_the_export_of_a_flight_s_frame_is_the_scene_that_flew() -> None:
+    worker = Worker()
+    worker.open("simsat_slew", {"exposure.frames": "2"}, False)
+    flown(worker)
+    worker.flight_frame(1)
+    tree = yaml.safe_load(worker.export()["scene.yaml"])
+    assert tree == {
+        "schema": tree["schema"],
+        "base": "simsat_slew",
+        "exposure": {"frames": 2},
+    }
+    worker.render(False)
+    assert "start" in yaml.safe_load(worker.export()["scene.yaml"])["motion"]

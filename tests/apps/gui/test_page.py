@@ -153,7 +153,7 @@ def test_a_typed_attitude_is_identified_by_key_1(page: Any) -> None:
 def test_every_export_reads_back(page: Any, tmp_path: Path) -> None:
     kept = {
         name: exported(page, name, tmp_path)
-        for name in ("truth", "solution", "figure", "scene")
+        for name in ("truth", "solution", "figure", "scene", "command line", "Python")
     }
     frame = fits.getdata(exported(page, "frame, FITS", tmp_path))
     gray = cv2.imread(str(exported(page, "frame, PNG", tmp_path)), cv2.IMREAD_UNCHANGED)

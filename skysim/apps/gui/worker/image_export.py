@@ -1,5 +1,6 @@
 """Export of the image on the page as files: frame, truth, solution, scene."""
 
+import shlex
 import tempfile
 import zipfile
 from dataclasses import asdict
@@ -33,8 +34,16 @@ FILE_BY_ITEM = {  # file by menu entry
     "solution": "solution.json",
     "figure": "figure.png",
     "scene": "scene.yaml",
+    "command line": "command.txt",
+    "Python": "scene.py",
     "all of them": "",
 }
+PYTHON = """import skysim
+
+scene = skysim.load_scene({!r}, {!r})
+for frame in skysim.simulate(scene):
+    print(frame)
+"""
 
 
 def frame_files(
@@ -54,7 +63,11 @@ def frame_files(
     if workbench.result:
         solution = file_io.to_json(solution_record(workbench.result))
         contents["solution.json"] = solution.encode()
-    contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
+    name = base_reference(base)
+    sets = [word for pair in overrides.items() for word in ("--set", "=".join(pair))]
+    contents["scene.yaml"] = scene_yaml(name, overrides).encode()
+    contents["command.txt"] = shlex.join(["skysim", "run", name, *sets]).encode()
+    contents["scene.py"] = PYTHON.format(name, overrides).encode()
     return contents
 
 

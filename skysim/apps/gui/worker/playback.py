@@ -124,6 +124,14 @@ class Playback:
         self.file.seek(kept.place)
         return kept.view, pickle.load(self.file)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether the newest frame of the workbench is one of the flight."""
+        return (
+            self.shown is not None
+            and self.frames[self.shown].view.result is self.bench.result
+        )
+
     def render(self) -> None:
         """Render the shown frame with its truth, unless a later frame of the scene has been rendered."""
         if self.shown is None or self.bench.frame is not None:

@@ -234,9 +234,13 @@ class Worker:
         """The files of the image on the page."""
         if self.other:
             return image_export.photo_files(*self.other)
+        bench = self.workbench
+        overrides = self.overrides | bench.scene_at_rest()
         if self.flight:
             self.flight.render()
-        return image_export.frame_files(self.workbench, self.scene, self.overrides)
+            if self.flight.is_shown:
+                overrides = self.overrides
+        return image_export.frame_files(bench, self.scene, overrides)
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

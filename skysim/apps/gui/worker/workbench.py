@@ -24,6 +24,7 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
+from skysim.apps.gui.views.forms import yaml_line
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Ints, Record, Trajectory, Truth
@@ -31,6 +32,7 @@ from skysim.experiments.dome_survey import survey_prior
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import PRESCRIBED
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
@@ -124,6 +126,27 @@ class Workbench:
             self.geometry,
             self.lens,
         )
+
+    def scene_at_rest(self) -> dict[str, str]:
+        """Overrides for the scene in which the vehicle rests at the present attitude."""
+        if self.lab_from_body == self.lab.start:
+            return {}
+        camera = self.lab.camera
+        angles = scoring.angles_deg(
+            camera.mount.cam_from_body * self.lab_from_body.inv(), camera
+        )
+        names = scoring.angle_names(self.scene)
+        start = {
+            f"{name.lower()}_deg": angle for name, angle in zip(names, angles, strict=True)
+        }
+        motion = {
+            "start": start,
+            "control": PRESCRIBED,
+            "maneuver": [],
+            "jitter": [],
+            "rate_deg_s": [0, 0, 0],
+        }
+        return {f"motion.{key}": yaml_line(value) for key, value in motion.items()}
 
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
