@@ -118,6 +118,15 @@ def test_key_1_identifies_with_and_without_noise(page: Any, tmp_path: Path) -> N
         [table[f"true_{n}_deg"][-1] for n in (1, 2, 3)], before, rtol=0, atol=1e-4
     )
     assert max(table["cross_arcsec"]) < 60
+    # A reload keeps the log and its table.
+    page.reload()
+    status(page, "solved")
+    panel(page, "Log")
+    assert page.locator(".lab-log").inner_text().count("identify with") == 4
+    with page.expect_download() as comes:
+        page.get_by_role("button", name="CSV of the identifications").click()
+    assert len(Table.read(comes.value.path(), format="ascii.csv")) == len(table)
+    onto_the_page(page)
     frame = source(page)
     page.keyboard.press("n")
     changed(page, frame)

@@ -294,7 +294,10 @@ def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
     )  # the first roll, after five heads
     page.get_by_role("button", name="Point to attitude 1", exact=True).click()
     assert come(
-        lambda: abs(float(page.get_by_label("angle 1").input_value()) - float(wanted)) < 0.006
+        lambda: (
+            abs(float(page.locator(".lab-angle").nth(0).input_value()) - float(wanted))
+            < 0.006
+        )
     )
     fly, adjust, save = (
         page.get_by_role("button", name=name, exact=True)

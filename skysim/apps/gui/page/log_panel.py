@@ -1,6 +1,7 @@
 """Log panel: the events of this session, and a table of the identifications as CSV."""
 
 import time
+from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -39,34 +40,45 @@ class LogPanel:
 
     Attributes
     ----------
-    rows
-        Identifications as values of COLUMNS
+    kept
+        The `lines`, and `rows` of identifications as values of COLUMNS
     """
 
     def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.lines: list[str] = []
-        self.rows: list[tuple[Any, ...]] = []
+        self.kept: MutableMapping[str, list[Any]] = {"lines": [], "rows": []}
         self.button = widgets.button(
             "CSV of the identifications", self.download, "log-csv", "flat"
         )
         self.button.set_enabled(False)
-        self.label = ui.label("Nothing yet.").classes("mono lab-log").mark("log")
+        self.label = (
+            ui.label("Nothing yet.").classes("mono lab-log").props('role="log"').mark("log")
+        )
 
     def add(self, text: str) -> None:
-        self.lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.lines[: MAX_LINES - 1]]
-        self.label.set_text("\n".join(self.lines))
+        lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.kept["lines"]][:MAX_LINES]
+        self.kept["lines"] = lines
+        self.label.set_text("\n".join(lines))
+
+    def keep(self, storage: MutableMapping[str, list[Any]]) -> None:
+        """Go on with the log of the tab's storage, which a reload keeps."""
+        for name, now in self.kept.items():
+            storage[name] = [*now, *storage.get(name, ())]
+        self.kept = storage
+        self.label.set_text("\n".join(storage["lines"]))
+        self.button.set_enabled(bool(storage["rows"]))
 
     def identified(self, view: FrameView, info: SceneInfo) -> None:
         """Log an identification with its attitude and error."""
         text, row = identification(view, info)
         self.add(text)
-        self.rows = [*self.rows[1 - MAX_ROWS :], row]
+        self.kept["rows"] = [*self.kept["rows"][1 - MAX_ROWS :], row]
         self.button.set_enabled(True)
 
     def download(self) -> None:
         ui.download(
-            live.csv_table(COLUMNS, self.rows), f"{Path(self.page.state.scene).stem}_log.csv"
+            live.csv_table(COLUMNS, self.kept["rows"]),
+            f"{Path(self.page.state.scene).stem}_log.csv",
         )
 
 

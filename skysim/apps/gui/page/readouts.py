@@ -51,15 +51,18 @@ class AttitudeCard:
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
-        field = LiveInput(self.page.contents, "text").props(f'aria-label="angle {n + 1}"')
         return (
-            field.classes("mono lab-angle")
+            LiveInput(self.page.contents, "text")
+            .classes("mono lab-angle")
             .mark(f"angle-{n}")
             .on("keydown.enter", self.point, js_handler=ANGLES_JS)
         )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
         """Show the algorithms of a new scene."""
+        for name, field in zip(scene_info.names, self.inputs, strict=True):
+            field.props(f'aria-label="true {name} in degrees"')
+            field.update()
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
         self.stages.props["title"] = ", ".join(
             f"{stage} {name}" for stage, name in scene_info.stages.items()

@@ -2,6 +2,7 @@
 
 import asyncio
 import bisect
+import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,6 +24,9 @@ CONTROL = "motion.control"
 CONTROL_KEYS = (CONTROL, "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
 LOOK_S = 0.05  # interval of checks whether the flight still plays
+DOUBLE_CLICK_S = (
+    0.5  # the second click of a double click does not stop what the first has begun
+)
 DRAW_S = 0.7  # interval of drawing the strips while frames are computed
 
 
@@ -51,6 +55,8 @@ class RunPanel:
         Position of the slider while its frame is not shown yet
     index
         Index of the frame on the page
+    begun_s
+        Time at which the last computation has begun
     started_s, from_s
         Time of the last start of playback, and the time in the flight at this start
     """
@@ -61,6 +67,7 @@ class RunPanel:
     sought: int | None = None
     plays_when_done = False
     started_s = 0.0
+    begun_s = -math.inf
     drawn_s = 0.0
 
     def __init__(self, page: context.PageContext) -> None:
@@ -186,11 +193,14 @@ class RunPanel:
 
     async def simulate(self) -> None:
         """Compute the flight, then play it; if it is being computed, stop that and keep the frames so far."""
+        if time.monotonic() < self.begun_s + DOUBLE_CLICK_S:
+            return
         self.stop_computing()
         if self.computing:
             return
         self.pause()
         self.computing = self.plays_when_done = True
+        self.begun_s = time.monotonic()
         self.clear()
         self.simulate_button.set_text("Stop")
         self.page.show_message("")

@@ -217,7 +217,9 @@ class Worker:
     def advance_flight(self, budget_s: float) -> FlightStep:
         """Compute the flight for about budget_s. Raises InputError if none has begun."""
         if self.flight is None:
-            raise InputError("", "no flight has begun")
+            raise InputError(
+                "", "the flight was lost with its worker: Simulate computes it again"
+            )
         return self.flight.advance(budget_s)
 
     def flight_frame(self, index: int) -> FrameView:
