@@ -444,7 +444,7 @@ def test_the_browser_s_panel_solves_the_same_image(
         data = (tmp_path / "x.fits.gz").read_bytes()
     photo, pixels = photo_from_file(name, data, FOV_DEG)
     assert pixels.shape == (HEIGHT_PX, WIDTH_PX)
-    check_right({"status": photo.result.status, **photo.solution}, sky[2])
+    check_right({"status": photo.result.row.status, **photo.solution}, sky[2])
     refused, _ = photo_from_file(
         "x.png", with_exif(tmp_path / "y.png", gray, 2).read_bytes(), FOV_DEG
     )

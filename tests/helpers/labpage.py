@@ -207,7 +207,9 @@ def address(page: Any) -> str:
 
 def angles(page: Any) -> np.ndarray:
     """The three typed angles."""
-    return np.array([float(page.get_by_label(f"angle {n}").input_value()) for n in (1, 2, 3)])
+    return np.array(
+        [float(field.input_value()) for field in page.locator(".lab-angle").all()]
+    )
 
 
 def source(page: Any) -> str:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Floats, Ints, Record, frozen
+from skysim.core.types import Floats, FrameRow, Ints, Record, frozen
 from skysim.results import plots
 from skysim.scene.scene import Scene
 
@@ -95,37 +95,19 @@ def places_px(detections: Collection[Detection]) -> Floats:
 
 @frozen
 class TrackerResult:
-    """The tracker's solution of a frame, and its error if the truth is known.
+    """The tracker's solution of a frame.
 
     Attributes
     ----------
-    status
-        "solved", or the reason why not
-    angles_deg
-        Angles in the order of the scene's angle names
-    sigma_arcsec
-        Estimated standard errors, cross-boresight and roll
+    row
+        The frame in numbers, as in `solutions.ecsv`; of an image without truth, without errors
     windows_px
         Pixels (x, y) at which the tracker's map predicts lights
     """
 
-    status: str
+    row: FrameRow
     detections: tuple[Detection, ...]
-    ms: float
-    angles_deg: Triple | None = None
-    cross_arcsec: float = NAN
-    roll_arcsec: float = NAN
-    sigma_arcsec: tuple[float, float] = (NAN, NAN)
-    wrong: bool = False
     windows_px: tuple[tuple[float, float], ...] = ()
-
-    @property
-    def solved(self) -> bool:
-        return self.angles_deg is not None
-
-    @property
-    def identified(self) -> int:
-        return sum(detection.id >= 0 for detection in self.detections)
 
 
 @frozen
@@ -168,8 +150,6 @@ class FrameView(NamedTuple):
         Value from which a pixel is saturated
     body_wxyz
         lab_from_body
-    t_s
-        Time in the motion that is played; 0 otherwise
     """
 
     pose: Pose
@@ -181,7 +161,6 @@ class FrameView(NamedTuple):
     lights: Lights
     result: TrackerResult | None
     ms: float
-    t_s: float = 0.0
     pixels: Pixels = NO_PIXELS
 
 
@@ -237,29 +216,22 @@ Curves = dict[
 
 
 class FlightRow(NamedTuple):
-    """One frame of a flight in numbers; NaN where it was not solved, or the scene has no filter.
+    """One frame of a flight in numbers; NaN if the scene has no filter.
 
     Attributes
     ----------
-    t_s
-        Beginning of its exposure
-    cross, roll
-        Error and standard error of the tracker, arcsec
-    lights, identified
-        Numbers of lights in the field, and of identified ones
+    row
+        As in `solutions.ecsv`
+    lights
+        Number of lights in the field
     filter_arcsec
         Error of the filter
     innovation_arcsec
         Angle between the star tracker's attitude and the filter's
     """
 
-    t_s: float
-    cross_arcsec: float
-    cross_sigma_arcsec: float
-    roll_arcsec: float
-    roll_sigma_arcsec: float
+    row: FrameRow
     lights: int
-    identified: int
     filter_arcsec: float
     innovation_arcsec: float
 

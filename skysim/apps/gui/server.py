@@ -330,7 +330,13 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
         )
 
     # NiceGUI allows three seconds for building a page; many pages that are built at once need longer.
-    @ui.page("/", title="skysim gui", dark=True, response_timeout=CONNECT_TIMEOUT_S)
+    @ui.page(
+        "/",
+        title="skysim gui",
+        dark=True,
+        language="en-US",
+        response_timeout=CONNECT_TIMEOUT_S,
+    )
     async def index(request: Request) -> None:
         tab = Tab(scene, folder, out, cameras, user_of(request.cookies))
         await tab.build()

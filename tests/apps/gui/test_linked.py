@@ -29,11 +29,12 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import LIGHT, Detection, TrackerResult
+from skysim.apps.gui.messages import LIGHT, Detection
 from skysim.apps.gui.page import readouts, strips
 from skysim.apps.gui.worker import geometry, playback
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
+from tests.helpers.solutions import solution
 
 pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
@@ -91,10 +92,8 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
         Detection(3, 4, 0.1, 5),
         Detection(5, 6, 0.1, 5, 9, float("nan")),
     )
-    solved = TrackerResult("solved", spots, 1.0, (0.0, 0.0, 0.0))
-    view = SimpleNamespace(t_s=0.25, result=solved)
+    view = SimpleNamespace(result=solution(spots, t_s=0.25))
     assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
-    assert list(playback.light_residuals(SimpleNamespace(t_s=0.5, result=None))) == []
     residuals = [(0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)]
     (strip,) = strips.strips([], {}, residuals)
     assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]

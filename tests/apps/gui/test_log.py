@@ -40,12 +40,12 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     assert view.result is not None
     line, row = log_panel.identification(view, info)
     assert "identify with noise: solved" in line
-    assert f"error {view.result.cross_arcsec:.2f}″ across" in line
+    assert f"error {view.result.row.cross_arcsec:.2f}″ across" in line
     one = dict(zip(log_panel.COLUMNS, row, strict=True))
     np.testing.assert_allclose(
         [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
     )
-    assert float(one["cross_arcsec"]) == pytest.approx(view.result.cross_arcsec, rel=1e-8)
+    assert float(one["cross_arcsec"]) == pytest.approx(view.result.row.cross_arcsec, rel=1e-8)
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
     assert not info.noise
@@ -118,6 +118,15 @@ def test_key_1_identifies_with_and_without_noise(page: Any, tmp_path: Path) -> N
         [table[f"true_{n}_deg"][-1] for n in (1, 2, 3)], before, rtol=0, atol=1e-4
     )
     assert max(table["cross_arcsec"]) < 60
+    # A reload keeps the log and its table.
+    page.reload()
+    status(page, "solved")
+    panel(page, "Log")
+    assert page.locator(".lab-log").inner_text().count("identify with") == 4
+    with page.expect_download() as comes:
+        page.get_by_role("button", name="CSV of the identifications").click()
+    assert len(Table.read(comes.value.path(), format="ascii.csv")) == len(table)
+    onto_the_page(page)
     frame = source(page)
     page.keyboard.press("n")
     changed(page, frame)

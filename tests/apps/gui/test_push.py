@@ -30,7 +30,8 @@ def free() -> Lab:
 
 
 def test_the_pull_force_is_linear_up_to_a_limit() -> None:
-    """A force k d at the lever r: the torque of a spring that swings at PULL_RAD_S, with J the mean moment."""
+    """A force k d at the lever r: the torque of a spring of J PULL_RAD_S^2, with J the mean moment."""
+    rest = np.zeros(3)
     turned = Rotation.from_rotvec([0.1, -0.4, 0.3])
     held = np.array([0.3, 0.0, 0.4])
     way = np.array([0.0, 0.01, 0.0])
@@ -38,17 +39,19 @@ def test_the_pull_force_is_linear_up_to_a_limit() -> None:
     stiffness = INERTIA.mean() * PULL_RAD_S**2
     expected = stiffness * np.cross(held, way) / 0.25  # r^2
     np.testing.assert_allclose(
-        pull_torque_nm(grip, turned, np.diag(INERTIA)), expected, rtol=1e-9, atol=1e-12
+        pull_torque_nm(grip, turned, rest, np.diag(INERTIA)), expected, rtol=1e-9, atol=1e-12
     )
     far = Grip(tuple(held), tuple(turned.apply(held + 1000 * way)))
-    assert np.linalg.norm(pull_torque_nm(far, turned, np.diag(INERTIA))) == pytest.approx(
-        stiffness
-    )
+    assert np.linalg.norm(
+        pull_torque_nm(far, turned, rest, np.diag(INERTIA))
+    ) == pytest.approx(stiffness)
     along = Grip(tuple(held), tuple(turned.apply(3 * held)))
     np.testing.assert_allclose(
-        pull_torque_nm(along, turned, np.diag(INERTIA)), 0.0, atol=1e-9
+        pull_torque_nm(along, turned, rest, np.diag(INERTIA)), 0.0, atol=1e-9
     )
-    np.testing.assert_array_equal(pull_torque_nm(None, turned, np.diag(INERTIA)), np.zeros(3))
+    np.testing.assert_array_equal(
+        pull_torque_nm(None, turned, rest, np.diag(INERTIA)), np.zeros(3)
+    )
 
 
 def test_a_pushed_free_vehicle_gains_and_keeps_torque_times_time(free: Lab) -> None:
@@ -74,18 +77,30 @@ def test_a_pushed_free_vehicle_gains_and_keeps_torque_times_time(free: Lab) -> N
     assert push.simulation.now_s == pytest.approx(2.0)
 
 
-def test_a_vehicle_without_gravity_oscillates_about_the_pulled_attitude(free: Lab) -> None:
-    """A sphere held a little off its place is a pendulum of the angular frequency PULL_RAD_S."""
+def test_a_vehicle_without_gravity_comes_to_the_pulled_attitude(free: Lab) -> None:
+    """A critically damped pendulum from rest: angle (1 - (1 + W t) exp(-W t)) of the offset, without overshoot."""
     push = Push(free, Rotation.identity())
     offset = math.radians(2)
     grip = Grip((0.5, 0.0, 0.0), (0.5 * math.cos(offset), 0.5 * math.sin(offset), 0.0))
     turned = []
-    half_s = math.pi / PULL_RAD_S
-    for _ in range(round(half_s / 0.01)):
+    for _ in range(300):
         push.advance(grip, 0.01)
         turned.append(push.lab_from_body.as_rotvec()[2])
-    assert max(turned) == pytest.approx(2 * offset, rel=0.02)
-    assert turned[len(turned) // 2] == pytest.approx(offset, rel=0.05)
+    phase = PULL_RAD_S * 0.01 * np.arange(1, 301)
+    expected = offset * (1 - (1 + phase) * np.exp(-phase))
+    np.testing.assert_allclose(turned, expected, rtol=0, atol=0.01 * offset)
+
+
+def test_a_short_pull_is_slow(free: Lab) -> None:
+    """No faster than the pulled angle times PULL_RAD_S / e, which it has after 1 / PULL_RAD_S."""
+    push = Push(free, Rotation.identity())
+    offset = math.radians(30)
+    grip = Grip((0.5, 0.0, 0.0), (0.5 * math.cos(offset), 0.5 * math.sin(offset), 0.0))
+    rates = []
+    for _ in range(300):
+        push.advance(grip, 0.01)
+        rates.append(np.linalg.norm(push.simulation.rate_body_rad_s))
+    assert max(rates) == pytest.approx(math.sin(offset) * PULL_RAD_S / math.e, rel=0.05)
 
 
 def test_a_frame_sees_the_motion_of_its_exposure(free: Lab) -> None:

@@ -104,6 +104,13 @@ def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch)
         written.write()
         pushed.append(", true," in sent[-1])
     assert pushed == [False, True, False, False, True, True]
+    # Angles that are typed in between are a step of their own.
+    written.end_step()
+    for degrees in (10.0, 11.0):
+        shown.state = replace(after, angles_deg=(degrees, 0.0, 0.0))
+        written.write()
+        pushed.append(", true," in sent[-1])
+    assert pushed[-2:] == [True, False]
 
 
 # In the browser.
@@ -116,7 +123,7 @@ def written(page: Any, *parts: str) -> bool:
 
 def angles_if_any(page: Any) -> Any:
     """The typed angles; zeros while a page without a frame has none."""
-    typed = [page.get_by_label(f"angle {n}").input_value() for n in (1, 2, 3)]
+    typed = [field.input_value() for field in page.locator(".lab-angle").all()]
     return [float(text or 0) for text in typed]
 
 
@@ -138,9 +145,9 @@ def test_reload_link_and_back_restore_the_view(browser: Any, server: Server) -> 
         set_to(page, "camera.f_number", "2")
         onto_the_page(page)
         for angle in (1, 2, 3):
-            page.get_by_label(f"angle {angle}").fill("40")
+            page.locator(".lab-angle").nth(angle - 1).fill("40")
         frame = source(page)
-        page.get_by_label("angle 3").press("Enter")
+        page.locator(".lab-angle").nth(2).press("Enter")
         changed(page, frame)
         assert written(page, "camera.f_number%3D2", "at=40.000000%2C40.000000%2C40.000000")
         link = address(page)

@@ -17,7 +17,7 @@ class Head:
     def __init__(self, page: context.PageContext) -> None:
         self.page = page
         with widgets.div("lab-head"):
-            ui.label("skysim gui").classes("lab-name")
+            ui.label("skysim gui").classes("lab-name").props('role="heading" aria-level="1"')
             self.picker = widgets.select(
                 self.scenes(),
                 "borderless",

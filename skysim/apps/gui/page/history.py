@@ -112,6 +112,11 @@ class History:
         arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
         ui.run_javascript(f"skysimHistory.write({arguments})")
 
+    def end_step(self) -> None:
+        """Make the next change of attitude a step of its own, because another action makes it."""
+        self.write()
+        self.moving = False
+
     def undo(self) -> None:
         ui.run_javascript("skysimHistory.undo()")
 

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from skysim.apps.gui.views import context, forms, keys, live, style, widgets
 from skysim.apps.gui.worker.study_process import (
+    NO_RESULTS,
     PAGE_STUDY,
     RESPONSES,
     StudyProcess,
@@ -195,7 +196,7 @@ class MonteCarloPanel:
             self.page.out / path.stem if self.study_select.value else path.parent
         )
         self.process.total = study.trials
-        self.bar.set_value(0)
+        self.show(NO_RESULTS)
         self.button.set_text("Stop")
         self.stopped = False
         self.note.set_text("starting …")
@@ -279,6 +280,7 @@ class MonteCarloPanel:
             return
         self.process = StudyProcess(folder)
         self.process.total = found.trials
+        self.show(NO_RESULTS)
         self.stopped = True
         self.study_select.set_value(name if (STUDIES / f"{name}.yaml").is_file() else "")
         if not self.study_select.value:
@@ -323,7 +325,8 @@ class MonteCarloPanel:
             live.format_number(center) for center in results.bins
         ]
         self.chart.options["series"][0]["data"] = list(results.counts)
-        self.chart.options["title"]["text"] = "" if results.counts else "no trial solved"
+        empty = "no trial solved" if results.done else "no trials yet"
+        self.chart.options["title"]["text"] = "" if results.counts else empty
         self.chart.update()
         self.table.clear()
         with self.table:
@@ -361,7 +364,7 @@ class MonteCarloPanel:
             self.page.show_photo(
                 photo, kind="replay", study=self.process.folder.name, trial=number
             )
-            self.page.log(f"replayed trial {number}: {photo.result.status}")
+            self.page.log(f"replayed trial {number}: {photo.result.row.status}")
 
     def list_reports(self) -> None:
         self.reports.clear()

@@ -144,7 +144,7 @@ class PhotoPanel:
             return
         self.page.show_photo(photo, kind="photo", photo=name)
         stages = "".join(f"; {stage} {algorithm}" for stage, algorithm in self.stages)
-        status_text = f"{name}: {photo.result.status}{stages}"
+        status_text = f"{name}: {photo.result.row.status}{stages}"
         if status_text != self.logged:  # log the repeated status of a live camera once
             self.logged = status_text
             self.page.log(status_text)

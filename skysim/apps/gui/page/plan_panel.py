@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from skysim.simulation.checks.plan_check import Check
 
 # Frame rate and holds of a survey flight: few frames while the vehicle slews, and a whole exposure in each hold.
-SURVEY_RATE_HZ = 0.5
+SURVEY_RATE_HZ = 0.1
 HOLD_PERIODS = 2.0
 TILT_MARGIN_DEG = 0.5  # least distance of the tilt from the vehicle's stop
 TILT_STEPS = 61  # number of points of a slew at which its tilt is computed
@@ -267,7 +267,8 @@ class PlanPanel:
                 survey_flight, *self.page.state.opened, self.plan.angles_deg
             )
             if overrides and self.page.is_open and await self.page.open(scene, overrides):
-                self.page.show_panel("Run")
+                with self.stops:
+                    ui.label().bind_text_from(self.run_panel.summary, "text")
                 await self.run_panel.simulate()
 
     async def download_map(self) -> None:

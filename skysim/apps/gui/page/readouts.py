@@ -51,15 +51,18 @@ class AttitudeCard:
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
 
     def angle_input(self, n: int) -> LiveInput:
-        field = LiveInput(self.page.contents, "text").props(f'aria-label="angle {n + 1}"')
         return (
-            field.classes("mono lab-angle")
+            LiveInput(self.page.contents, "text")
+            .classes("mono lab-angle")
             .mark(f"angle-{n}")
             .on("keydown.enter", self.point, js_handler=ANGLES_JS)
         )
 
     def set_scene(self, scene_info: SceneInfo) -> None:
         """Show the algorithms of a new scene."""
+        for name, field in zip(scene_info.names, self.inputs, strict=True):
+            field.props(f'aria-label="true {name} in degrees"')
+            field.update()
         self.stages.set_text("stages (F6, F7): " + " · ".join(scene_info.stages.values()))
         self.stages.props["title"] = ", ".join(
             f"{stage} {name}" for stage, name in scene_info.stages.items()
@@ -95,12 +98,14 @@ class AttitudeCard:
                 field.update()
         estimates = errors = ["–"] * 3  # without a solution
         result = image.result
-        if result and result.angles_deg:
-            estimates = [format_angle(angle) for angle in result.angles_deg]
-            cross, roll = result.sigma_arcsec
+        if result and result.row.estimate_deg:
+            row = result.row
+            estimates = [format_angle(angle) for angle in result.row.estimate_deg]
+            cross = row.cross_sigma_arcsec
+            roll = row.roll_sigma_arcsec
             texts = (
-                (result.cross_arcsec, f"cross {result.cross_arcsec:.2f}″"),
-                (result.roll_arcsec, f"roll {result.roll_arcsec:+.1f}″"),
+                (row.cross_arcsec, f"cross {row.cross_arcsec:.2f}″"),
+                (row.roll_arcsec, f"roll {row.roll_arcsec:+.1f}″"),
                 (cross, f"σ {format_number(cross)}″ {format_number(roll)}″"),
             )
             errors = ["–" if math.isnan(value) else text for value, text in texts]
@@ -121,11 +126,14 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
     """Style class and status line: solved, refused, wrong, or not solved."""
     if result is None:
         return "quiet", "not solved: press 1 to identify"
-    if not result.solved:
-        return "warn", f"{result.status}; {len(result.detections)} lights detected"
-    time_text = f", {result.ms:.1f} ms" if result.ms else ""  # a replayed trial has no time
-    counts = f"{result.identified} of {len(result.detections)} lights identified{time_text}"
-    if result.wrong:
+    row = result.row
+    if not row.estimate_deg:
+        return "warn", f"{row.status}; {row.detected} lights detected"
+    time_text = (
+        f", {row.time_ms:.1f} ms" if row.time_ms else ""
+    )  # a replayed trial has no time
+    counts = f"{row.matched} of {row.detected} lights identified{time_text}"
+    if row.wrong:
         return "bad", f"WRONG by more than 10′ and than claimed; {counts}"
     return "good", f"solved; {counts}"
 

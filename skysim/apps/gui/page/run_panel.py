@@ -2,8 +2,9 @@
 
 import asyncio
 import bisect
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -14,13 +15,18 @@ from nicegui import ui
 from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import context, forms, live, widgets
+from skysim.results import scoring
+from skysim.scene.scene import Scene
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
-TIME_S = attrgetter("t_s")  # time of a row
+TIME_S = attrgetter("row.t_s")  # time of a flight's row
 CONTROL = "motion.control"
 CONTROL_KEYS = (CONTROL, "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
 LOOK_S = 0.05  # interval of checks whether the flight still plays
+DOUBLE_CLICK_S = (
+    0.5  # the second click of a double click does not stop what the first has begun
+)
 DRAW_S = 0.7  # interval of drawing the strips while frames are computed
 
 
@@ -49,6 +55,8 @@ class RunPanel:
         Position of the slider while its frame is not shown yet
     index
         Index of the frame on the page
+    begun_s
+        Time at which the last computation has begun
     started_s, from_s
         Time of the last start of playback, and the time in the flight at this start
     """
@@ -59,6 +67,7 @@ class RunPanel:
     sought: int | None = None
     plays_when_done = False
     started_s = 0.0
+    begun_s = -math.inf
     drawn_s = 0.0
 
     def __init__(self, page: context.PageContext) -> None:
@@ -184,11 +193,14 @@ class RunPanel:
 
     async def simulate(self) -> None:
         """Compute the flight, then play it; if it is being computed, stop that and keep the frames so far."""
+        if time.monotonic() < self.begun_s + DOUBLE_CLICK_S:
+            return
         self.stop_computing()
         if self.computing:
             return
         self.pause()
         self.computing = self.plays_when_done = True
+        self.begun_s = time.monotonic()
         self.clear()
         self.simulate_button.set_text("Stop")
         self.page.show_message("")
@@ -234,7 +246,7 @@ class RunPanel:
     def draw(self) -> None:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
-        ends = [*self.log.get("t_s", ())[-1:], *(row.t_s for row in self.rows[-1:])]
+        ends = [*self.log.get("t_s", ())[-1:], *map(TIME_S, self.rows[-1:])]
         lights = (
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once
@@ -277,7 +289,7 @@ class RunPanel:
             self.pause()
         elif self.is_ready:
             is_over = self.index >= len(self.rows) - 1
-            self.from_s = 0.0 if is_over else self.rows[self.index].t_s
+            self.from_s = 0.0 if is_over else TIME_S(self.rows[self.index])
             self.start()
 
     def pause(self) -> None:
@@ -313,7 +325,7 @@ class RunPanel:
         if self.is_ready:
             self.pause()
             await self.show_index(
-                min(range(len(self.rows)), key=lambda n: abs(self.rows[n].t_s - t_s))
+                min(range(len(self.rows)), key=lambda n: abs(TIME_S(self.rows[n]) - t_s))
             )
 
     async def slid(self, event: Any) -> None:
@@ -323,7 +335,7 @@ class RunPanel:
         while not is_showing and self.sought is not None:
             index = self.sought
             if 0 <= index < len(self.rows):
-                self.from_s = self.rows[index].t_s
+                self.from_s = TIME_S(self.rows[index])
                 self.started_s = time.monotonic()
                 await self.show_index(index)
             if self.sought == index:
@@ -342,7 +354,7 @@ class RunPanel:
                 if self.index >= len(self.rows) - 1:
                     self.pause()
                 elif self.playing:
-                    wait_s = (self.rows[self.index + 1].t_s - self.now_s) / self.factor
+                    wait_s = (TIME_S(self.rows[self.index + 1]) - self.now_s) / self.factor
                     await asyncio.sleep(min(max(wait_s, 0.001), LOOK_S))
         except Exception:
             self.pause()
@@ -356,14 +368,25 @@ class RunPanel:
         view = await self.page.ask("flight_frame", index)
         if view is None or index >= len(self.rows):
             return
+        t_s = TIME_S(self.rows[index])
         self.seek.set_value(index)
-        self.clock.set_text(f"{view.t_s:.2f} s  {index + 1}/{len(self.rows)}")
-        self.strips.set_moment(view.t_s)
-        self.page.show_frame(view, kind="flight", t_s=view.t_s)
+        self.clock.set_text(f"{t_s:.2f} s  {index + 1}/{len(self.rows)}")
+        self.strips.set_moment(t_s)
+        self.page.show_frame(view, kind="flight", t_s=t_s)
         await self.page.sensor.wait_drawn()
 
     def download(self) -> None:
+        assert self.page.scene_info
+        table = flight_table(self.rows, self.page.scene_info.scene)
         ui.download(
-            live.csv_table(FlightRow._fields, self.rows),
+            live.csv_table(table.colnames, table),
             f"{Path(self.page.state.scene).stem}_flight.csv",
         )
+
+
+def flight_table(rows: Sequence[FlightRow], scene: Scene) -> Any:
+    """The table of `solutions.ecsv` with the page's columns, as an astropy table."""
+    table = scoring.table([one.row for one in rows], scene)
+    for name in FlightRow._fields[1:]:
+        table[name] = [getattr(one, name) for one in rows]
+    return table

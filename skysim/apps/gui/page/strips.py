@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import field
+from operator import attrgetter
 
 import numpy as np
 from nicegui import ui
@@ -10,13 +11,14 @@ from nicegui import ui
 from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
 from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
-from skysim.core.types import Floats, Record, frozen
+from skysim.core.types import Record, frozen
 
 BAND_COLOR = "#8b95a5"
 STRIP_PX = 118  # height of a strip
 HEAD_PX = 22  # height of its title and legend
 AXIS_PX = 24  # height of the time axis
 INNER_PX = STRIP_PX - HEAD_PX - 8  # height of a strip between its axes
+FLOOR = 1e-3  # arcsec; lower limit of errors on a logarithmic axis
 MAX_DOTS = 20_000  # maximum number of dots; if there are more, some frames are left out
 Points = list[list[float]]
 LEFT_PX = 52  # distance of a strip from the left edge of the chart
@@ -111,12 +113,12 @@ def strips(
         Residuals of the identified lights, as in `FlightStep`
     """
 
-    fields = FlightRow._fields
-    of = dict(zip(fields, np.array(rows, float).reshape(-1, len(fields)).T, strict=True))
-
-    def of_frames(name: str, values: Floats, kind: str = "line") -> StripCurve:
-        known = ~np.isnan(values)
-        return StripCurve(name, [*map(point, of["t_s"][known], values[known])], kind)
+    def of_frames(
+        name: str, field: str, kind: str = "line", factor: int = 1, least: float = -math.inf
+    ) -> StripCurve:
+        found = ((one.row.t_s, factor * attrgetter(field)(one)) for one in rows)
+        points = [point(t_s, max(value, least)) for t_s, value in found if value == value]
+        return StripCurve(name, points, kind)
 
     def of_motion(name: str) -> StripCurve:
         return StripCurve(name, [*map(point, log.get("t_s", ()), log.get(name, ()))])
@@ -125,32 +127,32 @@ def strips(
         Strip(
             "cross-boresight error, ″",
             (
-                of_frames("tracker", np.maximum(of["cross_arcsec"], 1e-3), "dots"),
-                of_frames("3σ", 3 * of["cross_sigma_arcsec"], "band"),
+                of_frames("tracker", "row.cross_arcsec", "dots", least=FLOOR),
+                of_frames("3σ", "row.cross_sigma_arcsec", "band", 3),
             ),
             logarithmic=True,
         ),
         Strip(
             "roll error, ″",
             (
-                of_frames("tracker", of["roll_arcsec"], "dots"),
-                of_frames("−3σ", -3 * of["roll_sigma_arcsec"], "band"),
-                of_frames("+3σ", 3 * of["roll_sigma_arcsec"], "band"),
+                of_frames("tracker", "row.roll_arcsec", "dots"),
+                of_frames("−3σ", "row.roll_sigma_arcsec", "band", -3),
+                of_frames("+3σ", "row.roll_sigma_arcsec", "band", 3),
             ),
         ),
         Strip(
             "attitude error, ″",
             (
                 *map(of_motion, ("pointing", "IMU alone", "filter")),
-                of_frames("innovation", of["innovation_arcsec"], "dots"),
+                of_frames("innovation", "innovation_arcsec", "dots"),
             ),
             logarithmic=True,
         ),
         Strip(
             "lights",
             (
-                of_frames("in the field", of["lights"]),
-                of_frames("identified", of["identified"]),
+                of_frames("in the field", "lights"),
+                of_frames("identified", "row.matched"),
             ),
         ),
         Strip("residual of each light, px", dots=thinned(residuals)),
@@ -308,13 +310,11 @@ def series(curve: StripCurve, n: int, k: int) -> Record:
 
 
 def rms_line(rows: Sequence[FlightRow]) -> str:
-    """Root mean squares over the flight's solved frames, and how many were solved."""
-    solved = [
-        (row.cross_arcsec, row.roll_arcsec)
-        for row in rows
-        if not math.isnan(row.cross_arcsec)
-    ]
+    """Root mean squares over the flight's solved frames, and how many were solved, and wrong."""
+    solved = [one.row for one in rows if one.row.estimate_deg]
     if not solved:
         return f"{len(rows)} frames, none solved" if rows else ""
-    cross, roll = np.sqrt(np.mean(np.square(solved), axis=0))
-    return f"{len(solved)} of {len(rows)} frames solved; rms: cross {cross:.3g}″, roll {roll:.3g}″"
+    errors = [(row.cross_arcsec, row.roll_arcsec) for row in solved]
+    cross, roll = np.sqrt(np.mean(np.square(errors), axis=0))
+    wrong = sum(row.wrong for row in solved)
+    return f"{len(solved)} of {len(rows)} frames solved, {wrong} wrong; rms: cross {cross:.3g}″, roll {roll:.3g}″"

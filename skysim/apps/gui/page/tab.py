@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from nicegui import run, ui
+from nicegui import app, run, ui
 
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import (
@@ -132,6 +132,7 @@ class Tab(context.PageContext):
                         )
         await asyncio.sleep(PAUSE_S)
         self.history = history.History(self, self.show_query, self.is_settling)
+        self.end_step = self.history.end_step
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
         )
@@ -254,6 +255,7 @@ class Tab(context.PageContext):
         """Show the first view: that of the page's address, or of the browser's storage, or the server's scene."""
         self.use(session)
         self.new_session = new_session
+        self.log_panel.keep(app.storage.tab)
         await self.arrangement.restore()
         await self.show_query(await self.history.read())
         refusal = self.message_text

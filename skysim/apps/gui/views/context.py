@@ -55,6 +55,8 @@ class PageContext:
         Contents of the fields that change with every frame
     log
         Function that adds a line to the log
+    end_step
+        Function that makes the next change of attitude a step of its own for undo
     """
 
     id: str
@@ -77,6 +79,7 @@ class PageContext:
     tabs: ui.tabs
     contents: live.Contents
     log: Callable[[str], None]
+    end_step: Callable[[], None]
 
     @property
     def solving(self) -> bool:
@@ -86,7 +89,10 @@ class PageContext:
     # Requests to the worker.
 
     async def ask(self, task: str, *arguments: Any) -> Any:
-        """Result of a task of the worker; None after an error, which is shown, or if the tab has been closed."""
+        """Result of a task of the worker; None after an error, which is shown, or if the tab has been closed.
+
+        A worker that has ended is replaced, and the task is done by the new one.
+        """
         try:
             result = await self.session.run(task, *arguments)
         except InputError as error:
@@ -99,6 +105,8 @@ class PageContext:
                 self.show_message(f"{error}; a new one shows the view again")
                 try:
                     await self.restart()
+                    # A worker that its task ends is not started a third time.
+                    return await self.ask(task, *arguments)
                 finally:
                     self.restarting = False
             return None
@@ -141,10 +149,16 @@ class PageContext:
             Whether it is solved even if not every frame is
         """
         begin = time.perf_counter()
+        # Angles that are set are no part of a movement by keys or the pointer, before or after.
+        is_step = task == "point"
+        if is_step:
+            self.end_step()
         view = await self.ask(task, *arguments, solve or self.solving)
         if view is not None:
             self.latency.set_text(f"{1e3 * (time.perf_counter() - begin):.0f} ms")
             self.show_frame(view, kind="live", angles_deg=view.angles_deg)
+            if is_step:
+                self.end_step()
         return view
 
     async def restart(self) -> None:

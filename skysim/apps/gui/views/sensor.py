@@ -311,7 +311,7 @@ def statistics_text(image: FrameView | Photo, of: SceneInfo | Photo) -> str:
         ),
     ]
     detected = (
-        ("identified", f"{result.identified} of {len(result.detections)}") if result else ()
+        ("identified", f"{result.row.matched} of {result.row.detected}") if result else ()
     )
     rows += [(*lights, *detected, "", "", "", "")[:4]]
     return "\n".join(f"{a:<11s}{b:<18s}{c:<11s}{d}".rstrip() for a, b, c, d in rows)

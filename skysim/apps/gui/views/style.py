@@ -215,5 +215,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-trial {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
   .lab-grid {{ grid-template-columns: 60px repeat(3, minmax(0, 1fr)); gap: 2px 6px }}
 }}
+@media (prefers-reduced-motion: reduce) {{
+  *, ::before, ::after {{ animation: none !important; transition: none !important }}
+}}
 .empty {{ color: {COLORS["quiet"]}; padding: 28px 8px; text-align: center; line-height: 1.6 }}
 """

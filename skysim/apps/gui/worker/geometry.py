@@ -195,7 +195,9 @@ def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:
 # Pushing the vehicle: a user pulls at a point of it, and its dynamics are integrated in real time.
 
 
-PULL_RAD_S = 1.5  # angular frequency at which a held vehicle without gravity swings about the wanted point
+PULL_RAD_S = (
+    1.5  # a held vehicle without gravity approaches the wanted place as exp(-PULL_RAD_S t)
+)
 PERIOD_S = 0.01  # time for which a torque is constant in body axes
 MAX_ADVANCE_S = (
     0.25  # maximum step of one call; on a slow machine the motion is slower than real time
@@ -252,7 +254,10 @@ class Push:
         steps = round(min(elapsed_s, MAX_ADVANCE_S) / simulation.step_s)
         for begin in range(0, steps, period):
             self.torque_nm = pull_torque_nm(
-                grip, self.lab_from_body, self.lab.vehicle.inertia_kg_m2
+                grip,
+                self.lab_from_body,
+                simulation.rate_body_rad_s,
+                self.lab.vehicle.inertia_kg_m2,
             )
             control = np.zeros((min(period, steps - begin), simulation.model.nu))
             control[:, simulation.vehicle.torques] = self.torque_nm
@@ -275,19 +280,22 @@ class Push:
 
 
 def pull_torque_nm(
-    grip: Grip | None, lab_from_body: Rotation, inertia_kg_m2: Floats
+    grip: Grip | None, lab_from_body: Rotation, rate_body_rad_s: Floats, inertia_kg_m2: Floats
 ) -> Floats:
-    """(3,) torque about the bearing, in body axes, of a force toward the wanted point.
+    """(3,) torque about the bearing, in body axes, of a hand that leads the held point to the wanted one.
 
-    With the held point r and the vector d from it to the wanted one, T = J w^2 (r x d) / max(r^2, |r x d|). This is the
-    torque of a force proportional to d, scaled so that vehicles of every size follow alike, and at most J w^2. J is the
-    mean moment of inertia, w is PULL_RAD_S. The bearing takes the force itself.
+    With the held point r, the vector d from it to the wanted one and the rate w,
+
+        T = J W^2 (r x d) / max(r^2, |r x d|) - 2 J W w.
+
+    The first part is the torque of a force proportional to d, scaled so that vehicles of every size follow alike, and
+    at most J W^2; the second damps the motion critically, as a hand does, so that the vehicle reaches the place without
+    swinging about it. J is the mean moment of inertia, W is PULL_RAD_S. The bearing takes the force itself.
     """
     if grip is None:
         return np.zeros(3)
     held = np.array(grip.held_body_m)
     moment = np.cross(held, lab_from_body.inv().apply(grip.wanted_m) - held)
-    stiffness = np.trace(inertia_kg_m2) / 3 * PULL_RAD_S**2
-    return np.asarray(
-        stiffness * moment / max(held @ held, float(np.linalg.norm(moment)), 1e-9)
-    )
+    moment /= max(held @ held, float(np.linalg.norm(moment)), 1e-9)
+    inertia = np.trace(inertia_kg_m2) / 3
+    return np.asarray(inertia * PULL_RAD_S * (PULL_RAD_S * moment - 2 * rate_body_rad_s))

@@ -1,5 +1,6 @@
 """Export of the image on the page as files: frame, truth, solution, scene."""
 
+import shlex
 import tempfile
 import zipfile
 from dataclasses import asdict
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from skysim.apps.gui.messages import TrackerResult, places_px
 from skysim.apps.gui.worker.photo import Photo
-from skysim.apps.gui.worker.workbench import Workbench, tracker_result
+from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core import files as file_io
 from skysim.core.errors import InputError
 from skysim.core.images import TOP_DOWN_CARD
@@ -33,8 +34,16 @@ FILE_BY_ITEM = {  # file by menu entry
     "solution": "solution.json",
     "figure": "figure.png",
     "scene": "scene.yaml",
+    "command line": "command.txt",
+    "Python": "scene.py",
     "all of them": "",
 }
+PYTHON = """import skysim
+
+scene = skysim.load_scene({!r}, {!r})
+for frame in skysim.simulate(scene):
+    print(frame)
+"""
 
 
 def frame_files(
@@ -51,16 +60,14 @@ def frame_files(
         }
     annotated = scoring.annotated(workbench.frame, workbench.truth, workbench.report)
     contents["figure.png"] = bytes(cv2.imencode(".png", annotated)[1])
-    if workbench.report:
-        result = tracker_result(
-            workbench.lab,
-            workbench.estimator,
-            workbench.frame,
-            workbench.truth,
-            workbench.report,
-        )
-        contents["solution.json"] = file_io.to_json(solution_record(result)).encode()
-    contents["scene.yaml"] = scene_yaml(base_reference(base), overrides).encode()
+    if workbench.result:
+        solution = file_io.to_json(solution_record(workbench.result))
+        contents["solution.json"] = solution.encode()
+    name = base_reference(base)
+    sets = [word for pair in overrides.items() for word in ("--set", "=".join(pair))]
+    contents["scene.yaml"] = scene_yaml(name, overrides).encode()
+    contents["command.txt"] = shlex.join(["skysim", "run", name, *sets]).encode()
+    contents["scene.py"] = PYTHON.format(name, overrides).encode()
     return contents
 
 
@@ -83,10 +90,7 @@ def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:
 
 def solution_record(result: TrackerResult) -> Record:
     """The tracker's result for JSON."""
-    record = asdict(result)
-    record["spots"] = record.pop("detections")
-    del record["windows_px"]
-    return record
+    return asdict(result.row) | {"spots": [asdict(spot) for spot in result.detections]}
 
 
 def base_reference(scene: str, folder: Path | None = None) -> str:

@@ -26,7 +26,7 @@ from skysim.apps.gui.worker import geometry as lenses
 from skysim.apps.gui.worker import workbench
 from skysim.core import images
 from skysim.core.errors import InputError
-from skysim.core.types import Record, frozen
+from skysim.core.types import FrameRow, Record, frozen
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, store, trials
 from skysim.results import plots, scoring
@@ -64,6 +64,7 @@ class Photo:
     hint: str = ""
 
 
+UNKNOWN = (math.nan,) * 3
 PhotoPixels = tuple[Photo, NDArray]  # a photo and the image's pixels
 # Suffixes of image files as a browser's file dialog takes them: ".gz" for ".fits.gz".
 SUFFIXES = tuple(
@@ -107,9 +108,8 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     frame, truth, report = runner.replayed_frame(setup, row.seed)
     result = workbench.tracker_result(lab, setup.estimator, frame, truth, report)
     if row.error:
-        result = TrackerResult(
-            row.error.strip().splitlines()[-1], result.detections, result.ms
-        )
+        status = row.error.strip().splitlines()[-1]
+        result = replace(result, row=replace(result.row, status=status, estimate_deg=None))
     scene = lab.scene
     photo = Photo(
         result,
@@ -142,12 +142,22 @@ def solved_photo(image: NDArray, report: Report, tracker: StarTracker) -> PhotoP
     angles: Triple | None = (
         (solution["ra_deg"], solution["dec_deg"], solution["roll_deg"]) if solution else None
     )
-    result = TrackerResult(
-        attitude.status,
-        workbench.detections_of(tracker, report),
-        1e3 * sum(report.seconds.values()),
-        angles,
+    row = FrameRow(
+        frame=0,
+        t_s=math.nan,
+        rate_deg_s=math.nan,
+        status=attitude.status,
+        truth_deg=UNKNOWN,
+        estimate_deg=angles,
+        cross_arcsec=math.nan,
+        roll_arcsec=math.nan,
+        detected=len(report.centroids),
+        matched=len(attitude.match.observed) if attitude.match else 0,
+        rms_px=attitude.rms_px,
+        time_ms=1e3 * sum(report.seconds.values()),
+        wrong=False,
     )
+    result = TrackerResult(row, workbench.detections_of(tracker, report))
     saturation_dn = float(np.iinfo(image.dtype).max) if image.dtype.kind == "u" else math.inf
     statistics = plots.frame_statistics(image, saturation_dn)
     lens: Lens | None = None

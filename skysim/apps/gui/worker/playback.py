@@ -18,7 +18,6 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Frame, Mount, Telemetry
 from skysim.results import telemetry_report
 from skysim.simulation.flight import Flight, Shot
-from skysim.simulation.timing import exposure_window
 
 MAX_POINTS = 500  # approximate maximum number of points of a curve on the page
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
@@ -97,11 +96,10 @@ class Playback:
         bench = self.bench
         assert shot.report is not None
         seconds = sum(shot.seconds.values())
-        view = bench.frame_view(shot.frame, shot.truth, shot.report, seconds)
-        t_s = exposure_window(bench.scene, shot.frame.index, shot.frame.exposure_s).open_s
-        self.frames.append(
-            KeptFrame(view._replace(t_s=t_s), shot.report, self.keep(shot.frame))
+        view = bench.frame_view(
+            shot.frame, shot.truth, shot.report, seconds, shot.update_status
         )
+        self.frames.append(KeptFrame(view, shot.report, self.keep(shot.frame)))
 
     def keep(self, frame: Frame) -> int | None:
         """Write a frame's pixels to the end of the file, and return their place there; None if the file is full."""
@@ -126,6 +124,14 @@ class Playback:
         self.file.seek(kept.place)
         return kept.view, pickle.load(self.file)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether the newest frame of the workbench is one of the flight."""
+        return (
+            self.shown is not None
+            and self.frames[self.shown].view.result is self.bench.result
+        )
+
     def render(self) -> None:
         """Render the shown frame with its truth, unless a later frame of the scene has been rendered."""
         if self.shown is None or self.bench.frame is not None:
@@ -134,6 +140,7 @@ class Playback:
         bench = self.bench
         bench.frame, bench.truth = self.flight.render(self.shown)
         bench.report = kept.report
+        bench.result = kept.view.result
 
 
 def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
@@ -141,26 +148,24 @@ def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
     view = kept.view
     result = view.result
     assert result is not None  # every frame of a flight is solved
-    cross_sigma, roll_sigma = result.sigma_arcsec
-    errors = result.cross_arcsec, cross_sigma, result.roll_arcsec, roll_sigma
     filter_arcsec = innovation_arcsec = math.nan
     if log.lab_from_filter is not None:
-        n = min(int(np.searchsorted(log.t_s, view.t_s)), len(log.t_s) - 1)
+        n = min(int(np.searchsorted(log.t_s, result.row.t_s)), len(log.t_s) - 1)
         lab_from_filter = log.lab_from_filter[n]
         filter_arcsec = angle_arcsec(lab_from_filter, log.lab_from_body[n])
         cam_from_lab = kept.report.attitude.cam_from_ref
         if cam_from_lab is not None:
             lab_from_body = cam_from_lab.inv() * mount.cam_from_body
             innovation_arcsec = angle_arcsec(lab_from_body, lab_from_filter)
-    counts = len(view.lights), result.identified
-    return FlightRow(view.t_s, *errors, *counts, filter_arcsec, innovation_arcsec)
+    return FlightRow(result.row, len(view.lights), filter_arcsec, innovation_arcsec)
 
 
 def light_residuals(view: FrameView) -> Iterator[Residual]:
     """The residual of every light that is identified in a frame."""
-    for spot in view.result.detections if view.result else ():
+    assert view.result is not None
+    for spot in view.result.detections:
         if spot.id >= 0 and math.isfinite(spot.residual_px):
-            yield view.t_s, spot.id, spot.residual_px
+            yield view.result.row.t_s, spot.id, spot.residual_px
 
 
 def curves(log: Telemetry) -> Curves:

@@ -82,7 +82,10 @@ class Session:
     def start(self) -> None:
         """Fork the worker; waits until the template is ready."""
         with self.worker_pipe:
-            self.process.start()
+            try:
+                self.process.start()
+            except EOFError:  # the template has just ended: the next call starts another one
+                self.process.start()
 
     async def run(self, task: str, *arguments: Any) -> Any:
         """Run a task and return its result. Raises InputError for a user error, WorkerLost if the worker has ended."""

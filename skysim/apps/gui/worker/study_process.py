@@ -58,6 +58,9 @@ class StudyResults(NamedTuple):
     failed: tuple[tuple[int, str], ...]
 
 
+NO_RESULTS = StudyResults(0, {}, (), (), ())
+
+
 def monte_carlo(
     scene: str, overrides: Mapping[str, str], trial: Mapping[str, Any], count: int, seed: int
 ) -> str:

@@ -238,11 +238,12 @@ def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int
     by_hold: dict[int, int] = {}
     holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
     for row, view in enumerate(views):
-        leg = int(np.searchsorted(reference.start_s, view.t_s, side="right")) - 1
-        if leg in holds and view.t_s + view.exposure_s <= reference.start_s[leg + 1]:
-            rate_rad_s = np.linalg.norm(
-                flight.trajectory().rate_at(view.t_s + view.exposure_s / 2)
-            )
+        assert view.result is not None  # every frame of a flight is solved
+        middle_s = view.result.row.t_s
+        half_s = view.exposure_s / 2
+        leg = int(np.searchsorted(reference.start_s, middle_s - half_s, side="right")) - 1
+        if leg in holds and middle_s + half_s <= reference.start_s[leg + 1]:
+            rate_rad_s = np.linalg.norm(flight.trajectory().rate_at(middle_s))
             if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
                 by_hold[leg] = row
     return list(by_hold.values()), len(holds)

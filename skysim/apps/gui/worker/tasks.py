@@ -217,7 +217,9 @@ class Worker:
     def advance_flight(self, budget_s: float) -> FlightStep:
         """Compute the flight for about budget_s. Raises InputError if none has begun."""
         if self.flight is None:
-            raise InputError("", "no flight has begun")
+            raise InputError(
+                "", "the flight was lost with its worker: Simulate computes it again"
+            )
         return self.flight.advance(budget_s)
 
     def flight_frame(self, index: int) -> FrameView:
@@ -234,9 +236,13 @@ class Worker:
         """The files of the image on the page."""
         if self.other:
             return image_export.photo_files(*self.other)
+        bench = self.workbench
+        overrides = self.overrides | bench.scene_at_rest()
         if self.flight:
             self.flight.render()
-        return image_export.frame_files(self.workbench, self.scene, self.overrides)
+            if self.flight.is_shown:
+                overrides = self.overrides
+        return image_export.frame_files(bench, self.scene, overrides)
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

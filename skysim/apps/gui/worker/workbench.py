@@ -24,6 +24,7 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
+from skysim.apps.gui.views.forms import yaml_line
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Ints, Record, Trajectory, Truth
@@ -31,6 +32,7 @@ from skysim.experiments.dome_survey import survey_frames
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
 from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import PRESCRIBED
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
@@ -66,6 +68,7 @@ class Workbench:
     frame: Frame | None = None
     truth: Truth | None = None
     report: Report | None = None
+    result: TrackerResult | None = None
     magnitude: dict[int, float] = field(default_factory=dict)
 
     @classmethod
@@ -121,6 +124,27 @@ class Workbench:
             self.lens,
         )
 
+    def scene_at_rest(self) -> dict[str, str]:
+        """Overrides for the scene in which the vehicle rests at the present attitude."""
+        if self.lab_from_body == self.lab.start:
+            return {}
+        camera = self.lab.camera
+        angles = scoring.angles_deg(
+            camera.mount.cam_from_body * self.lab_from_body.inv(), camera
+        )
+        names = scoring.angle_names(self.scene)
+        start = {
+            f"{name.lower()}_deg": angle for name, angle in zip(names, angles, strict=True)
+        }
+        motion = {
+            "start": start,
+            "control": PRESCRIBED,
+            "maneuver": [],
+            "jitter": [],
+            "rate_deg_s": [0, 0, 0],
+        }
+        return {f"motion.{key}": yaml_line(value) for key, value in motion.items()}
+
     def render_at_rest(self, solve: bool = False) -> FrameView:
         """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
         camera = self.next_run().camera
@@ -139,10 +163,17 @@ class Workbench:
         self.frame, self.truth = exposure.render_frame(camera, trajectory, 0)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         clock.lap("all")
-        return self.frame_view(self.frame, self.truth, self.report, clock.seconds["all"])
+        view = self.frame_view(self.frame, self.truth, self.report, clock.seconds["all"])
+        self.result = view.result
+        return view
 
     def frame_view(
-        self, frame: Frame, truth: Truth, report: Report | None, seconds: float
+        self,
+        frame: Frame,
+        truth: Truth,
+        report: Report | None,
+        seconds: float,
+        update_status: str = "",
     ) -> FrameView:
         """The view of a frame of this scene for the page, without its pixels."""
         return FrameView(
@@ -153,7 +184,7 @@ class Workbench:
             frame.exposure_s,
             plots.frame_statistics(frame.image_dn, frame.saturation_dn),
             true_lights(truth, self.magnitude),
-            tracker_result(self.lab, self.estimator, frame, truth, report)
+            tracker_result(self.lab, self.estimator, frame, truth, report, update_status)
             if report
             else None,
             1e3 * seconds,
@@ -200,27 +231,22 @@ def magnitude_by_id(lab: Lab) -> dict[int, float]:
 
 
 def tracker_result(
-    lab: Lab, estimator: factory.Estimator, frame: Frame, truth: Truth, report: Report
+    lab: Lab,
+    estimator: factory.Estimator,
+    frame: Frame,
+    truth: Truth,
+    report: Report,
+    update_status: str = "",
 ) -> TrackerResult:
     """The tracker's report with its errors relative to the truth."""
-    row = scoring.row(lab.camera, frame, truth, report)
+    row = scoring.row(lab.camera, frame, truth, report, update_status)
     # Lights in the field: tracking mode would search at their places in the next frame.
     windows_px: list[tuple[float, float]] = []
     if report.attitude.solved and not isinstance(estimator, factory.UserTracker):
         _, xy_px = predicted_lights(estimator, report.attitude)
         inside = estimator.camera.contains(np.nan_to_num(xy_px, nan=-1e9))
         windows_px = [(x, y) for x, y in xy_px[inside][:MAX_WINDOWS].tolist()]
-    return TrackerResult(
-        row.status,
-        detections_of(estimator, report),
-        row.time_ms,
-        row.estimate_deg,
-        row.cross_arcsec,
-        row.roll_arcsec,
-        (row.cross_sigma_arcsec, row.roll_sigma_arcsec),
-        row.wrong,
-        tuple(windows_px),
-    )
+    return TrackerResult(row, detections_of(estimator, report), tuple(windows_px))
 
 
 def detections_of(estimator: factory.Estimator, report: Report) -> tuple[Detection, ...]:

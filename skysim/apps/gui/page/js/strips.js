@@ -33,6 +33,8 @@ export default {
     scale() {
       const { chart, shown } = this, finder = { gridIndex: shown.grid };
       const from = chart.convertToPixel(finder, [0, 0]), to = chart.convertToPixel(finder, [1, 1]);
+      // The chart may have lost this strip already, as after a worker's end: then no dot has a place.
+      if (!from || !to) return () => [NaN, NaN];
       return ([t, y]) => [from[0] + t * (to[0] - from[0]), from[1] + y * (to[1] - from[1])];
     },
     paint() {
