@@ -46,6 +46,7 @@ FLAT_M = (400e-9, 1000e-9)
 
 LUMA = (0.2989, 0.5870, 0.1140)  # weights of red, green, blue in gray (ITU-R BT.601)
 STEP_M = 1e-9  # of the integrals
+NODES = 4  # of the quadrature of lateral color, K
 LONGEST_NM = 10_000.0  # of a curve; the integral of a longer one would take too many steps
 SUN = (
     0.650,
@@ -344,7 +345,7 @@ def star_flux_e_s_m2(
 
 @lru_cache(maxsize=64)
 def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
-    """(256,) inverse temperatures, and the `chromatic_moments` (256, 4) of black bodies of these temperatures."""
+    """(256,) inverse temperatures, and `chromatic_moments` (256, 4 + 2 K) of black bodies of these temperatures."""
     inverse_k, _ = _black_bodies(band)
     return inverse_k, chromatic_moments(
         band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)
@@ -352,27 +353,27 @@ def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
 
 
 def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
-    """(..., 4) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
+    """(..., 4 + 2 K) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
     if band.chromatic is None:
         return None
     inverse_k, moments = _black_body_moments(band)
-    # Each moment is interpolated in 1/T.
+    # Each column is interpolated in 1/T.
     own_k = 1 / temperature_k(b_v, v_i)
     return np.stack([np.interp(own_k, inverse_k, column) for column in moments.T], axis=-1)
 
 
 def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -> Floats:
-    """(4,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
+    """(4 + 2 K,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
     # A line has no spread.
     if not isinstance(spectrum, str) and fwhm_m is None:
         focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
-        return np.array([focus_m, 0.0, corner_px, 0.0])
+        return np.array([focus_m, 0.0, corner_px, 0.0, *np.eye(2 * NODES)[NODES]])
     power, _ = broad_spectrum(spectrum, fwhm_m)
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
 def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
-    """Mean and standard deviation of the lens's chromatic shifts over a light's photo-electrons.
+    """Moments of the lens's chromatic shifts over a light's photo-electrons, and a quadrature of the lateral ones.
 
     Parameters
     ----------
@@ -382,25 +383,36 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
     Returns
     -------
     Floats
-        (..., 4) mean and standard deviation of the shift of focus in m, then of the shift at the chip's corner in px;
-        0 for a light that the camera does not see
+        (..., 4 + 2 K) mean and standard deviation of the shift of focus in m, then of the shift at the chip's corner in
+        px; K nodes of the latter about its mean in px, and their shares of the light (`quadrature`)
     """
+    # Weights of the trapezoidal rule, as in `Band.integral`.
+    grid = band.grid_m()
+    light = photons(grid) * band.response_at(grid) * np.convolve(np.diff(grid), (0.5, 0.5))
     # The least positive number avoids a division by zero.
-    total = np.maximum(band.integral(photons), np.finfo(float).tiny)
+    light /= np.maximum(light.sum(axis=-1, keepdims=True), np.finfo(float).tiny)
+    shifts = chromatic_shifts(band, grid)
+    means = light @ shifts.T
+    # Rounding may leave less than nothing.
+    spreads = np.sqrt(np.maximum(light @ shifts.T**2 - means**2, 0))
+    moments = np.stack([means, spreads], axis=-1).reshape(*means.shape[:-1], 4)
+    nodes_px, shares = quadrature(shifts[1], light)
+    return np.concatenate([moments, nodes_px - means[..., 1:], shares], axis=-1)
 
-    # Mean of (shift - origin)^power.
-    def mean_of(power: int, column: int, origin: Floats) -> Floats:
-        def weighted(wavelength_m: Floats) -> Floats:
-            return (
-                photons(wavelength_m)
-                * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
-            )
 
-        return band.integral(weighted) / total
+def quadrature(values: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """K nodes (..., K) and K weights that give sums of shares f(values) for polynomials f of degree 2 K - 1.
 
-    means = [mean_of(1, column, np.zeros(())) for column in range(2)]
-    spreads = [np.sqrt(mean_of(2, column, mean)) for column, mean in enumerate(means)]
-    return np.stack([means[0], spreads[0], means[1], spreads[1]], axis=-1)
+    So an image made of K spots has the mean, the variance, the skewness and further moments of the whole light. It is
+    Gauss's quadrature for the measure that the shares (..., M) are on the values (M,): in the basis of polynomials
+    that are orthogonal under it, multiplication by the value is a matrix whose eigenvalues are the nodes, and the
+    squares of the eigenvectors' first components are the weights (Golub & Welsch 1969, Math. Comp. 23, 221). A light
+    of fewer values has nodes without a share.
+    """
+    powers = np.vander(values, NODES, increasing=True)
+    basis = np.linalg.qr(np.sqrt(shares)[..., None] * powers)[0]
+    nodes, vectors = np.linalg.eigh(basis.mT @ (values[:, None] * basis))
+    return nodes, vectors[..., 0, :] ** 2
 
 
 def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:

@@ -60,6 +60,8 @@ class Kernels(NamedTuple):
         (N, 15) fields of `ellipse.EllipseDisk`; zeros for other kinds
     bessel
         The table for `ellipse.jinc`; empty without ellipses
+    parts
+        (N, K, 3) spots of which an image is made by lateral color: shares of the light, and displacements in px
     """
 
     kind: Ints
@@ -70,6 +72,7 @@ class Kernels(NamedTuple):
     tables: Singles
     disk: Floats
     bessel: Singles
+    parts: Floats
 
 
 class KernelCache(NamedTuple):
@@ -132,6 +135,7 @@ def source_kernels(
     2. Disks that a circle does not represent get an ellipse.
     3. Look each source's kernel up by its rounded sizes; make those that are missing.
     4. Widen the exact Gaussians, which are not rounded, by the blurs of each source.
+    5. Lateral color spreads each image along its radius.
 
     Parameters
     ----------
@@ -155,7 +159,7 @@ def source_kernels(
     sigma = np.hypot(field_sigma_px(camera.psf, camera, position), optics.blur_px)
     shift_m: Floats | float = 0.0
     if chromatic is not None:
-        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
+        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic))
         shift_m = chromatic[:, 0]
     emitter = np.where(is_led, sources.radius_m / distance_m, 0.0) * camera.focal_px
     # Defocus depends on the distance along the boresight.
@@ -187,7 +191,15 @@ def source_kernels(
     # 4. Widening.
     if gaussian and (optics.blur_px or camera.psf.corner_sigma_px or chromatic is not None):
         kernels = widened(kernels, sizes.sigma_px)
-    return kernels
+    # 5. The nodes and shares of each light's quadrature.
+    if chromatic is None:
+        return kernels
+    nodes_px, shares = np.split(chromatic[:, 4:, None], 2, axis=1)
+    spots_px = nodes_px * ((position - camera.center_px) / camera.corner_px)[:, None]
+    return kernels._replace(
+        reach_px=kernels.reach_px + np.abs(spots_px).max(axis=(1, 2)),
+        parts=np.concatenate([shares, spots_px], axis=2),
+    )
 
 
 def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
@@ -247,8 +259,18 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
+    # One part with all of the light.
+    parts = np.tile(np.eye(1, 3), (len(keys), 1, 1))
     return Kernels(
-        kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel
+        kind.astype(np.int64),
+        sigma,
+        reach,
+        sharp,
+        spans,
+        cache.tables[0],
+        disk,
+        bessel,
+        parts,
     )
 
 

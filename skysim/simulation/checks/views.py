@@ -268,7 +268,12 @@ def lens_blur(
     shift_m: Floats | float = 0.0
     if points.chromatic is not None:
         shift_m = points.chromatic[:, 0]
-        lens2_px2 = lens2_px2 + chromatic_sigma_px(camera, points.chromatic, xy_px) ** 2
+        lens2_px2 = lens2_px2 + chromatic_sigma_px(camera, points.chromatic) ** 2
+        # Lateral color smears along the radius: half of its variance on each axis.
+        radius = (
+            np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1) / camera.corner_px
+        )
+        lens2_px2 = lens2_px2 + (radius * points.chromatic[:, 3]) ** 2 / 2
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 
