@@ -366,14 +366,20 @@ def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -
     """(4 + 2 K,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
     # A line has no spread.
     if not isinstance(spectrum, str) and fwhm_m is None:
-        focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
-        return np.array([focus_m, 0.0, corner_px, 0.0, *np.eye(2 * NODES)[NODES]])
+        shifts = chromatic_shifts(band, np.array([spectrum]))[:, 0]
+        return np.array([*shifts, 0, 0, *np.eye(2 * NODES)[NODES]])
     power, _ = broad_spectrum(spectrum, fwhm_m)
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
 def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
     """Moments of the lens's chromatic shifts over a light's photo-electrons, and a quadrature of the lateral ones.
+
+    The quadrature's K nodes and shares give the mean of polynomials of degree 2 K - 1 over the light, so an image made
+    of K spots has the mean, the variance, the skewness and further moments of the whole light. It is Gauss's: in the
+    basis of polynomials that are orthogonal under the light, multiplication by the shift is a matrix whose eigenvalues
+    are the nodes, and the squares of the eigenvectors' first components are the shares (Golub & Welsch 1969, Math.
+    Comp. 23, 221). A light of fewer shifts has nodes without a share.
 
     Parameters
     ----------
@@ -383,36 +389,25 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
     Returns
     -------
     Floats
-        (..., 4 + 2 K) mean and standard deviation of the shift of focus in m, then of the shift at the chip's corner in
-        px; K nodes of the latter about its mean in px, and their shares of the light (`quadrature`)
+        (..., 4 + 2 K) means of the shift of focus in m and of the shift at the chip's corner in px, their standard
+        deviations, K nodes of the latter about its mean in px, and their shares of the light
     """
     # Weights of the trapezoidal rule, as in `Band.integral`.
     grid = band.grid_m()
     light = photons(grid) * band.response_at(grid) * np.convolve(np.diff(grid), (0.5, 0.5))
-    # The least positive number avoids a division by zero.
-    light /= np.maximum(light.sum(axis=-1, keepdims=True), np.finfo(float).tiny)
-    shifts = chromatic_shifts(band, grid)
-    means = light @ shifts.T
+    # The camera may see nothing of it.
+    light /= np.maximum(light.sum(axis=-1, keepdims=True), 1e-300)
+    shifts = chromatic_shifts(band, grid).T
+    means = light @ shifts
     # Rounding may leave less than nothing.
-    spreads = np.sqrt(np.maximum(light @ shifts.T**2 - means**2, 0))
-    moments = np.stack([means, spreads], axis=-1).reshape(*means.shape[:-1], 4)
-    nodes_px, shares = quadrature(shifts[1], light)
-    return np.concatenate([moments, nodes_px - means[..., 1:], shares], axis=-1)
-
-
-def quadrature(values: Floats, shares: Floats) -> tuple[Floats, Floats]:
-    """K nodes (..., K) and K weights that give sums of shares f(values) for polynomials f of degree 2 K - 1.
-
-    So an image made of K spots has the mean, the variance, the skewness and further moments of the whole light. It is
-    Gauss's quadrature for the measure that the shares (..., M) are on the values (M,): in the basis of polynomials
-    that are orthogonal under it, multiplication by the value is a matrix whose eigenvalues are the nodes, and the
-    squares of the eigenvectors' first components are the weights (Golub & Welsch 1969, Math. Comp. 23, 221). A light
-    of fewer values has nodes without a share.
-    """
-    powers = np.vander(values, NODES, increasing=True)
-    basis = np.linalg.qr(np.sqrt(shares)[..., None] * powers)[0]
-    nodes, vectors = np.linalg.eigh(basis.mT @ (values[:, None] * basis))
-    return nodes, vectors[..., 0, :] ** 2
+    spreads = np.sqrt(np.maximum(light @ shifts**2 - means**2, 0))
+    lateral_px = shifts[:, 1]
+    powers = np.vander(lateral_px, NODES, increasing=True)
+    basis = np.linalg.qr(np.sqrt(light)[..., None] * powers)[0]
+    nodes_px, vectors = np.linalg.eigh(basis.mT @ (lateral_px[:, None] * basis))
+    return np.concatenate(
+        [means, spreads, nodes_px - means[..., 1:], vectors[..., 0, :] ** 2], axis=-1
+    )
 
 
 def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:

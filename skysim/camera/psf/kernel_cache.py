@@ -135,7 +135,8 @@ def source_kernels(
     2. Disks that a circle does not represent get an ellipse.
     3. Look each source's kernel up by its rounded sizes; make those that are missing.
     4. Widen the exact Gaussians, which are not rounded, by the blurs of each source.
-    5. Lateral color spreads each image along its radius.
+
+    Lateral color makes several spots along the radius of each image, by the quadrature of its light.
 
     Parameters
     ----------
@@ -153,18 +154,18 @@ def source_kernels(
     """
     camera = optics.camera
     chromatic = sources.chromatic
+    if chromatic is None:
+        # No shift, and one node that has all of the light.
+        chromatic = np.eye(1, 6, 5).repeat(len(sources), 0)
     is_led = sources.place[:, 3] > 0
     # 1. Gaussian blurs add in squares.
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
-    sigma = np.hypot(field_sigma_px(camera.psf, camera, position), optics.blur_px)
-    shift_m: Floats | float = 0.0
-    if chromatic is not None:
-        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic))
-        shift_m = chromatic[:, 0]
+    sigma = np.hypot(field_sigma_px(camera, position), optics.blur_px)
+    sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic))
     emitter = np.where(is_led, sources.radius_m / distance_m, 0.0) * camera.focal_px
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
-    defocus = blur_radius_px(camera, axial_m, shift_m)
+    defocus = blur_radius_px(camera, axial_m, chromatic[:, 0])
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
@@ -178,28 +179,23 @@ def source_kernels(
     # 2. Ellipses.
     disk = ellipses(keys, camera, disks, axes_px, sizes)
     # 3. Gaussians need no shared table, so all have the key of sharp points.
+    coma_px = camera.along_radius("coma_um", camera.psf.coma_px, position)
     gaussian = camera.psf.kind == "gaussian" and not (
-        camera.detector.intrapixel or camera.psf.coma_px
+        camera.detector.intrapixel or coma_px.any()
     )
     if gaussian:
         keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
-    if camera.psf.coma_px:
-        coma_px = camera.psf.coma_px * (position - camera.center_px) / camera.corner_px
+    if coma_px.any():
         coma_px[disk.any(axis=1)] = 0
         keys = np.column_stack([keys, np.rint(coma_px / COMA_PX).astype(np.int64)])
-    kernels = look_up(camera, keys, disk)
-    # 4. Widening.
-    if gaussian and (optics.blur_px or camera.psf.corner_sigma_px or chromatic is not None):
-        kernels = widened(kernels, sizes.sigma_px)
-    # 5. The nodes and shares of each light's quadrature.
-    if chromatic is None:
-        return kernels
     nodes_px, shares = np.split(chromatic[:, 4:, None], 2, axis=1)
-    spots_px = nodes_px * ((position - camera.center_px) / camera.corner_px)[:, None]
-    return kernels._replace(
-        reach_px=kernels.reach_px + np.abs(spots_px).max(axis=(1, 2)),
-        parts=np.concatenate([shares, spots_px], axis=2),
-    )
+    spots_px = camera.along_radius("lateral", nodes_px, position[:, None])
+    parts = np.concatenate([shares, spots_px], axis=2)
+    kernels = look_up(camera, keys, disk, parts)
+    # 4. Widening.
+    if gaussian and sigma.any():
+        kernels = widened(kernels, sizes.sigma_px)
+    return kernels
 
 
 def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
@@ -240,12 +236,11 @@ def ellipses(
     return disk
 
 
-def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
-    """The kernels of N keys (N, 3 or 5) in the camera's cache, with the ellipses `disk`; makes the missing ones."""
+def look_up(camera: CameraConfig, keys: Ints, disk: Floats, parts: Floats) -> Kernels:
+    """The kernels of N keys (N, 3 or 5) in the camera's cache, with ellipses and parts; makes the missing ones."""
     cache = kernel_cache(camera)
     # Sizes pack into integers, which sort faster than rows; those with coma do not.
-    has_coma = keys.shape[1] > len(PACKING)
-    codes = keys if has_coma else keys @ PACKING
+    codes = keys if keys.shape[1] > len(PACKING) else keys @ PACKING
     # Stars in focus share one key, which saves the sort.
     first = np.zeros(1, int)
     inverse = np.zeros(len(codes), int)
@@ -256,11 +251,10 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
     properties = np.array([cache.kernels[key] for key in used]).reshape(-1, 8)[inverse]
     kind, sigma, reach, sharp = np.ascontiguousarray(properties[:, :4].T)
+    reach += np.abs(parts[..., 1:]).max((1, 2))
     spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
-    # One part with all of the light.
-    parts = np.tile(np.eye(1, 3), (len(keys), 1, 1))
     return Kernels(
         kind.astype(np.int64),
         sigma,
