@@ -372,27 +372,17 @@ def _integrate(
         points = 1 if speed * spread < STILL_PX else 2
         for p in range(points):
             x, y, rate = _interpolate(tracks, n, mean + spread * (2 * p - points + 1))
-            electrons = rate * lit / points
-            if (
-                not electrons > 0
-            ):  # no image at this time (NaN position), or the LED faces away
+            e = rate * lit / points
+            if not e > 0:  # no image at this time (NaN position), or the LED faces away
                 continue
-            for k in range(kernels.parts.shape[1]):
-                share, dx, dy = kernels.parts[n, k]
+            for part in range(kernels.parts.shape[1]):
+                share, dx, dy = kernels.parts[n, part]
                 _splat_point(
-                    patch,
-                    row0,
-                    row1,
-                    x - x0 + dx,
-                    y - y0 + dy,
-                    electrons * share,
-                    n,
-                    kernels,
-                    table,
+                    patch, row0, row1, x - x0 + dx, y - y0 + dy, e * share, n, kernels, table
                 )
-            total = total + electrons
-            total_x = total_x + electrons * x
-            total_y = total_y + electrons * y
+            total = total + e
+            total_x = total_x + e * x
+            total_y = total_y + e * y
     return total, total_x, total_y
 
 
