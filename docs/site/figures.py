@@ -409,8 +409,8 @@ def color(path: Path) -> None:
         electrons = photons * band.response_at(nm * 1e-9)
         spectra.plot(nm, electrons / electrons.max(), color=paint, label=name)
         shift.plot(
-            np.interp(moments[2], chromatic_shifts(band, nm * 1e-9)[1], nm),
-            moments[2],
+            np.interp(moments[1], chromatic_shifts(band, nm * 1e-9)[1], nm),
+            moments[1],
             "o",
             color=paint,
         )

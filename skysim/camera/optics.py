@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 
 from skysim.core.types import Floats, frozen
-from skysim.scene.sections.camera import CameraConfig, TwoStopsConfig, VignettingTableConfig
+from skysim.scene.sections.camera import (
+    CameraConfig,
+    TwoStopsConfig,
+    VignettingTableConfig,
+    radial,
+)
 
 
 def two_stops(config: TwoStopsConfig, field_rad: Floats) -> Floats:
@@ -127,12 +132,6 @@ class Optics:
         if config is None:
             return cosine
         return cosine * VIGNETTING[config.kind](config, np.arccos(np.minimum(cosine, 1)))
-
-
-def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
-    """Radial distortion factor 1 + k1 r^2 + k2 r^4 + k3 r^6 from k1, k2, p1, p2, k3 (OpenCV's order)."""
-    k1, k2, _, _, k3 = distortion
-    return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
 
 
 def tangential(distortion: tuple[float, ...], x: Floats, y: Floats) -> tuple[Floats, Floats]:

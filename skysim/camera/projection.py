@@ -189,7 +189,7 @@ def _pixels(
 
 def lateral_color(camera: CameraConfig, xy_px: Floats, chromatic: Floats) -> Floats:
     """Move images (..., N, 2) along their radii by their mean color (N, 4), as the distance from the center."""
-    return xy_px + (xy_px - camera.center_px) * (chromatic[:, 2:3] / camera.corner_px)
+    return xy_px + camera.along_radius("lateral", chromatic[:, 1:2], xy_px)
 
 
 def beside_edges(camera: CameraConfig, xy_px: Floats) -> Floats:

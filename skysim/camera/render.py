@@ -348,7 +348,7 @@ def _integrate(
     2. In a piece the light has a duration `lit`, a mean time and a standard deviation `spread` (from the pulses).
     3. Two points of half the light each, at mean - spread and mean + spread, reproduce these moments: for steady light
        spread = length / (2 sqrt 3), which is the two-point Gauss-Legendre rule, with an error of the fourth order in
-       the length. An image that hardly moves within the piece needs one point.
+       the length. An image that hardly moves within the piece needs one point. Lateral color makes each several.
 
     Returns the electrons of the whole image and their first moments in x and y.
     """
@@ -372,15 +372,17 @@ def _integrate(
         points = 1 if speed * spread < STILL_PX else 2
         for p in range(points):
             x, y, rate = _interpolate(tracks, n, mean + spread * (2 * p - points + 1))
-            electrons = rate * lit / points
-            if (
-                not electrons > 0
-            ):  # no image at this time (NaN position), or the LED faces away
+            e = rate * lit / points
+            if not e > 0:  # no image at this time (NaN position), or the LED faces away
                 continue
-            _splat_point(patch, row0, row1, x - x0, y - y0, electrons, n, kernels, table)
-            total = total + electrons
-            total_x = total_x + electrons * x
-            total_y = total_y + electrons * y
+            for part in range(kernels.parts.shape[1]):
+                share, dx, dy = kernels.parts[n, part]
+                _splat_point(
+                    patch, row0, row1, x - x0 + dx, y - y0 + dy, e * share, n, kernels, table
+                )
+            total = total + e
+            total_x = total_x + e * x
+            total_y = total_y + e * y
     return total, total_x, total_y
 
 

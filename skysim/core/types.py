@@ -292,8 +292,9 @@ class Sources:
     motion
         (N, 2, 3) velocity in s^-1 and acceleration in s^-2 of `place` at mid-exposure; None without motion
     chromatic
-        (N, 4) mean and standard deviation, over the photo-electrons, of the lens's shift of focus in m and of its
-        lateral shift at the detector's corner in px; None for a lens without chromatic aberration
+        (N, 4 + 2 K) means, over the photo-electrons, of the lens's shift of focus in m and of its lateral shift at the
+        detector's corner in px, their standard deviations, K lateral shifts about that mean in px, and their shares of
+        the light (`photometry.chromatic_moments`); None for a lens without chromatic aberration
     """
 
     id: Ints

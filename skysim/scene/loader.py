@@ -488,6 +488,7 @@ FILE_KEYS: tuple[str, ...] = (
     "motion.maneuver.*.file",
     "camera.preset",
     "camera.psf.file",
+    "camera.lens_table",
     "camera.calibration",
     "camera.transmission",
     "camera.detector.quantum_efficiency",

@@ -61,7 +61,7 @@ def reflected_v0(wavelength_m: Floats, albedo: Albedo) -> Floats:
 
 @lru_cache(maxsize=64)
 def reflected_chromatic(albedo: Albedo, band: Band) -> Floats | None:
-    """(4,) `chromatic_moments` of a body; None for a lens without chromatic aberration."""
+    """(4 + 2 K,) `chromatic_moments` of a body; None for a lens without chromatic aberration."""
     if band.chromatic is None:
         return None
     return chromatic_moments(band, lambda wavelength_m: reflected_v0(wavelength_m, albedo))
@@ -130,7 +130,7 @@ class BodyLight:
     earthshine
         As in `DiscSurface`
     chromatic
-        (4,) a row of `Sources.chromatic`
+        (4 + 2 K,) a row of `Sources.chromatic`
     """
 
     name: str

@@ -46,6 +46,7 @@ FLAT_M = (400e-9, 1000e-9)
 
 LUMA = (0.2989, 0.5870, 0.1140)  # weights of red, green, blue in gray (ITU-R BT.601)
 STEP_M = 1e-9  # of the integrals
+NODES = 4  # of the quadrature of lateral color, K
 LONGEST_NM = 10_000.0  # of a curve; the integral of a longer one would take too many steps
 SUN = (
     0.650,
@@ -344,7 +345,7 @@ def star_flux_e_s_m2(
 
 @lru_cache(maxsize=64)
 def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
-    """(256,) inverse temperatures, and the `chromatic_moments` (256, 4) of black bodies of these temperatures."""
+    """(256,) inverse temperatures, and `chromatic_moments` (256, 4 + 2 K) of black bodies of these temperatures."""
     inverse_k, _ = _black_bodies(band)
     return inverse_k, chromatic_moments(
         band, lambda wavelength_m: black_body_v0(wavelength_m, 1 / inverse_k)
@@ -352,27 +353,33 @@ def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
 
 
 def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
-    """(..., 4) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
+    """(..., 4 + 2 K) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
     if band.chromatic is None:
         return None
     inverse_k, moments = _black_body_moments(band)
-    # Each moment is interpolated in 1/T.
+    # Each column is interpolated in 1/T.
     own_k = 1 / temperature_k(b_v, v_i)
     return np.stack([np.interp(own_k, inverse_k, column) for column in moments.T], axis=-1)
 
 
 def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -> Floats:
-    """(4,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
+    """(4 + 2 K,) `chromatic_moments` of an LED, with arguments as in `led_strength_e_s_sr`."""
     # A line has no spread.
     if not isinstance(spectrum, str) and fwhm_m is None:
-        focus_m, corner_px = chromatic_shifts(band, np.array([spectrum]))[:, 0]
-        return np.array([focus_m, 0.0, corner_px, 0.0])
+        shifts = chromatic_shifts(band, np.array([spectrum]))[:, 0]
+        return np.array([*shifts, 0, 0, *np.eye(2 * NODES)[NODES]])
     power, _ = broad_spectrum(spectrum, fwhm_m)
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
 def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
-    """Mean and standard deviation of the lens's chromatic shifts over a light's photo-electrons.
+    """Moments of the lens's chromatic shifts over a light's photo-electrons, and a quadrature of the lateral ones.
+
+    The quadrature's K nodes and shares give the mean of polynomials of degree 2 K - 1 over the light, so an image made
+    of K spots has the mean, the variance, the skewness and further moments of the whole light. It is Gauss's: in the
+    basis of polynomials that are orthogonal under the light, multiplication by the shift is a matrix whose eigenvalues
+    are the nodes, and the squares of the eigenvectors' first components are the shares (Golub & Welsch 1969, Math.
+    Comp. 23, 221). A light of fewer shifts has nodes without a share.
 
     Parameters
     ----------
@@ -382,25 +389,25 @@ def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats
     Returns
     -------
     Floats
-        (..., 4) mean and standard deviation of the shift of focus in m, then of the shift at the chip's corner in px;
-        0 for a light that the camera does not see
+        (..., 4 + 2 K) means of the shift of focus in m and of the shift at the chip's corner in px, their standard
+        deviations, K nodes of the latter about its mean in px, and their shares of the light
     """
-    # The least positive number avoids a division by zero.
-    total = np.maximum(band.integral(photons), np.finfo(float).tiny)
-
-    # Mean of (shift - origin)^power.
-    def mean_of(power: int, column: int, origin: Floats) -> Floats:
-        def weighted(wavelength_m: Floats) -> Floats:
-            return (
-                photons(wavelength_m)
-                * (chromatic_shifts(band, wavelength_m)[column] - origin[..., None]) ** power
-            )
-
-        return band.integral(weighted) / total
-
-    means = [mean_of(1, column, np.zeros(())) for column in range(2)]
-    spreads = [np.sqrt(mean_of(2, column, mean)) for column, mean in enumerate(means)]
-    return np.stack([means[0], spreads[0], means[1], spreads[1]], axis=-1)
+    # Weights of the trapezoidal rule, as in `Band.integral`.
+    grid = band.grid_m()
+    light = photons(grid) * band.response_at(grid) * np.convolve(np.diff(grid), (0.5, 0.5))
+    # The camera may see nothing of it.
+    light /= np.maximum(light.sum(axis=-1, keepdims=True), 1e-300)
+    shifts = chromatic_shifts(band, grid).T
+    means = light @ shifts
+    # Rounding may leave less than nothing.
+    spreads = np.sqrt(np.maximum(light @ shifts**2 - means**2, 0))
+    lateral_px = shifts[:, 1]
+    powers = np.vander(lateral_px, NODES, increasing=True)
+    basis = np.linalg.qr(np.sqrt(light)[..., None] * powers)[0]
+    nodes_px, vectors = np.linalg.eigh(basis.mT @ (lateral_px[:, None] * basis))
+    return np.concatenate(
+        [means, spreads, nodes_px - means[..., 1:], vectors[..., 0, :] ** 2], axis=-1
+    )
 
 
 def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:

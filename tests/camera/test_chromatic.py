@@ -99,18 +99,36 @@ def test_mean_and_spread_of_a_light(case: str) -> None:
 
     total = integral(np.ones_like)
     wanted = list[float]()
+    moments_px = dict[int, float]()
     for column in (1e-6 * np.array(FOCUS_UM), CORNER_PX):
         mean = integral(lambda nm, of=column: np.interp(nm, WAVELENGTH_NM, of)) / total
         square = integral(
             lambda nm, of=column, mean=mean: (np.interp(nm, WAVELENGTH_NM, of) - mean) ** 2
         )
         wanted += [mean, (square / total) ** 0.5]
+        for power in (3, 4, 5, 6, 7):
+            moments_px[power] = (
+                integral(
+                    lambda nm, of=column, mean=mean, power=power: (
+                        (np.interp(nm, WAVELENGTH_NM, of) - mean) ** power
+                    )
+                )
+                / total
+            )
     made = np.array(moments(band)).ravel()
+    nodes_px, shares = made[4:8], made[8:]
     if case == "a line":  # a narrow one has no width, that of the quadrature 2 nm
-        np.testing.assert_allclose(made[[0, 2]], np.array(wanted)[[0, 2]], rtol=2e-3)
-        assert made[[1, 3]].tolist() == [0, 0]
-    else:
-        np.testing.assert_allclose(made, wanted, rtol=2e-3)
+        np.testing.assert_allclose(made[:2], wanted[::2], rtol=2e-3)
+        assert made[2:4].tolist() == [0, 0]
+        assert (nodes_px @ shares, shares.sum()) == (0, 1)
+        return
+    np.testing.assert_allclose(made[:4], wanted[::2] + wanted[1::2], rtol=2e-3)
+    # The quadrature of the lateral shifts: its moments up to the seventh are the light's.
+    found = [shares.sum(), shares @ nodes_px, np.sqrt(shares @ nodes_px**2)]
+    np.testing.assert_allclose(found, [1, 0, wanted[3]], rtol=2e-3, atol=1e-4)
+    for power, moment in moments_px.items():
+        scale = made[3] ** power
+        assert shares @ nodes_px**power == pytest.approx(moment, rel=0.01, abs=0.01 * scale)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -133,7 +151,7 @@ def test_chromatic_images_match_the_integral_over_wavelength(case: str) -> None:
     image = np.zeros((48, 64))
     render(
         image,
-        light(place, np.reshape(moments(band), (1, 4))),
+        light(place, np.reshape(moments(band), (1, -1))),
         lens,
         STILL,
         AT_CENTER,
@@ -147,6 +165,67 @@ def test_chromatic_images_match_the_integral_over_wavelength(case: str) -> None:
     np.testing.assert_allclose(mean, ray_mean, rtol=0, atol=2e-3)
     assert square == pytest.approx(ray_square + 2 * (0.7**2 + 1 / 12), rel=0.01)
     assert square > 1.02 * 2 * (0.7**2 + 1 / 12)
+
+
+@pytest.mark.parametrize("case", ["a blue star", "a red star", "a white LED", "a blue LED"])
+@pytest.mark.parametrize("psf", ["gaussian", "coma"])
+def test_lateral_color_spreads_an_image_as_its_wavelengths_do(case: str, psf: str) -> None:
+    """Each pixel, and the centroid within an aperture, against one image for every nanometer."""
+    moments, spectrum, _ = CASES[case]
+    lateral = {key: CHROMATIC[key] for key in ("wavelength", "corner_px")}
+    shape = {"kind": "gaussian", "sigma_px": 0.7} | (
+        {"coma_px": 1.5} if psf == "coma" else {}
+    )
+    config = camera(chromatic=lateral, psf=shape, width_px=640, height_px=480)
+    lens = Optics.from_camera(config)
+    band = Band.from_camera(config)
+    place_px = np.array([530.0, 360.0])
+    toward = np.append((place_px - config.center_px) / config.focal_px, 1.0)
+    place = np.append(toward / np.linalg.norm(toward), 0.0)
+
+    def drawn(chromatic: Any) -> Floats:
+        image = np.zeros((480, 640))
+        render(
+            image,
+            light(place, np.atleast_2d(chromatic)),
+            lens,
+            STILL,
+            AT_CENTER,
+            Window(0.0, 0.1),
+        )
+        return image[348:373, 518:543] / image.sum()
+
+    image = drawn(moments(band))
+    nm = np.arange(380.5, 1100)
+    share = spectrum(nm * 1e-9).ravel() * band.response_at(nm * 1e-9)
+    corner_px = np.interp(nm, WAVELENGTH_NM, CORNER_PX)
+    wanted = (
+        sum(
+            share[corner_px == one].sum() * drawn([0, one, *np.eye(10)[6]])
+            for one in np.unique(corner_px[share > 0])
+        )
+        / share.sum()
+    )
+    np.testing.assert_allclose(image, wanted, rtol=0, atol=1e-3 * wanted.max())
+    y, x = np.mgrid[-12:13, -12:13]
+    along = (x * toward[0] + y * toward[1]) / np.hypot(*toward[:2])
+
+    def centroid_px(one: Floats, radius_px: float) -> float:
+        inside = np.hypot(x, y) < radius_px
+        return float((one * along)[inside].sum() / one[inside].sum())
+
+    for radius_px in (1.5, 2.5, 10.0):
+        assert centroid_px(image, radius_px) == pytest.approx(
+            centroid_px(wanted, radius_px), abs=2e-4
+        )
+    # A symmetric image of this width has its peak at its center of light.
+    center_px = centroid_px(image, 10.0)
+    third = (image * (along - center_px) ** 3).sum() / image.sum()
+    if psf == "gaussian":
+        mean_px = share @ corner_px / share.sum()
+        scale = np.hypot(*(place_px - config.center_px)) / config.corner_px
+        skew = share @ ((corner_px - mean_px) * scale) ** 3 / share.sum()
+        assert third == pytest.approx(skew, rel=0.02, abs=3e-4)
 
 
 def chip_points(
@@ -226,11 +305,9 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
     sources = lab.camera.sources
     config = lab.scene.camera
     assert sources.chromatic is not None
-    assert sources.chromatic.shape == (len(sources), 4)
-    assert np.all(
-        (sources.chromatic[:, [0, 2]] > 0) & (sources.chromatic[:, [0, 2]] < [40e-6, 1])
-    )
-    spread = np.ptp(sources.chromatic[:, 2])
+    assert sources.chromatic.shape == (len(sources), 12)
+    assert np.all((sources.chromatic[:, :2] > 0) & (sources.chromatic[:, :2] < [40e-6, 1]))
+    spread = np.ptp(sources.chromatic[:, 1])
     assert (spread > 0.01) == (scene == "shefex2" or "light.led.color_scatter" in keys)
     toward = Rotation.align_vectors([[0, 0, 1]], sources.place[:1, :3])[0]
     pose = Poses(
@@ -244,7 +321,7 @@ def test_every_light_of_a_scene_has_its_color(scene: str, keys: dict[str, str]) 
         for one in (first, gray)
     )
     np.testing.assert_allclose(
-        seen, nominal * (1 + first.chromatic[0, 2] / config.corner_px), rtol=1e-9, atol=1e-9
+        seen, nominal * (1 + first.chromatic[0, 1] / config.corner_px), rtol=1e-9, atol=1e-9
     )
 
 
@@ -256,8 +333,8 @@ def test_bodies_and_satellites_have_their_colors() -> None:
         lab.camera.lights, expected_exposure(lab.camera, lab.start, np.zeros(3), 0.0)
     ).discs
     lights = {body.name: points_of(body, np.zeros((2, 2))).chromatic for body in bodies}
-    assert lights["mars"][1, 2] > lights["sun"][1, 2] + 0.02
-    assert lights["uranus"][1, 2] < lights["sun"][1, 2] - 0.02
+    assert lights["mars"][1, 1] > lights["sun"][1, 1] + 0.02
+    assert lights["uranus"][1, 1] < lights["sun"][1, 1] - 0.02
     path = np.array([0.0, 0, 1]), np.zeros((2, 3))
     satellite = as_sources(
         [moving_light(1, "one", 3.0, path, (500.0, 90.0, 1.0))], lab.camera.band

@@ -122,13 +122,11 @@ def test_the_blur_is_the_cone_s_section_at_the_chip() -> None:
 
 
 def test_the_field_blur_grows_from_the_center_to_the_far_corner() -> None:
-    lens = camera(principal_point_px=[500.0, 700.0])
-    psf = GaussianPsfConfig(corner_sigma_px=1.5)
+    psf = {"kind": "gaussian", "corner_sigma_px": 1.5}
+    lens = camera(principal_point_px=[500.0, 700.0], psf=psf)
     corner = np.array([1599.5, -0.5])  # the farthest of the four
     at = np.array([[500.0, 700.0], (corner + np.array([500, 700])) / 2, corner])
-    np.testing.assert_allclose(
-        field_sigma_px(psf, lens, at), [0, 0.75, 1.5], rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(field_sigma_px(lens, at), [0, 0.75, 1.5], rtol=0, atol=1e-12)
 
 
 # --- transfer functions ---

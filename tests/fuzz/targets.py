@@ -42,6 +42,7 @@ from skysim.results.files import recording
 from skysim.results.files.parts import read_prices
 from skysim.results.report import Column, Table, print_table
 from skysim.scene import loader, opencv_calibration
+from skysim.scene.sections.camera import read_columns
 from skysim.simulation.flight import open_flight
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
@@ -138,7 +139,7 @@ def calibrations(data: bytes) -> None:
 
 
 def tables(data: bytes) -> None:
-    """CSV tables: LEDs, points of a dome, attitudes, exposures, a curve over wavelength, a PSF, prices."""
+    """CSV tables: LEDs, points of a dome, attitudes, exposures, a curve over wavelength, a PSF, prices, a lens."""
     path = write_file(data, "table.csv")
     rejects(lambda: survey_procedure.read_attitudes(path), InputError)
     rejects(lambda: read_settings(path), InputError)
@@ -154,6 +155,7 @@ def tables(data: bytes) -> None:
         )
     rejects(lambda: otf.read_cells.__wrapped__(str(path)), InputError)
     rejects(lambda: read_prices(path), InputError)
+    rejects(lambda: read_columns(str(path)), InputError)
 
 
 def vehicles(data: bytes) -> None:

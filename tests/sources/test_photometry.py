@@ -560,7 +560,7 @@ def test_a_lens_that_blocks_all_light_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("value", "message"),
-    [("gone.csv", "no file 'gone.csv'; allowed: "), ("1.5", "less than")],
+    [("gone.csv", "'gone.csv' is not a file; allowed: "), ("1.5", "less than")],
 )
 def test_a_transmission_is_a_number_or_a_file(value: str, message: str) -> None:
     with pytest.raises(InputError, match=f"^camera.transmission: .*{message}"):

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import erfc
 
-from skysim.camera.optics import Optics, radial, tangential
+from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.types import Floats, frozen, normalized
-from skysim.scene.sections.camera import CameraConfig
+from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
     Glow,

@@ -39,7 +39,7 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> Optics:
     Its field contains every light whose ghost reaches the chip.
     """
     blur = DiskPsfConfig(kind="disk", radius_px=ghost.radius_px, sigma_px=BLUR_PX)
-    camera = optics.camera.with_values(psf=blur)
+    camera = optics.camera.with_values(psf=blur, lens_table=None)
     reach = (1 + ghost.radius_px / camera.corner_px) / abs(ghost.magnification)
     field_rad = math.atan(math.tan(optics.field_rad) * reach)
     collecting_m2 = optics.collecting_m2 * ghost.share

@@ -60,6 +60,8 @@ class Kernels(NamedTuple):
         (N, 15) fields of `ellipse.EllipseDisk`; zeros for other kinds
     bessel
         The table for `ellipse.jinc`; empty without ellipses
+    parts
+        (N, K, 3) spots of which an image is made by lateral color: shares of the light, and displacements in px
     """
 
     kind: Ints
@@ -70,6 +72,7 @@ class Kernels(NamedTuple):
     tables: Singles
     disk: Floats
     bessel: Singles
+    parts: Floats
 
 
 class KernelCache(NamedTuple):
@@ -133,6 +136,8 @@ def source_kernels(
     3. Look each source's kernel up by its rounded sizes; make those that are missing.
     4. Widen the exact Gaussians, which are not rounded, by the blurs of each source.
 
+    Lateral color makes several spots along the radius of each image, by the quadrature of its light.
+
     Parameters
     ----------
     xy_px
@@ -149,18 +154,18 @@ def source_kernels(
     """
     camera = optics.camera
     chromatic = sources.chromatic
+    if chromatic is None:
+        # No shift, and one node that has all of the light.
+        chromatic = np.eye(1, 6, 5).repeat(len(sources), 0)
     is_led = sources.place[:, 3] > 0
     # 1. Gaussian blurs add in squares.
     position = np.where(np.isnan(xy_px), camera.center_px, xy_px)
-    sigma = np.hypot(field_sigma_px(camera.psf, camera, position), optics.blur_px)
-    shift_m: Floats | float = 0.0
-    if chromatic is not None:
-        sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic, position))
-        shift_m = chromatic[:, 0]
+    sigma = np.hypot(field_sigma_px(camera, position), optics.blur_px)
+    sigma = np.hypot(sigma, chromatic_sigma_px(camera, chromatic))
     emitter = np.where(is_led, sources.radius_m / distance_m, 0.0) * camera.focal_px
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
-    defocus = blur_radius_px(camera, axial_m, shift_m)
+    defocus = blur_radius_px(camera, axial_m, chromatic[:, 0])
     size = np.array([camera.width_px, camera.height_px])
     outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
     # Sources far outside the frame have no image.
@@ -174,18 +179,21 @@ def source_kernels(
     # 2. Ellipses.
     disk = ellipses(keys, camera, disks, axes_px, sizes)
     # 3. Gaussians need no shared table, so all have the key of sharp points.
+    coma_px = camera.along_radius("coma_um", camera.psf.coma_px, position)
     gaussian = camera.psf.kind == "gaussian" and not (
-        camera.detector.intrapixel or camera.psf.coma_px
+        camera.detector.intrapixel or coma_px.any()
     )
     if gaussian:
         keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
-    if camera.psf.coma_px:
-        coma_px = camera.psf.coma_px * (position - camera.center_px) / camera.corner_px
+    if coma_px.any():
         coma_px[disk.any(axis=1)] = 0
         keys = np.column_stack([keys, np.rint(coma_px / COMA_PX).astype(np.int64)])
-    kernels = look_up(camera, keys, disk)
+    nodes_px, shares = np.split(chromatic[:, 4:, None], 2, axis=1)
+    spots_px = camera.along_radius("lateral", nodes_px, position[:, None])
+    parts = np.concatenate([shares, spots_px], axis=2)
+    kernels = look_up(camera, keys, disk, parts)
     # 4. Widening.
-    if gaussian and (optics.blur_px or camera.psf.corner_sigma_px or chromatic is not None):
+    if gaussian and sigma.any():
         kernels = widened(kernels, sizes.sigma_px)
     return kernels
 
@@ -228,12 +236,11 @@ def ellipses(
     return disk
 
 
-def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
-    """The kernels of N keys (N, 3 or 5) in the camera's cache, with the ellipses `disk`; makes the missing ones."""
+def look_up(camera: CameraConfig, keys: Ints, disk: Floats, parts: Floats) -> Kernels:
+    """The kernels of N keys (N, 3 or 5) in the camera's cache, with ellipses and parts; makes the missing ones."""
     cache = kernel_cache(camera)
     # Sizes pack into integers, which sort faster than rows; those with coma do not.
-    has_coma = keys.shape[1] > len(PACKING)
-    codes = keys if has_coma else keys @ PACKING
+    codes = keys if keys.shape[1] > len(PACKING) else keys @ PACKING
     # Stars in focus share one key, which saves the sort.
     first = np.zeros(1, int)
     inverse = np.zeros(len(codes), int)
@@ -244,11 +251,20 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats) -> Kernels:
     # Contiguous: columns of a table would be another array type, for which the renderer is compiled once more.
     properties = np.array([cache.kernels[key] for key in used]).reshape(-1, 8)[inverse]
     kind, sigma, reach, sharp = np.ascontiguousarray(properties[:, :4].T)
+    reach += np.abs(parts[..., 1:]).max((1, 2))
     spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
     bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
     return Kernels(
-        kind.astype(np.int64), sigma, reach, sharp, spans, cache.tables[0], disk, bessel
+        kind.astype(np.int64),
+        sigma,
+        reach,
+        sharp,
+        spans,
+        cache.tables[0],
+        disk,
+        bessel,
+        parts,
     )
 
 

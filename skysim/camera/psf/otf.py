@@ -26,7 +26,6 @@ from skysim.scene.sections.camera import (
     GaussianPsfConfig,
     MeasuredPsfConfig,
     MoffatPsfConfig,
-    Psf,
 )
 
 Otf = NDArray  # real, or complex where the PSF is not symmetric
@@ -58,26 +57,23 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
     return diameter_m / (2 * camera.pixel_m)
 
 
-def field_sigma_px(psf: Psf, camera: CameraConfig, xy_px: Floats) -> Floats:
-    """(...,) sigma of the field's blur at pixels (..., 2): proportional to the distance from the principal point.
-
-    It is psf.corner_sigma_px at the farthest corner.
-    """
-    radius_px = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1)
-    return psf.corner_sigma_px * radius_px / camera.corner_px
+def field_sigma_px(camera: CameraConfig, xy_px: Floats) -> Floats:
+    """(...,) sigma of the field's blur at pixels (..., 2): psf.corner_sigma_px at the farthest corner, or a table's."""
+    return np.linalg.norm(
+        camera.along_radius("sigma_um", camera.psf.corner_sigma_px, xy_px), axis=-1
+    )
 
 
-def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -> Floats:
-    """(N,) sigma of the blur by the colors within each light, at (N, 2) pixels.
+def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats) -> Floats:
+    """(N,) sigma of the blur by the axial color of the wavelengths within each light.
 
     A wavelength whose focus is shifted by d has a defocus disk of radius k d and variance k^2 d^2 / 4 along each axis.
-    The disk of the mean shift is drawn as such, so a Gaussian of variance k^2 var(d) / 4 is added here. Lateral color
-    smears along the radius of the field; half of its variance goes to each axis.
+    The disk of the mean shift is drawn as such, so a Gaussian of variance k^2 var(d) / 4 is added here.
 
     Parameters
     ----------
     chromatic
-        (N, 4) as in `Sources`
+        (N, 4 + 2 K) as in `Sources`
     """
     # k: the defocus disk's radius in pixels per shift of focus in m.
     scale_px_m = (
@@ -85,8 +81,7 @@ def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats, xy_px: Floats) -
         * camera.image_distance_m
         / (2 * camera.pixel_m * camera.focal_length_m**2)
     )
-    radius = np.linalg.norm(xy_px - np.array(camera.center_px), axis=-1) / camera.corner_px
-    return np.hypot(scale_px_m * chromatic[:, 1] / 2, radius * chromatic[:, 3] / math.sqrt(2))
+    return scale_px_m * chromatic[:, 2] / 2
 
 
 def blur(sigma_px: float, fx: Floats, fy: Floats) -> Floats:

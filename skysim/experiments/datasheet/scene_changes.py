@@ -64,11 +64,12 @@ def causes(scene: Scene) -> Changes:
         reference = {"kind": "steady", "temperature_c": scene.thermal.reference_c}
         changes["the temperature held"] = {"thermal.temperature": reference}
     die_m = scene.dome.led.die_m if scene.dome else ()
-    built: dict[str, tuple[str, Sequence[float], Any]] = {
+    built: dict[str, tuple[str, Sequence[Any], Any]] = {
         "the pupil fixed": ("camera.pupil_walk", camera.pupil_walk_m, 2 * ["0 mm"]),
         "dies centered": ("light.led.die", die_m, 3 * ["0 mm"]),
         "no sag": ("vehicle.sag_arcsec", scene.vehicle.sag_arcsec, [0, 0]),
         "a round ball": ("vehicle.runout", scene.vehicle.runout_m, 3 * ["0 mm"]),
+        "no lens errors": ("camera.lens_table", [camera.lens_table], None),
         "no coma": ("camera.psf.coma_px", [camera.psf.coma_px], 0),
         "even pixels": ("camera.detector.intrapixel", [chip.intrapixel], 0),
         "straight edges": ("camera.detector.edge_px", [chip.edge_px], 0),

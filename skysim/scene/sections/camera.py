@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -12,8 +13,9 @@ from pydantic import (
     Tag,
 )
 
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, check_name, unknown_name
 from skysim.core.paths import DATA
+from skysim.core.types import Floats
 from skysim.core.units import (
     BY_KIND,
     AboveZero,
@@ -34,6 +36,7 @@ from skysim.core.units import (
     check_table,
     quantity,
 )
+from skysim.core.yaml_reader import MAX_BYTES, ExistingFile, read_limited
 from skysim.scene.opencv_calibration import OpencvCalibration
 
 # Type in the JSON schema, which editors show.
@@ -55,6 +58,12 @@ Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
 Distortion = tuple[Radial, Radial, Tangential, Tangential, Radial]
+
+
+def radial(distortion: tuple[float, ...], r2: Floats) -> Floats:
+    """Radial distortion factor 1 + k1 r^2 + k2 r^4 + k3 r^6 from k1, k2, p1, p2, k3 (OpenCV's order)."""
+    k1, k2, _, _, k3 = distortion
+    return 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
 
 
 def focus_distance(value: Any) -> float:
@@ -168,6 +177,53 @@ class ChromaticConfig(ConfigModel):
             raise InputError(
                 "", "nothing depends on the wavelength", "focus or corner_px other than 0"
             )
+
+
+Column = Several[Annotated[Number, Field(ge=-100, le=100)]] | None
+
+
+class LensTableConfig(ConfigModel):
+    """Errors of the lens against the field angle, from a lens program: linear between the rows, constant beyond them.
+
+    Attributes
+    ----------
+    field_deg
+        Ascending field angles
+    coma_um
+        Seidel's sagittal coma on the detector, instead of psf.coma_px; positive if the flare points outward
+    sigma_um
+        Standard deviation of a blur (astigmatism, field curvature), instead of psf.corner_sigma_px
+    lateral
+        Lateral color over that of chromatic.corner_px
+    """
+
+    field_deg: Several[Annotated[Number, Field(ge=0, le=89)]]
+    coma_um: Column = None
+    sigma_um: Column = None
+    lateral: Column = None
+
+    def check(self) -> None:
+        for name, column in self:
+            if column:
+                check_table(self.field_deg, column, name, "field_deg")
+
+
+def read_columns(value: Any) -> Any:
+    """The columns of a lens's table by name: of a CSV or ECSV file, or `value` itself if it is no name of a file."""
+    if not isinstance(value, str):
+        return value
+    try:
+        content = read_limited(Path(value), MAX_BYTES, "utf-8-sig").replace(",", " ")
+        # Neither comments nor empty lines.
+        names, *rows = [line.split() for line in content.splitlines() if line[:1] not in "#"]
+        for name in names:
+            check_name("", "column", name, LensTableConfig.model_fields)
+        columns = np.array(rows, float).T.tolist()
+        return dict(zip(names, columns, strict=True))
+    except ValueError as error:
+        raise InputError(
+            "", f"{value}: {error}", "a line of names, then rows of numbers"
+        ) from None
 
 
 class GhostConfig(ConfigModel):
@@ -331,20 +387,8 @@ def transmission_tag(value: Any) -> str:
     return "curve" if isinstance(value, str) and value.endswith(".csv") else "number"
 
 
-def curve_exists(value: str) -> str:
-    """The path of a curve. Raises InputError if there is no such file."""
-    if not Path(value).is_file():
-        raise InputError(
-            "",
-            f"no file {value!r}",
-            "a CSV file of wavelength_nm and response, or a number to 1",
-        )
-    return value
-
-
 Transmission = Annotated[
-    Annotated[PositiveFraction, Tag("number")]
-    | Annotated[Annotated[str, AfterValidator(curve_exists)], Tag("curve")],
+    Annotated[PositiveFraction, Tag("number")] | Annotated[ExistingFile, Tag("curve")],
     Discriminator(transmission_tag),
 ]
 
@@ -476,6 +520,8 @@ class CameraConfig(ConfigModel):
     transmission
         Transmission of the lens: one number for all wavelengths, or a CSV file of wavelength_nm and transmission, which
         is 0 beyond its ends
+    lens_table
+        Errors of the lens against the field angle: a CSV or ECSV file, or its columns
     pupil_walk
         Displacement z = a tan^2 t + b tan^4 t of the entrance pupil along the boresight for light at the field angle t;
         only near lights (LEDs) are displaced
@@ -506,6 +552,13 @@ class CameraConfig(ConfigModel):
     pupil_walk_m: tuple[Walk, Walk] = (0.0, 0.0)
     psf: Psf = GaussianPsfConfig()
     chromatic: ChromaticConfig | None = None
+    lens_table: (
+        Annotated[
+            LensTableConfig,
+            BeforeValidator(read_columns, json_schema_input_type=LensTableConfig | str),
+        ]
+        | None
+    ) = None
     ghosts: tuple[GhostConfig, ...] = ()
     glare: GlareConfig | None = None
     baffle: BaffleConfig | None = None
@@ -518,6 +571,38 @@ class CameraConfig(ConfigModel):
                 "focus",
                 f"{self.focus_m:g} m is less than twice the focal length {self.focal_length_m:g} m",
             )
+        table = self.lens_table
+        if table and (
+            (table.coma_um and self.psf.coma_px)
+            or (table.sigma_um and self.psf.corner_sigma_px)
+            or (table.lateral and not self.chromatic)
+        ):
+            raise InputError(
+                "lens_table",
+                "columns that conflict with keys of camera",
+                "coma_um or psf.coma_px, sigma_um or psf.corner_sigma_px, lateral with chromatic",
+            )
+
+    def along_radius(self, column: str, corner: Any, xy_px: Floats) -> Floats:
+        """Displacements (..., 2) in px along the field's radius at xy_px (..., 2), by an error of the lens.
+
+        They grow with the radius, to `corner` px at the farthest corner. A column of the lens's table gives them
+        instead; `lateral` is relative to `corner`.
+        """
+        from_center_px = xy_px - self.center_px
+        table = self.lens_table
+        if table is None or not (values := getattr(table, column)):
+            return corner * from_center_px / self.corner_px
+        # The image's radius at the table's angles, with radial distortion up to its fold.
+        tangent = np.tan(np.radians(table.field_deg))
+        knots_px = self.focal_px * np.maximum.accumulate(
+            tangent * radial(self.distortion, tangent**2)
+        )
+        # Not zero: on the axis blur has no direction.
+        from_center_px += 1e-12
+        radius_px = np.linalg.norm(from_center_px, axis=-1, keepdims=True)
+        unit_px = corner if column == "lateral" else 1e-6 / self.pixel_m
+        return unit_px * np.interp(radius_px, knots_px, values) * from_center_px / radius_px
 
     @property
     def pupil_m(self) -> float:

@@ -264,11 +264,14 @@ def lens_blur(
 ) -> tuple[Floats, Floats]:
     """(n,) variances of the lens's images at xy_px, in px^2, and (n,) radii of the defocus disks in px."""
     camera = model.optics.camera
-    lens2_px2 = model.lens_px**2 + field_sigma_px(camera.psf, camera, xy_px) ** 2
+    lens2_px2 = model.lens_px**2 + field_sigma_px(camera, xy_px) ** 2
     shift_m: Floats | float = 0.0
     if points.chromatic is not None:
         shift_m = points.chromatic[:, 0]
-        lens2_px2 = lens2_px2 + chromatic_sigma_px(camera, points.chromatic, xy_px) ** 2
+        # Lateral color spreads along the radius: half of its variance is on each axis.
+        spread_px = camera.along_radius("lateral", points.chromatic[:, 3:4], xy_px)
+        lens2_px2 += chromatic_sigma_px(camera, points.chromatic) ** 2
+        lens2_px2 += np.sum(spread_px**2, axis=-1) / 2
     return lens2_px2, blur_radius_px(camera, depth_m, shift_m)
 
 

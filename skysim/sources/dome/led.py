@@ -155,7 +155,7 @@ def peaks_m(led: LedConfig, normal: Floats) -> tuple[Floats, Floats]:
 
 
 def chromatic_of(led: LedConfig, band: Band, normal: Floats) -> Floats | None:
-    """(N, 4) `Sources.chromatic` of LEDs with the numbers of `color_factors`; None for a lens without aberration."""
+    """`Sources.chromatic` of LEDs with the numbers of `color_factors`; None for a lens without aberration."""
     if band.chromatic is None:
         return None
     if not led.color_scatter_m:

@@ -23,7 +23,7 @@ from skysim.sources.dome.led import (
     strength_factors,
 )
 from skysim.sources.dome.surface import Surface, directions, unit_vectors
-from skysim.sources.photometry import Band
+from skysim.sources.photometry import NODES, Band
 
 
 class PlacedLeds(NamedTuple):
@@ -79,7 +79,7 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: Generator) 
             strength[rows] *= color_factors(one, band, color[rows])
     if led.aging:
         strength = strength * aging_factors(led.aging, rng.standard_normal(count))
-    chromatic = np.empty((count, 4))
+    chromatic = np.empty((count, 4 + 2 * NODES))
     if band.chromatic is not None:
         for one, rows in types:
             chromatic[rows] = chromatic_of(one, band, color[rows])
