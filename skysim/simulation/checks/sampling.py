@@ -125,9 +125,8 @@ def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View
     found = view(lit, exposure, context.camera, beam.before(lit))
     row = context.rows_of(lit.points.id[found.row])
     known = row >= 0
-    return View(found.lab_from_cam, row, *found[2:]).take(known), broken(found, context)[
-        known
-    ]
+    named = View(*found[:2], row, *found[3:])
+    return named.take(known), broken(found, context)[known]
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:
