@@ -65,7 +65,7 @@ def causes(scene: Scene) -> Changes:
         "no dispersion by the air": {"light.air.dispersion": False},
     }
     for name, change in better.items():
-        if any(differs(scene, key.split(".")) for key in change):
+        if any(differs(scene, key) for key in change):
             changes[name] = change
     fainter_mag = scene.tracker.limit_mag + 0.5
     if fainter_mag <= catalog_end_mag(scene):

@@ -347,7 +347,7 @@ def misshapen_px(view: View, context: Context) -> Floats | None:
     coma = camera.psf.coma_px / camera.corner_px * (at - camera.center_px @ COMPLEX)
     rays = place[:, None] + coma[:, None] * RAYS
     # The deviation with the peak of the image: erf(1 / (2 sqrt 2 lens))^2 is the share of the middle pixel.
-    root_share = 1 / (math.sqrt(2 * np.pi) * view.sigma_px)
+    root_share = gauss(0.0) / view.sigma_px
     lens_px = 0.5 / special.ndtri((1 + root_share) / 2)[:, None, None]
     columns, rows = (
         np.diff(special.ndtr((EDGES_PX - part[..., None]) / lens_px))
@@ -418,7 +418,7 @@ def image_shape(length_key: int, radius_key: int) -> tuple[Floats, ...]:
     return grid, along @ across, slope @ across, along @ (-dv.T * across)
 
 
-def gauss(x: Floats) -> Floats:
+def gauss(x: Floats | float) -> Floats:
     """The normal density."""
     return np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
 

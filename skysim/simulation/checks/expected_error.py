@@ -57,6 +57,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import lateral_color
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
+from skysim.scene.unused import differs
 from skysim.simulation.checks.detection import Context, centroid_variance, misshapen_px
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.atmosphere import AirEffects
@@ -88,6 +89,14 @@ def mean_root(variance_rad2: Floats) -> float:
 
 
 AS_BUILT = "hardware as built"
+AS_BUILT_KEYS = (
+    "thermal",
+    "vehicle.sag_arcsec",
+    "vehicle.runout",
+    "light.led.die",
+    "camera.pupil_walk",
+    "camera.detector.edge_px",
+)
 
 # Causes of the attitude error. Each returns None if the scene does not have it, else the displacements (n, 2, k) of the
 # image positions in px by k errors of unit variance that all lights share. Errors of surveyed LEDs are independent:
@@ -257,10 +266,7 @@ def rolling_shutter(view: View, context: Context) -> Floats | None:
 def as_built(view: View, context: Context) -> Floats | None:
     """Images minus those of the surveyed hardware: temperature, sag, run-out, dies, pupil of the lens, chip's edge."""
     scene = context.scene
-    camera = scene.camera
-    die_m = scene.dome.led.die_m if scene.dome else ()
-    shifts = (*camera.pupil_walk_m, *die_m, camera.detector.edge_px)
-    if not (scene.thermal or scene.vehicle.is_bent or any(shifts)):
+    if not any(differs(scene, key) for key in AS_BUILT_KEYS):
         return None
     mount = context.camera.mount
     place = context.beliefs.lights.place[view.row]
@@ -268,7 +274,7 @@ def as_built(view: View, context: Context) -> Floats | None:
     surveyed_px = context.camera.optics.project(surveyed_m)
     chromatic = context.beliefs.lights.chromatic
     if chromatic is not None:
-        surveyed_px = lateral_color(camera, surveyed_px, chromatic[view.row])
+        surveyed_px = lateral_color(scene.camera, surveyed_px, chromatic[view.row])
     return (view.xy_px - surveyed_px)[:, :, None]
 
 
