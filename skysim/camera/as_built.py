@@ -103,23 +103,27 @@ def mount_at(vehicle: VehicleConfig, mount: Mount, lab_from_body: Rotation) -> M
     """The camera's mount at an attitude, at which gravity bends it and the bearing's ball displaces it.
 
     1. Gravity across the boresight b bends the bracket, with compliances k about the camera's axes in angle per g: the
-       camera turns by k (b x (d - d_0)), d the down direction in its axes and d_0 that of a level vehicle, at which it
-       was aligned.
+       camera turns by w = k (b x (d - d_0)), d the down direction in its axes and d_0 that of a level vehicle, at which
+       it was aligned. The pupil, which is mast_m b from where the bracket bends, moves by w x mast_m b.
     2. A ball has the radius R + sum q_i u_i^2 in the direction u of the body. Around its lowest point, which is in the
        direction d, the surface is a sphere about c = 2 q d - (d . q d) d (elementwise products q d): it has the radius
        there and its slope. A small cup holds this sphere, so the body moves by -c, minus its place when level (a cup of
        half-angle 45 deg moves it across by 0.8 of that).
     """
-    # 1. Sag. Directions in the camera's axes turn the other way.
+    # 1. Sag.
     down_body = lab_from_body.inv().apply(-UP)
     down_cam = mount.cam_from_body.apply(down_body + UP)
     compliance_rad = ARCSEC_RAD * np.array([*vehicle.sag_arcsec, 0.0])
-    cam_from_aligned = Rotation.from_rotvec(compliance_rad * np.cross(down_cam, BORESIGHT))
+    turned_rad = compliance_rad * np.cross(BORESIGHT, down_cam)
+    swung_m = np.cross(turned_rad, vehicle.mast_m * BORESIGHT)
+    pupil_m = mount.camera_body_m + mount.cam_from_body.inv().apply(swung_m)
     # 2. Run-out. A level body is higher by q_z.
     deviation_m = np.array(vehicle.runout_m) * down_body
     lift_m = down_body @ deviation_m + vehicle.runout_m[2]
     moved_m = lift_m * down_body - 2 * deviation_m
-    return Mount(mount.camera_body_m + moved_m, cam_from_aligned * mount.cam_from_body)
+    # Lights turn the other way.
+    cam_from_aligned = Rotation.from_rotvec(-turned_rad)
+    return Mount(pupil_m + moved_m, cam_from_aligned * mount.cam_from_body)
 
 
 def off_center(leds: Sources, die_m: Floats) -> Sources:

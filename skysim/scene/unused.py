@@ -93,7 +93,7 @@ def find(
     for key in keys:
         for rule in rules:
             section = section_of(key, rule)
-            if section and differs(model, section.split(".")) and rule.applies(*arguments):
+            if section and differs(model, section) and rule.applies(*arguments):
                 return key, rule
     return None
 
@@ -109,8 +109,9 @@ def section_of(key: str, rule: Rule) -> str:
     return next((name for name in rule.keys if key == name or key.startswith(f"{name}.")), "")
 
 
-def differs(model: Any, path: list[str]) -> bool:
-    """Whether the model has a value at a path of YAML keys that is not the default of its field."""
+def differs(model: Any, dotted: str) -> bool:
+    """Whether the model has a value at a dotted key of YAML that is not the default of its field."""
+    path = dotted.split(".")
     for depth, key in enumerate(path):
         name = field_names(type(model)).get(key) if isinstance(model, ConfigModel) else None
         if name is None:

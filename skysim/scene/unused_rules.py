@@ -483,6 +483,12 @@ RULES = (
         "vehicle.disturbances.earth_rotation, or a vehicle.imu whose earth_rate is not none",
     ),
     Rule(
+        ("vehicle.mast",),
+        lambda scene: not any(scene.vehicle.sag_arcsec),
+        "nothing bends",
+        "vehicle.sag_arcsec",
+    ),
+    Rule(
         ("camera.pupil_walk",),
         without_dome,
         "light from infinity passes any place of the pupil alike",

@@ -200,6 +200,25 @@ def test_a_camera_on_top_leans_further_over() -> None:
     assert lean_arcsec == pytest.approx(30 * np.sin(leans_rad[0]), rel=1e-3)
 
 
+def test_a_mast_turns_about_where_it_bends() -> None:
+    """Its foot stays; the pupil on top sinks toward the low side by compliance times sine of the tilt times length."""
+    mount = Mount(np.array([0.1, -0.2, 0.9]), Rotation.from_euler("zx", [0.7, 0.2]))
+    up = np.array([0.0, 0.0, 1.0])
+    bent = mount_at(vehicle(sag_arcsec=(90.0, 60.0), mast="0.4 m"), mount, TURNED)
+    feet = [
+        one.camera_body_m - one.cam_from_body.inv().apply(0.4 * up) for one in (mount, bent)
+    ]
+    moved_m = bent.camera_body_m - mount.camera_body_m
+    assert np.linalg.norm(moved_m) > 1e-5
+    np.testing.assert_allclose(feet[1], feet[0], atol=1e-3 * np.linalg.norm(moved_m))
+    level = Mount(mount.camera_body_m, Rotation.from_euler("z", 0.7))
+    round_ = vehicle(sag_arcsec=(90.0, 90.0), mast="0.4 m")
+    sunk_m = mount_at(round_, level, TURNED).camera_body_m - level.camera_body_m
+    down = TURNED.inv().apply([0, 0, -1.0])
+    expected_m = 0.4 * 90 * ARCSEC_RAD * np.array([down[0], down[1], 0])
+    np.testing.assert_allclose(sunk_m, expected_m, rtol=1e-9, atol=1e-15)
+
+
 def test_compliances_are_about_the_camera_s_axes() -> None:
     """A camera that looks at the horizon when level: weight when tilted about its x axis bends it about x alone."""
     mount = Mount(np.zeros(3), Rotation.from_euler("x", 90.0, degrees=True))
@@ -393,11 +412,14 @@ def test_rendered_lights_are_where_a_pinhole_sees_them(key: str, value: str) -> 
     [
         ("light.led.die", "[0.1 mm, 0 mm, 0 mm]"),
         ("vehicle.sag_arcsec", "[90, 60]"),
+        ("vehicle.mast", "[30, 20]"),
         ("vehicle.runout", "[60 um, -40 um, 0 um]"),
     ],
 )
 def test_a_run_errs_as_check_forecasts(key: str, value: str) -> None:
-    scene = loader.load("simsat_bump", {key: value} | EXACT)
+    mast = {"vehicle.mast": "0.5 m"} if key == "vehicle.mast" else {}
+    key = "vehicle.sag_arcsec" if mast else key
+    scene = loader.load("simsat_bump", {key: value} | mast | EXACT)
     lab = build_lab(scene)
     forecast = plan_of(lab, attitudes.of_frames(lab)).frames.error
     scores = simulate(scene).scores

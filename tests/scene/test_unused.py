@@ -278,6 +278,7 @@ CASES = [
     Case(SKY, MOON, "site.latitude_deg", "-50", {**MOON, "site.longitude_deg": "20"}),
     Case(SKY, {}, "site.longitude_deg", "20", MOON),
     Case(SKY, MOON, "site.height", "9 km", {**MOON, "site.longitude_deg": "20"}),
+    Case(DOME, {}, "vehicle.mast", "0.3 m", {"vehicle.sag_arcsec": "[5, 5]"}),
     Case(SKY, {}, "camera.pupil_walk", "[10 mm, 0 mm]", {}),
     Case(SKY, WARMING, "thermal.dome_ppm_k", "70", {}),
     Case(DOME, WARMING, "thermal.anchor_height", "1 m", {"thermal.dome_ppm_k": "70"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,12 +13,17 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from estimator.centroiding.centroid import CENTROIDERS
+from estimator.centroiding.gaussian_fit import fit_all
+from estimator.detection.background import FILTERED_NOISE
 from estimator.detection.detect import DETECTORS
+from skysim.camera.detector import repel
+from skysim.camera.psf.kernel import build_kernel
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Frame, Truth
 from skysim.results import metrics
 from skysim.results.run import render_at
 from skysim.scene import loader
+from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks import (
     attitudes,
     beliefs,
@@ -42,6 +48,7 @@ from skysim.simulation.lights.light import Exposure, Lit, beam_of
 from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory
+from tests.helpers.splatting import add_kernel
 
 LEDS = 12
 # of a ring of LEDs over the bearing, the pupil, and the ring's radius
@@ -61,6 +68,7 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
     depth_m = offset_m[:, 2]
     behind = np.full(count, VISIBLE)
     return View(
+        datetime.datetime(2020, 1, 1),
         Rotation.identity(),
         row,
         xy_px,
@@ -226,6 +234,7 @@ def images(
     gradient = np.zeros((1, 2, 3))
     row = np.zeros(1, int)
     return View(
+        datetime.datetime(2020, 1, 1),
         Rotation.identity(),
         row,
         zero[:, None] + np.zeros(2),
@@ -457,6 +466,143 @@ def test_a_neighbor_moves_a_fitted_star(stars: Lab) -> None:
         np.array([1e-3]), np.array([1000.0]), np.array([500.0]), camera
     )[0]
     assert near == pytest.approx(1e-3 / 3, rel=0.02)
+
+
+# Coma, charge that repels charge, colors in the air
+
+
+SIDE_PX = 25
+
+
+def fitted_shift_px(
+    config: CameraConfig, coma_px: float, electrons: float, at: Floats
+) -> Floats:
+    """(2,) the tracker's fit minus the place of an image that the renderer draws, with its charge repelled."""
+    patch = np.zeros((SIDE_PX, SIDE_PX), np.float32)
+    kernel = build_kernel(config.psf, config, coma_px=(coma_px, 0.0) if coma_px else ())
+    add_kernel(patch, 0, SIDE_PX, 12 + at[0], 12 + at[1], electrons, kernel)
+    repel(patch, config.detector)
+    place = 12 + at
+    noise = np.full((2, 2), 15.0 * FILTERED_NOISE)
+    box = np.array([[11, 11, 13, 13]])
+    light = np.array([electrons])
+    fitted = fit_all(
+        patch.astype(float), place[None], light, box, light, 0 * noise, noise, 1.0, np.inf
+    )
+    return np.asarray(fitted[0, :2] - place)
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize(
+    ("coma_px", "per_e", "electrons"),
+    [(0.5, 0.0, 2_000.0), (1.0, 0.0, 30_000.0), (1.5, 0.0, 500.0), (0.0, 2e-6, 30_000.0)],
+)
+def test_fits_of_flares_and_of_charge_err_as_check_counts(
+    stars: Lab, sigma_px: float, coma_px: float, per_e: float, electrons: float
+) -> None:
+    """At places all over a pixel, against the renderer's image: its transfer function, and its charge."""
+    corner_px = 2 * coma_px
+    keys = {
+        "camera.psf": f"{{kind: gaussian, sigma_px: {sigma_px}, coma_px: {corner_px}}}",
+        "camera.detector.brighter_fatter_per_e": f"{per_e}",
+    }
+    scene = loader.load("shefex2", keys)
+    config = scene.camera
+    peak = build_kernel(config.psf, config).peak
+    phases = (np.arange(5) + 0.5) / 5 - 0.5
+    at = np.array([[x, y] for x in phases for y in phases])
+    # Halfway to the corner, along x.
+    half_px = np.round(config.center_px) + np.array([round(config.corner_px / 2), 0])
+    lights = images(electrons, 1 / np.sqrt(2 * np.pi * peak)).take(np.zeros(len(at), int))
+    columns = dict(zip(View._fields, lights, strict=True))
+    columns |= {"xy_px": half_px + at, "peak_e": np.full(len(at), electrons * peak)}
+    context = SimpleNamespace(
+        scene=scene,
+        settings=SimpleNamespace(centroider="default"),
+        camera=SimpleNamespace(background_e=0.0, noise_e=15.0),
+    )
+    found = detection.misshapen_px(View(**columns), context)
+    assert found is not None
+    fitted = [fitted_shift_px(config, coma_px, electrons, one) for one in at]
+    largest_px = np.abs(fitted).max()
+    np.testing.assert_allclose(found[:, :, 0], fitted, atol=0.06 * largest_px + 2e-5)
+    context.settings.centroider = "cog"
+    assert detection.misshapen_px(View(**columns), context) is None
+
+
+SLOW_TURN = {"motion.rate_deg_s": "[0.05, 0.2, 0]", "exposure.rate_hz": "0.1"}
+
+
+def paired_errors(
+    name: str, keys: dict[str, str], more: dict[str, str], count: int
+) -> tuple[Floats, Floats, dict[str, Floats]]:
+    """(N, 2) squares of cross and roll errors, of all and of what keys add frame by frame, rad^2; forecast by cause."""
+    labs = [build_lab(loader.load(name, one)) for one in (keys, keys | more)]
+    trackers = [build_tracker(lab.camera) for lab in labs]
+    frames = attitudes.of_frames(labs[1])
+    error = sampling.sampled(frames, detection.context_of(labs[1])).error
+    errors = []
+    rows = np.arange(count) % len(frames.t_s)
+    for n, row in enumerate(rows):
+        pair = []
+        for lab, tracker in zip(labs, trackers, strict=True):
+            frame, truth = render_at(
+                lab.in_run(n),
+                frames.lab_from_body[row],
+                frames.rate_body_rad_s[row],
+                float(frames.t_s[row]),
+            )
+            solution = factory.solve_frame(tracker, frame).attitude.cam_from_ref
+            assert solution is not None
+            pair.append((solution * truth.cam_from_lab.inv()).as_rotvec())
+        errors.append(pair)
+    squares = [
+        np.column_stack([(one[:, :2] ** 2).sum(axis=1), one[:, 2] ** 2])
+        for one in (np.array(errors)[:, 1], np.diff(np.array(errors), axis=1)[:, 0])
+    ]
+    forecast = {
+        cause: np.column_stack([error.rad2["cross"][cause], error.rad2["roll"][cause]])[
+            :count
+        ]
+        for cause in error.rad2["cross"]
+    }
+    return squares[0], squares[1], forecast
+
+
+@pytest.mark.slow
+def test_coma_adds_to_the_error_of_solved_frames_what_check_counts() -> None:
+    """At 40 attitudes: cross errors, and what a coma of 1 px at the corner adds frame by frame."""
+    every, added, forecast = paired_errors(
+        "shefex2", SLOW_TURN, {"camera.psf.coma_px": "1"}, 40
+    )
+    cause = forecast["coma and charge"][:, 0].mean()
+    assert np.sqrt(added[:, 0].mean() / cause) == pytest.approx(1, abs=0.25)
+    total = sum(forecast.values())[:, 0].mean()
+    assert cause > total / 2
+    assert np.sqrt(every[:, 0].mean() / total) == pytest.approx(1, abs=0.25)
+
+
+def test_colors_in_the_air_turn_solutions_as_check_counts() -> None:
+    """Frames without noise, and equal weights, so that the colors alone make the difference."""
+    keys = SLOW_TURN | {
+        "site": "{latitude_deg: 53.1, longitude_deg: 8.8, height: 10 m}",
+        "start_time": "2012-12-29T22:00:00",
+        "motion.start": "{ra_deg: 71, dec_deg: 15, roll_deg: 0}",
+        "light.occlusion": "false",
+        "light.air": "{pressure_hpa: 1000, temperature_c: 10, scintillation: false}",
+        "camera.detector.noise": "false",
+        "tracker.refraction": "true",
+        "tracker.centroid_sigma_px": "0.5",
+    }
+    _, added, forecast = paired_errors("shefex2", keys, {"light.air.dispersion": "true"}, 8)
+    expected = forecast["dispersion"]
+    assert np.sqrt(expected[:, 0].mean()) / ARCSEC_RAD > 0.1
+    np.testing.assert_allclose(np.sqrt(added[:, 0]), np.sqrt(expected[:, 0]), rtol=0.25)
+    gray = sampling.sampled(
+        attitudes.of_frames(lab := build_lab(loader.load("shefex2", keys))),
+        detection.context_of(lab),
+    )
+    assert not gray.error.rad2["cross"]["dispersion"].any()
 
 
 # A total station

@@ -1,11 +1,11 @@
 """Changes of a scene that a datasheet measures: what would lower the error, and disturbances."""
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from skysim.experiments.study.factors import Settings
 from skysim.scene.scene import BODIES_YEARS, Scene
+from skysim.scene.unused import differs
 from skysim.simulation.checks.sky_warnings import CATALOG_MARGIN_MAG
 from skysim.tracking.onboard_model import onboard_catalog
 
@@ -32,51 +32,42 @@ def causes(scene: Scene) -> Changes:
     """Changes of the scene that would lower the error; those without effect on it are left out."""
     camera = scene.camera
     chip = camera.detector
-    survey = scene.tracker.survey
     exposure = scene.exposure
     changes: Changes = {
         "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
     }
     if 2 * exposure.time_s + exposure.trigger_jitter_s <= 1 / exposure.rate_hz:
         changes["twice the exposure time"] = {"exposure.time": f"{2 * exposure.time_s} s"}
-    if chip.read_noise_e:
-        changes["half the read noise"] = {
-            "camera.detector.read_noise_e": chip.read_noise_e / 2
-        }
-    if any(getattr(chip, key) for key in FIXED_PATTERN):
-        none = {f"camera.detector.{key}": 0 for key in FIXED_PATTERN}
-        changes["no fixed pattern"] = none
-    if chip.cti_parallel or chip.cti_serial:
-        changes["no transfer loss"] = {
-            "camera.detector.cti_parallel": 0,
-            "camera.detector.cti_serial": 0,
-        }
-    if survey.lever_sigma_m:
-        changes["the lever known"] = {"tracker.survey.lever_sigma": "0 mm"}
-    if survey.led_sigma_m or survey.instrument:
-        changes["the LEDs' map known"] = {
-            "tracker.survey.led_sigma": "0 mm",
-            "tracker.survey.instrument": None,
-        }
-    if survey.focal_length_sigma_m:
-        changes["the focal length known"] = {"tracker.survey.focal_length_sigma": "0 mm"}
     if scene.thermal:
         reference = {"kind": "steady", "temperature_c": scene.thermal.reference_c}
         changes["the temperature held"] = {"thermal.temperature": reference}
-    die_m = scene.dome.led.die_m if scene.dome else ()
-    built: dict[str, tuple[str, Sequence[Any], Any]] = {
-        "the pupil fixed": ("camera.pupil_walk", camera.pupil_walk_m, 2 * ["0 mm"]),
-        "dies centered": ("light.led.die", die_m, 3 * ["0 mm"]),
-        "no sag": ("vehicle.sag_arcsec", scene.vehicle.sag_arcsec, [0, 0]),
-        "a round ball": ("vehicle.runout", scene.vehicle.runout_m, 3 * ["0 mm"]),
-        "no lens errors": ("camera.lens_table", [camera.lens_table], None),
-        "no coma": ("camera.psf.coma_px", [camera.psf.coma_px], 0),
-        "even pixels": ("camera.detector.intrapixel", [chip.intrapixel], 0),
-        "straight edges": ("camera.detector.edge_px", [chip.edge_px], 0),
+    better: Changes = {
+        "half the read noise": {"camera.detector.read_noise_e": chip.read_noise_e / 2},
+        "no fixed pattern": {f"camera.detector.{key}": 0 for key in FIXED_PATTERN},
+        "no transfer loss": {
+            "camera.detector.cti_parallel": 0,
+            "camera.detector.cti_serial": 0,
+        },
+        "the lever known": {"tracker.survey.lever_sigma": "0 mm"},
+        "the LEDs' map known": {
+            "tracker.survey.led_sigma": "0 mm",
+            "tracker.survey.instrument": None,
+        },
+        "the focal length known": {"tracker.survey.focal_length_sigma": "0 mm"},
+        "the pupil fixed": {"camera.pupil_walk": 2 * ["0 mm"]},
+        "dies centered": {"light.led.die": 3 * ["0 mm"]},
+        "no sag": {"vehicle.sag_arcsec": [0, 0]},
+        "a round ball": {"vehicle.runout": 3 * ["0 mm"]},
+        "no lens errors": {"camera.lens_table": None},
+        "no coma": {"camera.psf.coma_px": 0},
+        "even pixels": {"camera.detector.intrapixel": 0},
+        "straight edges": {"camera.detector.edge_px": 0},
+        "no brighter-fatter charge": {"camera.detector.brighter_fatter_per_e": 0},
+        "no dispersion by the air": {"light.air.dispersion": False},
     }
-    for name, (key, values, ideal) in built.items():
-        if any(values):
-            changes[name] = {key: ideal}
+    for name, change in better.items():
+        if any(differs(scene, key) for key in change):
+            changes[name] = change
     fainter_mag = scene.tracker.limit_mag + 0.5
     if fainter_mag <= catalog_end_mag(scene):
         changes["half a magnitude more stars known"] = {"tracker.limit_mag": fainter_mag}

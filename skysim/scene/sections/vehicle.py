@@ -334,8 +334,9 @@ class VehicleConfig(ConfigModel):
         Rotation vector from the axes of the file's camera to those of the scene's, in the axes of the file's camera
         (+x right, +y down, +z boresight): [0, 0, 55] rolls it about its boresight
     sag_arcsec
-        Bending of a camera's bracket by 1 g across its boresight, about its x and y axes; aligned when level. The pupil
-        stays, unlike that of a mast which bends
+        Bending of a camera's bracket by 1 g across its boresight, about its x and y axes; aligned when level
+    mast
+        Distance of the pupil along the boresight from where the bracket bends, which moves it by the angle times this
     runout
         Deviations of the ball's radius along the body's axes, which displace the bearing's center as it turns
     torque_limit
@@ -356,6 +357,7 @@ class VehicleConfig(ConfigModel):
     camera_m: Position | None = None
     camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
     sag_arcsec: tuple[Bend, Bend] = (0.0, 0.0)
+    mast_m: Annotated[Length, Field(ge=-10, le=10)] = 0.0
     runout_m: tuple[Deviation, Deviation, Deviation] = (0.0, 0.0, 0.0)
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0

@@ -14,8 +14,9 @@ from functools import lru_cache
 import numpy as np
 from scipy import special
 
-from estimator.centroiding.gaussian_fit import HALF_WINDOW_PX
+from estimator.centroiding.gaussian_fit import HALF_WINDOW_PX, fit_all
 from estimator.centroiding.moments import sampling_variance
+from estimator.detection.background import FILTERED_NOISE
 from estimator.detection.detect import (
     MAX_STREAK_PX,
     SHORTEST_PX,
@@ -23,7 +24,7 @@ from estimator.detection.detect import (
     noise_factor,
 )
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
-from skysim.camera.detector import saturation_dn
+from skysim.camera.detector import repel, saturation_dn
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.types import Bools, Floats, Ints
 from skysim.scene.scene import Scene
@@ -45,6 +46,12 @@ DISK_POINTS = 24  # points of a disk
 SHAPES = 10  # images whose sizes differ by less than one in this number count as equal
 COG_MARGIN_PX = 4.0  # margin of the window about the pixels above the threshold
 STILL_PX = np.zeros(2)
+# Edges of the pixels of the window of a fit.
+WINDOW_PX = 2 * HALF_WINDOW_PX + 1
+EDGES_PX = np.arange(WINDOW_PX + 1) - WINDOW_PX / 2
+# Places (x, y) as complex numbers, and where rays through even parts of the pupil end for a coma of 1 (`otf.coma`).
+COMPLEX = np.array([1, 1j])
+RAYS = np.outer(np.arange(1, 12, 2) / 12, 2 + 1j ** (np.arange(8) / 2)).ravel() - 1
 STREAK_CENTROIDERS = ("default", "streak")
 # Error of a streak's ends at which half of the fits converge (frames of paths of 25 to 150 px)
 MAX_END_SIGMA_PX = 1.1
@@ -325,6 +332,50 @@ def weighted_variance(
     return variance[0], variance[1]
 
 
+def misshapen_px(view: View, context: Context) -> Floats | None:
+    """(n, 2, 1) errors of fits by coma, and by charge that repels charge, each at its image's place in its pixel.
+
+    The tracker's fit of a Gaussian to the expected images, means over rays through the pupil of Gaussians of the lens's
+    variance. What it refuses keeps its center of light, which neither moves. A streak counts as a star of its peak.
+    """
+    camera = context.scene.camera
+    moves = camera.psf.coma_px or camera.detector.brighter_fatter_per_e
+    if context.settings.centroider == "cog" or not moves:
+        return None
+    at = view.xy_px @ COMPLEX
+    place = at - np.rint(at)
+    coma = camera.psf.coma_px / camera.corner_px * (at - camera.center_px @ COMPLEX)
+    rays = place[:, None] + coma[:, None] * RAYS
+    # The deviation with the peak of the image: erf(1 / (2 sqrt 2 lens))^2 is the share of the middle pixel.
+    root_share = gauss(0.0) / view.sigma_px
+    lens_px = 0.5 / special.ndtri((1 + root_share) / 2)[:, None, None]
+    columns, rows = (
+        np.diff(special.ndtr((EDGES_PX - part[..., None]) / lens_px))
+        for part in (rays.real, rays.imag)
+    )
+    light_e = (view.peak_e - context.camera.background_e) / root_share**2
+    # Their windows one below another, without sky.
+    image_e = np.einsum("n,nki,nkj->nij", light_e / len(RAYS), rows, columns).reshape(
+        -1, WINDOW_PX
+    )
+    repel(image_e, camera.detector)
+    row_px = WINDOW_PX * np.arange(len(view))
+    at_px = np.column_stack([place.real, place.imag + row_px]) + HALF_WINDOW_PX
+    sky_e = np.zeros((2, 2))
+    fitted = fit_all(
+        image_e,
+        at_px,
+        light_e,
+        np.zeros((len(view), 4), int),
+        light_e,
+        sky_e,
+        sky_e + context.camera.noise_e * FILTERED_NOISE,
+        1.0,
+        np.inf,
+    )
+    return np.nan_to_num(fitted[:, :2] - at_px)[:, :, None]
+
+
 def shapes_of(
     view: View, filter_px2: float = 0.0
 ) -> Iterator[tuple[Bools, Floats, tuple[Floats, ...]]]:
@@ -367,7 +418,7 @@ def image_shape(length_key: int, radius_key: int) -> tuple[Floats, ...]:
     return grid, along @ across, slope @ across, along @ (-dv.T * across)
 
 
-def gauss(x: Floats) -> Floats:
+def gauss(x: Floats | float) -> Floats:
     """The normal density."""
     return np.exp(-(x**2) / 2) / math.sqrt(2 * math.pi)
 

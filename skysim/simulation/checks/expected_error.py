@@ -57,8 +57,11 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import lateral_color
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, normalized
-from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.scene.unused import differs
+from skysim.simulation.checks.detection import Context, centroid_variance, misshapen_px
 from skysim.simulation.checks.views import View
+from skysim.simulation.lights.atmosphere import AirEffects
+from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import survey_errors
 
 
@@ -86,6 +89,14 @@ def mean_root(variance_rad2: Floats) -> float:
 
 
 AS_BUILT = "hardware as built"
+AS_BUILT_KEYS = (
+    "thermal",
+    "vehicle.sag_arcsec",
+    "vehicle.runout",
+    "light.led.die",
+    "camera.pupil_walk",
+    "camera.detector.edge_px",
+)
 
 # Causes of the attitude error. Each returns None if the scene does not have it, else the displacements (n, 2, k) of the
 # image positions in px by k errors of unit variance that all lights share. Errors of surveyed LEDs are independent:
@@ -225,6 +236,21 @@ def star_places(view: View, context: Context) -> Floats | None:
     return displacement(view, error) if error.any() else None
 
 
+def dispersion(view: View, context: Context) -> Floats | None:
+    """Refraction of the stars in their own colors minus that at the wavelength of `light.air`."""
+    effects = find_light(context.lab.camera.lights, AirEffects)
+    if effects is None:
+        return None
+    air = effects.air
+    lights = context.beliefs.lights.take(view.row)
+    zenith = air.at(view.time).zenith
+    own, common = (
+        air.refraction.apparent(lights.place[:, :3], zenith, scale)
+        for scale in (air.dispersion[air.rows(lights.id)], 1.0)
+    )
+    return displacement(view, own - common)
+
+
 def rolling_shutter(view: View, context: Context) -> Floats | None:
     """Motion of the images during the difference of true and assumed delay of their rows from the middle row."""
     camera = context.camera.optics.camera
@@ -240,10 +266,7 @@ def rolling_shutter(view: View, context: Context) -> Floats | None:
 def as_built(view: View, context: Context) -> Floats | None:
     """Images minus those of the surveyed hardware: temperature, sag, run-out, dies, pupil of the lens, chip's edge."""
     scene = context.scene
-    camera = scene.camera
-    die_m = scene.dome.led.die_m if scene.dome else ()
-    shifts = (*camera.pupil_walk_m, *die_m, camera.detector.edge_px)
-    if not (scene.thermal or scene.vehicle.is_bent or any(shifts)):
+    if not any(differs(scene, key) for key in AS_BUILT_KEYS):
         return None
     mount = context.camera.mount
     place = context.beliefs.lights.place[view.row]
@@ -251,7 +274,7 @@ def as_built(view: View, context: Context) -> Floats | None:
     surveyed_px = context.camera.optics.project(surveyed_m)
     chromatic = context.beliefs.lights.chromatic
     if chromatic is not None:
-        surveyed_px = lateral_color(camera, surveyed_px, chromatic[view.row])
+        surveyed_px = lateral_color(scene.camera, surveyed_px, chromatic[view.row])
     return (view.xy_px - surveyed_px)[:, :, None]
 
 
@@ -271,6 +294,8 @@ CAUSES = {
     "focal length": focal_length,
     "distortion": distortion,
     "star places": star_places,
+    "dispersion": dispersion,
+    "coma and charge": misshapen_px,
     "rolling shutter": rolling_shutter,
     "other map": other_map,
     AS_BUILT: as_built,
@@ -285,10 +310,13 @@ UNKNOWN_TO_TRACKER = (
 )
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
-# More causes, which are no displacements of all images.
 CENTROIDS = "centroid noise"
-LED_SURVEY = "LED survey"
-PIXEL_RESPONSE = "response within pixels"
+# Causes of errors that are independent in each light.
+INDEPENDENT = {
+    CENTROIDS: centroid_variance,
+    "LED survey": led_survey,
+    "response within pixels": pixel_response,
+}
 SOLVER = "solver"
 EXACT_SOLVERS = ("rotation_only", "pnp")  # solvers without an approximation
 
@@ -479,14 +507,13 @@ def solver_error(view: View, context: Context) -> Floats | None:
 
 def expected(views: list[View], context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
-    names = (CENTROIDS, LED_SURVEY, PIXEL_RESPONSE, *CAUSES, SOLVER)
-    cross, roll = ({name: np.zeros(len(views)) for name in names} for _ in range(2))
-    for a, view in enumerate(views):
-        variances = causes_at(view, context)
-        for name, variance in variances.items():
-            cross[name][a] = variance[:2].sum()
-            roll[name][a] = variance[2]
-    return Expected({"cross": cross, "roll": roll})
+    names = (*INDEPENDENT, *CAUSES, SOLVER)
+    found = [causes_at(view, context) for view in views]
+    by_cause = {
+        name: np.array([one.get(name, np.zeros(3)) for one in found]).T for name in names
+    }
+    cross = {name: rad2[0] + rad2[1] for name, rad2 in by_cause.items()}
+    return Expected({"cross": cross, "roll": {name: by_cause[name][2] for name in names}})
 
 
 def causes_at(view: View, context: Context) -> dict[str, Floats]:
@@ -504,18 +531,11 @@ def causes_at(view: View, context: Context) -> dict[str, Floats]:
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. and 3. Covariances by each cause, and the solver's own error squared.
-    found = {CENTROIDS: of_independent(gain, centroid_variance(view, context))}
-    independent = {
-        LED_SURVEY: led_survey(view, context),
-        PIXEL_RESPONSE: pixel_response(view, context),
-    }
-    for name, covariance_px2 in independent.items():
-        if covariance_px2 is not None:
-            found[name] = of_independent(gain, covariance_px2)
-    for name, cause in CAUSES.items():
-        shift_px = cause(view, context)
-        if shift_px is not None:
-            found[name] = of_common(gain, shift_px)
-    variances = {name: np.diag(matrix) for name, matrix in found.items()}
+    variances = {}
+    for table, propagated in ((INDEPENDENT, of_independent), (CAUSES, of_common)):
+        for name, cause in table.items():
+            error_px = cause(view, context)
+            if error_px is not None:
+                variances[name] = np.diag(propagated(gain, error_px))
     bias = solver_error(view, context)
     return variances if bias is None else variances | {SOLVER: bias**2}

@@ -87,32 +87,29 @@ class Plan(Context):
 
 def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     """The views at some attitudes, and the expected errors there."""
-    # 1. Light of each exposure.
     camera = context.lab.camera
-    rows = zip(at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True)
-    exposures = [expected_exposure(camera, *row) for row in rows]
     main = [light for light in camera.lights if not light.only_adds]
-    beams = [
-        beam_of(main if math.isnan(t_s) else camera.lights, exposure)
-        for exposure, t_s in zip(exposures, at.t_s.tolist(), strict=True)
-    ]
-    # 2. Known and other lights on the detector.
-    pairs = list(zip(beams, exposures, strict=True))
-    found = [known_lights(*pair, context) for pair in pairs]
-    others = [other_lights(*pair, context) for pair in pairs]
-    known = [view for view, _ in found]
-    seen = [view.take(view.visible) for view in known]
-    whole = [view.take(view.visible & ~breaks) for view, breaks in found]
-    # 3. Detected lights, and the expected errors of a solution with them.
-    detected = [usable(view, context) for view in whole]
-    used = [within_gate(view, context) for view in detected]
-    # Those that are left where most streaks break are not fitted as well as expected.
-    fitted = [
-        view.take(view.row < 0) if 2 * len(left) < len(usable(all_, context)) else view
-        for view, left, all_ in zip(used, detected, seen, strict=True)
-    ]
-    error = expected(fitted, context)
-    return Sampled(at, exposures, beams, known, seen, used, others, error)
+    rows = []
+    fits = []
+    for lab_from_body, rate_body_rad_s, t_s in zip(
+        at.lab_from_body, at.rate_body_rad_s, at.t_s.tolist(), strict=True
+    ):
+        # 1. Light of the exposure.
+        exposure = expected_exposure(camera, lab_from_body, rate_body_rad_s, t_s)
+        beam = beam_of(main if math.isnan(t_s) else camera.lights, exposure)
+        # 2. Known and other lights on the detector.
+        known, breaks = known_lights(beam, exposure, context)
+        others = other_lights(beam, exposure, context)
+        seen = known.take(known.visible)
+        # 3. Detected lights, and those of a solution with them.
+        detected = usable(known.take(known.visible & ~breaks), context)
+        used = within_gate(detected, context)
+        # Those that are left where most streaks break are not fitted as well as expected.
+        most_break = 2 * len(detected) < len(usable(seen, context))
+        fits.append(used.take(used.row < 0) if most_break else used)
+        rows.append((exposure, beam, known, seen, used, others))
+    columns = map(list, zip(*rows, strict=True))
+    return Sampled._make((at, *columns, expected(fits, context)))
 
 
 def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View, Bools]:
@@ -125,9 +122,8 @@ def known_lights(beam: Beam, exposure: Exposure, context: Context) -> tuple[View
     found = view(lit, exposure, context.camera, beam.before(lit))
     row = context.rows_of(lit.points.id[found.row])
     known = row >= 0
-    return View(found.lab_from_cam, row, *found[2:]).take(known), broken(found, context)[
-        known
-    ]
+    named = View(*found[:2], row, *found[3:])
+    return named.take(known), broken(found, context)[known]
 
 
 def other_lights(beam: Beam, exposure: Exposure, context: Context) -> dict[str, View]:

@@ -9,6 +9,7 @@ with lens the standard deviation of the Gaussian that has the peak of the lens's
 defocus the radii of uniform disks. `peak_share` is the share of the light in the brightest pixel.
 """
 
+import datetime
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -36,6 +37,8 @@ class View(NamedTuple):
 
     Attributes
     ----------
+    time
+        UTC of the exposure
     lab_from_cam
         Attitude of the camera, with its assumed mount
     row
@@ -64,6 +67,7 @@ class View(NamedTuple):
         (n,) names of the occluders that hide the lights; VISIBLE for none
     """
 
+    time: datetime.datetime
     lab_from_cam: Rotation
     row: Ints
     xy_px: Floats
@@ -107,7 +111,7 @@ class View(NamedTuple):
 
     def take(self, which: NDArray) -> "View":
         """The lights selected by a mask or by indices."""
-        return View(self.lab_from_cam, *(column[which] for column in self[1:]))
+        return View(*self[:2], *(column[which] for column in self[2:]))
 
 
 class CameraModel(NamedTuple):
@@ -224,6 +228,7 @@ def view(
     share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
+        exposure.time,
         exposure.lab_from_body * camera.mount.cam_from_body.inv(),
         row,
         xy_px,
