@@ -52,7 +52,7 @@ def run_guarded(script: Path, *arguments: str, cpu_s: int, memory_bytes: int) ->
             return f"it takes longer than {WALL_S:g} s"
         errors.seek(max(errors.tell() - MESSAGE_BYTES, 0))
         lines = errors.read().decode(errors="replace").strip().splitlines()
-    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+    if code == -signal.SIGXCPU:
         return f"it takes more than {cpu_s} s"
     if code < 0:
         return f"it crashes its reader ({signal.Signals(-code).name})"
@@ -70,7 +70,8 @@ def main() -> None:
     with suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_AS, (int(memory_bytes),) * 2)
     with suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s),) * 2)
+        # At the hard limit the signal is SIGKILL, which a system without memory sends too.
+        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), int(cpu_s) + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sys.argv = [script, *arguments]
     try:

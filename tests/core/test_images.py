@@ -67,6 +67,7 @@ def test_a_wrong_size_of_a_compressed_image_is_refused_in_one_line(
         ("while True: pass", "it takes more than 1 s"),
         ("bytearray(1 << 40)", "it needs more than 512 MiB of memory"),
         ("import os; os.abort()", r"it crashes its reader (SIGABRT)"),
+        ("import os; os.kill(os.getpid(), 9)", "it crashes its reader (SIGKILL)"),
         ("import sys; sys.exit('no\\nstars')", "stars"),
         ("import os; os._exit(3)", "its reader exits with code 3"),
     ],

@@ -11,7 +11,7 @@ import pytest
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.dynamics.multibody import mjcf
+from skysim.dynamics.multibody import mjcf, mjcf_trial
 from skysim.dynamics.multibody.mjcf import xml_root
 
 BUS = '<body name="bus"><camera name="star_camera"/><geom size=".1"/></body>'
@@ -221,6 +221,17 @@ def flexcomp(count: str) -> str:
     return f'<body name="f">{flex}</body>'
 
 
+def texture(side_px: int) -> str:
+    return (
+        f'<asset><texture name="t" type="2d" builtin="flat" width="{side_px}"'
+        f' height="{side_px}"/></asset>'
+    )
+
+
+# MuJoCo rejects a joint between bodies without mass, which the caller may lock.
+LIGHT = '<worldbody><body name="w"><joint name="wheel_1"/></body></worldbody>'
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
@@ -242,8 +253,27 @@ def flexcomp(count: str) -> str:
             "more than 1024 MiB of memory",
         ),
         (whole('<size nuser_body="2147483647"/>'), "more than 1024 MiB of memory"),
+        (whole(texture(20_000)), "more than 1024 MiB of memory"),
+        (whole(texture(60_000)), "more than 1024 MiB of memory"),
+        (whole(texture(10_000)), "nbuffer 3000.....; allowed: up to 268435456"),
+        (whole('<size memory="100G"/>'), "more than 1024 MiB of memory"),
+        (whole('<size nuserdata="2147483647"/>'), "more than 1024 MiB of memory"),
+        (whole(f'<size memory="100G"/>{LIGHT}'), "more than 1024 MiB of memory"),
     ],
-    ids=["contains itself", "flexcomp", "joints", "replicate", "height field", "nuser_body"],
+    ids=[
+        "contains itself",
+        "flexcomp",
+        "joints",
+        "replicate",
+        "height field",
+        "nuser_body",
+        "texture",
+        "large texture",
+        "texture of 300 MB",
+        "arena",
+        "user data",
+        "arena and a joint to lock",
+    ],
 )
 def test_a_model_that_would_crash_or_never_end_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, message: str
@@ -255,6 +285,38 @@ def test_a_model_that_would_crash_or_never_end_is_refused(
         InputError, match=rf"v\.xml: not a MuJoCo model that skysim reads: it .*{message}$"
     ):
         mjcf.load(tmp_path / "v.xml")
+
+
+@pytest.mark.parametrize("error", ["no memory", "a message that no version has had"])
+def test_only_a_model_that_has_been_compiled_survives_its_trial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: str
+) -> None:
+    """Any error of the compiler is a refusal, since a limit may be its cause."""
+    path = tmp_path / "v.xml"
+    path.write_text(whole(""))
+
+    class Spec:
+        keys = joints = ()
+
+        @staticmethod
+        def from_file(_path: str) -> type[Spec]:
+            return Spec
+
+        @staticmethod
+        def compile() -> None:
+            raise ValueError(error)
+
+    mjcf_trial.run_trial(str(path))
+    monkeypatch.setattr(mujoco, "MjSpec", Spec)
+    with pytest.raises(ValueError, match=error):
+        mjcf_trial.run_trial(str(path))
+
+
+def test_a_joint_that_mujoco_rejects_is_left_to_the_caller(tmp_path: Path) -> None:
+    path = tmp_path / "v.xml"
+    path.write_text(whole(LIGHT))
+    with pytest.raises(ValueError, match="mass and inertia of moving bodies"):
+        mjcf.load(path).compile()
 
 
 @pytest.mark.parametrize("value", ["inf", "1 NaN 1", "-1e300", "Infinity"])

@@ -431,6 +431,9 @@ def built(
     return multibody.build(VehicleConfig.model_validate({"model": str(file)} | changes))
 
 
+REFUSED = "not a MuJoCo model that skysim reads: .*"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("bodies", "message"),
@@ -442,8 +445,8 @@ def built(
         (f'<frame pos="1 0 0">{BUS}</frame>', "bus must be a direct child of worldbody"),
         (BUS.replace(CAMERA, "") + CAMERA, "camera star_camera must be on body bus"),
         (f"{BUS}<body><freejoint/>{BALL}</body>", "a joint outside body bus"),
-        (BUS.replace("<geom", "<gem"), "not a MuJoCo model: .*unrecognized element"),
-        (BUS.replace('size="0.3"', 'size="-1"'), "MuJoCo cannot compile it: .*size"),
+        (BUS.replace("<geom", "<gem"), f"{REFUSED}unrecognized element"),
+        (BUS.replace('size="0.3"', 'size="-1"'), f"{REFUSED}size"),
         (BUS.replace(' mass="50"', ' mass="0"'), "vehicle.mass: 0 kg; allowed: more than"),
         (
             carrying(WHEEL.replace("wheel_a", "bearing")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
-from skysim.sources.dome.layouts import boards, spreads
+from skysim.sources.dome.layouts import boards, listed, placing, spreads
 from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.dome.layouts.registry import board_of
 from skysim.sources.dome.led import lit_moments_s
@@ -690,7 +691,7 @@ def test_a_bad_file_of_leds_is_refused_in_one_line(
         ),
         (
             "{kind: listed, cap_deg: 30, file: nowhere.csv}",
-            "light.layout.file: nowhere.csv cannot be read",
+            "nowhere.csv: cannot be read",
         ),
         (
             "{kind: listed, cap_deg: 30, directions_deg: [[0, 1], [5, 40]]}",
@@ -945,3 +946,50 @@ def test_an_led_that_is_listed_twice_is_refused(names: str, tmp_path: Path) -> N
         InputError, match=r"leds.csv.2: at the place of 0; allowed: each LED once"
     ):
         lit({"kind": "listed", "file": str(path)}, MEASURED)
+
+
+@pytest.mark.parametrize("spacing_m", [0.0, 0.01, 0.05, 0.4, 3.0])
+def test_sites_taken_by_cells_are_those_of_an_exhaustive_search(spacing_m: float) -> None:
+    rng = np.random.default_rng(5)
+    sites_m = placing.scattered_cap(600, 1.5, rng) + 0.1 * rng.standard_normal((600, 3))
+    taken = list[int]()
+    for site, place_m in enumerate(sites_m):
+        distance_m = np.linalg.norm(sites_m[taken] - place_m, axis=1)
+        if (distance_m > spacing_m).all():
+            taken.append(site)
+    np.testing.assert_array_equal(placing.thin(sites_m, spacing_m), taken)
+    np.testing.assert_array_equal(placing.thin(sites_m, spacing_m, 5), taken[:5])
+
+
+def test_a_file_of_too_many_leds_is_refused_before_its_rows_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "leds.csv"
+    monkeypatch.setattr(listed, "parse_row", None)
+    path.write_text("azimuth_deg,tilt_deg\n" + "0,1\n" * 100_001)
+    with pytest.raises(InputError, match=r"leds\.csv: 100001 LEDs; allowed: up to 100000$"):
+        listed.read_csv(path)
+    monkeypatch.setattr(listed, "MAX_BYTES", 1000)
+    with pytest.raises(InputError, match=r"leds\.csv: 400025 bytes; allowed: up to 1000$"):
+        listed.read_csv(path)
+
+
+def test_leds_that_all_are_in_one_place_are_refused_in_linear_time(tmp_path: Path) -> None:
+    """The pairs of 100,000 LEDs in one place would be five billion."""
+    path = tmp_path / "leds.csv"
+    path.write_text("azimuth_deg,tilt_deg\n" + "0,1\n" * 100_000)
+    begin_s = time.process_time()
+    with pytest.raises(InputError, match=r"leds\.csv\.1: at the place of 0"):
+        lit({"kind": "listed", "file": str(path)}, MEASURED)
+    assert time.process_time() - begin_s < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fibonacci", "poisson_disk", "random"])
+def test_a_hundred_thousand_leds_are_placed_in_seconds(kind: str) -> None:
+    """Each place is drawn, and on a dome of the measured shape."""
+    lit({"kind": kind, "count": 100}, MEASURED)
+    begin_s = time.process_time()
+    leds = lit({"kind": kind, "count": 100_000}, MEASURED)
+    assert time.process_time() - begin_s < 15
+    assert len(leds) == 100_000

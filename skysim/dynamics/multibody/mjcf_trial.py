@@ -1,38 +1,38 @@
 """Script for `core.guarded`: read and compile an MJCF file, to see whether MuJoCo survives it.
 
-It fails if memory runs out or the model is too large. It ignores any other error of MuJoCo: the caller gets the same
-error and reports it. After such an error it compiles again without joints, since the caller may lock the joints that
-MuJoCo rejects.
+It succeeds only if a model has been compiled and its dynamics computed within the limits. Any other end is a failure,
+since an error of MuJoCo may mean that memory ran out here, where the caller has more.
 """
 
 import sys
-from contextlib import suppress
 from typing import Any
 
 import mujoco
 
 ERRORS = (ValueError, mujoco.FatalError)
-# Occlusion takes a time proportional to the square of ngeom, inertia to the square of nv.
-MAX_ELEMENTS = {"nbody": 2000, "ngeom": 2000, "nv": 1000}
+OUT_OF_MEMORY = (
+    "ould not allocate"  # in MuJoCo's messages, such as "could not allocate mjData arena"
+)
+# Occlusion takes a time proportional to the square of ngeom, inertia to the square of nv. A vehicle keeps several
+# models, each of nbuffer bytes.
+MAX_ELEMENTS = {"nbody": 2000, "ngeom": 2000, "nv": 1000, "nbuffer": 1 << 28}
 
 
 def run_trial(path: str) -> None:
-    """Read and compile the file at path.
+    """Read and compile the file at path, without its joints if MuJoCo rejects them, since the caller may lock them.
 
-    Raises MemoryError, or RuntimeError after a failed allocation in MuJoCo, and SystemExit for a large model.
+    Raises an error of ERRORS, RuntimeError after a failed allocation in MuJoCo, and SystemExit for a large model.
     """
+    spec = mujoco.MjSpec.from_file(path)
     try:
-        spec = mujoco.MjSpec.from_file(path)
-    except ERRORS:
-        return
-    # If it does not compile, the caller reports it, or compiles it without some joints.
-    try:
-        check_model(spec.compile())
-    except ERRORS:
-        with suppress(*ERRORS):
-            for element in [*spec.keys, *spec.joints]:
-                spec.delete(element)
-            check_model(spec.compile())
+        model = spec.compile()
+    except ERRORS as error:
+        if OUT_OF_MEMORY in str(error):
+            raise
+        for element in [*spec.keys, *spec.joints]:
+            spec.delete(element)
+        model = spec.compile()
+    check_model(model)
 
 
 def check_model(model: Any) -> None:
@@ -47,5 +47,7 @@ if __name__ == "__main__":
     mujoco.set_mju_user_warning(lambda _: None)
     try:
         run_trial(sys.argv[1])
-    except RuntimeError:
-        raise MemoryError from None
+    except (RuntimeError, *ERRORS) as error:
+        if isinstance(error, RuntimeError) or OUT_OF_MEMORY in str(error):
+            raise MemoryError from None
+        sys.exit(" ".join(str(error).split()))

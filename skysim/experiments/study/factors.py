@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import itertools
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
@@ -24,6 +25,8 @@ from skysim.core.units import ConfigModel, NotEmpty
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
 Option = tuple[Value, Settings]  # a level as in tables, and its settings
+# Of all factors: the scene of each level is read and kept before the first trial.
+MAX_LEVELS = 1000
 QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*?)?\s*$")
 Name = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*$")]
 
@@ -107,7 +110,7 @@ class Range(KeyedFactor):
 
     from_: Annotated[Value, Field(alias="from")]
     to: Value
-    steps: Annotated[int, Field(ge=2, le=10_000)] = 5
+    steps: Annotated[int, Field(ge=2, le=MAX_LEVELS)] = 5
     scale: Literal["linear", "log"] = "linear"
     integer: bool = False
 
@@ -232,6 +235,7 @@ Factor = Annotated[
 # Experimental designs: full factorial, one factor at a time, and samples of the factors' unit cube.
 
 
+MAX_POINTS = 100_000  # which are listed before the first trial
 SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
 
 
@@ -258,7 +262,7 @@ class Design(ConfigModel):
     """
 
     kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"
-    points: Annotated[int, Field(ge=2, le=1_000_000)] | None = None
+    points: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = None
 
 
 Factors = Mapping[str, Factor]
@@ -280,13 +284,22 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
         raise InputError(
             "design.points", f"{design.points} for {design.kind}", "a power of two"
         )
-    for name, factor in factors.items():
-        if not sampled and not factor.options():
+    levels = [len(factor.options()) for factor in factors.values()]
+    for name, count_of_levels in zip(factors, levels, strict=True):
+        if not sampled and not count_of_levels:
             raise InputError(
                 f"factors.{name}",
                 "a distribution has no levels",
                 "design.kind lhs, sobol, saltelli",
             )
+    # Counts multiply, so they are checked before the points are made.
+    totals = {"factorial": math.prod(levels), "saltelli": count * (len(factors) + 2)}
+    if (total := totals.get(design.kind, 0)) > MAX_POINTS:
+        raise InputError(
+            "design",
+            f"{design.kind} of {len(factors)} factors: {total} points",
+            f"up to {MAX_POINTS}",
+        )
     return list(DESIGNS[design.kind](design, factors, seed))
 
 

@@ -42,6 +42,7 @@ from skysim.core.units import (
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
 from skysim.experiments.study.factors import (
+    MAX_LEVELS,
     SAMPLED_DESIGNS,
     Design,
     Factor,
@@ -458,6 +459,17 @@ class Study(ConfigModel):
         if isinstance(design, dict) and design.get("kind") in ("lhs", "sobol"):
             return {"paired": False} | tree
         return tree
+
+    def check(self) -> None:
+        levels = 0
+        for name, factor in self.factors.items():
+            levels += len(factor.options())
+            if levels > MAX_LEVELS:
+                raise InputError(
+                    f"factors.{name}",
+                    f"{levels} levels, with those of the factors before it",
+                    f"up to {MAX_LEVELS} of all factors",
+                )
 
     @property
     def is_sampled(self) -> bool:

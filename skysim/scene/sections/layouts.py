@@ -36,7 +36,8 @@ Magnitudes = NotEmpty[Magnitude]
 TypeNames = NotEmpty[str]
 Pixels = Annotated[int, Field(ge=1, le=20_000)]
 Cap = Annotated[Number, Field(gt=0, le=90)]
-Count = Annotated[int, Field(ge=1, le=100_000)]
+MAX_LEDS = 100_000
+Count = Annotated[int, Field(ge=1, le=MAX_LEDS)]
 FieldOfView = Annotated[Number, Field(ge=1, le=90)]
 TapeLength = Annotated[Length, Field(ge=1e-3)]
 LimitMagnitude = Annotated[Number, Field(ge=-2, le=15)]
@@ -176,7 +177,7 @@ class PoissonDiskConfig(DimmedConfig):
 
     kind: Literal["poisson_disk"]
     spacing_m: PositiveLength | None = None
-    count: Annotated[int, Field(ge=1, le=20_000)] | None = None
+    count: Count | None = None
 
     def check(self) -> None:
         if (self.spacing_m is None) == (self.count is None):

@@ -308,3 +308,38 @@ def test_a_study_without_factors_has_one_point(tmp_path):
         study_file.load(
             written(tmp_path, "\n".join(lines).replace("frames: 1", "frames: -1"))
         )
+
+
+def many(factors: int, values: int) -> str:
+    """A study of so many factors, each of so many values."""
+    one = f"{{key: trial.noise_px, values: {list(range(values))}}}"
+    lines = "".join(f"  f{n}: {one}\n" for n in range(factors))
+    head, tail = STUDY.split("  strays:")
+    return head + lines + "replicates:" + tail.split("replicates:")[1]
+
+
+@pytest.mark.parametrize(
+    ("factors", "values", "design", "message"),
+    [
+        (
+            8,
+            50,
+            "factorial",
+            "design: factorial of 8 factors: 39062500000000 points; .*100000",
+        ),
+        (2, 317, "factorial", "design: factorial of 2 factors: 100489 points; .*100000"),
+        (1, 90_000, "factorial", "factors.f0: 90000 levels, .*; allowed: up to 1000 of all"),
+        (3, 400, "one_at_a_time", "factors.f2: 1200 levels, .*; allowed: up to 1000 of all"),
+        (1, 3, "saltelli, points: 65536", "saltelli of 1 factors: 196608 points"),
+        (1, 3, "lhs, points: 100001", "design.points: 100001 is not allowed; .* 100000"),
+    ],
+)
+def test_counts_that_multiply_are_refused_before_the_points_are_made(
+    tmp_path, monkeypatch, factors, values, design, message
+):
+    """A point is made from the options of its factors, the scene of a level is read in some milliseconds."""
+    monkeypatch.setattr("skysim.experiments.study.factors.make_point", None)
+    monkeypatch.setattr("skysim.experiments.study.study_file.resolve_point", None)
+    text = many(factors, values) + f"design: {{kind: {design}}}\n"
+    with pytest.raises(InputError, match=rf"{message}.*question\.yaml, line \d+"):
+        study_file.load(written(tmp_path, text))

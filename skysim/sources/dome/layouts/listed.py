@@ -1,15 +1,16 @@
 """LEDs by list: places in the lab or directions from the bearing, from the scene or from a CSV file."""
 
+import math
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
-from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError, Where
 from skysim.core.types import Floats, normalized
-from skysim.scene.sections.layouts import ListedConfig, relative_levels
+from skysim.core.yaml_reader import read_limited
+from skysim.scene.sections.layouts import MAX_LEDS, ListedConfig, relative_levels
 from skysim.sources.dome.layouts.placing import (
     Ints,
     PlacedLeds,
@@ -17,11 +18,13 @@ from skysim.sources.dome.layouts.placing import (
     directions_from_angles,
     on_surface,
     project_from_bearing,
+    thin,
 )
 from skysim.sources.dome.point_cloud import UNIT_M
 from skysim.sources.dome.surface import Surface
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
+MAX_BYTES = 1 << 25  # of a file
 SAME_PLACE = 1e-4  # distance of two LEDs of a file that are one, in m or rad
 PLACES = {tuple(f"{axis}_{unit}" for axis in "xyz"): scale for unit, scale in UNIT_M.items()}
 ANGLES = ("azimuth_deg", "tilt_deg")
@@ -72,8 +75,10 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     are_places = coordinates.shape[1] == 3
     directions = coordinates if are_places else directions_from_angles(coordinates)
     # A file is measured, with errors; the numbers of a list are exact, and stars of a display are close.
-    if pairs := cKDTree(directions).query_pairs(SAME_PLACE if config.file else 1e-6):
-        first, second = min(pairs)
+    apart = thin(directions, SAME_PLACE if config.file else 1e-6)
+    if len(apart) < len(directions):
+        second = np.setdiff1d(np.arange(len(directions)), apart)[0]
+        first = np.linalg.norm(directions[:second] - directions[second], axis=1).argmin()
         raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
     check_cap(key, directions, config.cap_deg)
     place_m = coordinates if are_places else project_from_bearing(surface, directions)
@@ -110,13 +115,7 @@ def read_csv(path: Path) -> LedFile:
     InputError
         With one line, and with the number of the wrong line.
     """
-    try:
-        text = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            "light.layout.file",
-            f"{path} cannot be read: {getattr(error, 'strerror', None) or error}",
-        ) from None
+    text = read_limited(path, MAX_BYTES).splitlines()
     lines = [
         (n, line)
         for n, line in enumerate(text, 1)
@@ -136,6 +135,9 @@ def read_csv(path: Path) -> LedFile:
             f"columns x_m, y_m, z_m or {', '.join(ANGLES)}, or x_mm and so on; optionally {' or '.join(BRIGHTNESS)},"
             f" {', '.join(FURTHER)}; one LED per line",
         )
+    # One line is the header.
+    if len(lines) > MAX_LEDS + 1:
+        raise InputError(path, f"{len(lines) - 1} LEDs", f"up to {MAX_LEDS}")
     # Each row is checked with its number in the file.
     rows = [parse_row(path, n, line, names) for n, line in lines[1:]]
     column = dict(zip(names, np.array(rows).T, strict=True))
@@ -178,7 +180,7 @@ def parse_row(path: Path, number: int, line: str, names: list[str]) -> list[floa
     except ValueError:
         row = []
     level = dict(zip(names, row, strict=False)).get("level", 1.0)
-    if len(row) != len(names) or not np.all(np.isfinite(row)) or not 0 < level <= 1:
+    if len(row) != len(names) or not all(map(math.isfinite, row)) or not 0 < level <= 1:
         raise Where(path, number).error(
             f"{line!r} is not an LED", f"{len(names)} numbers, a level above 0 and at most 1"
         )

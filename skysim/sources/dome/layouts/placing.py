@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
+from skysim.core.jit import jit
 from skysim.core.types import Floats, Ints, Sources, normalized
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
@@ -24,6 +25,8 @@ from skysim.sources.dome.led import (
 )
 from skysim.sources.dome.surface import Surface, directions, unit_vectors
 from skysim.sources.photometry import NODES, Band
+
+MAX_CELLS = 500  # along each side of the square in which `thin` lists sites
 
 
 class PlacedLeds(NamedTuple):
@@ -210,16 +213,45 @@ def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> In
 def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
     """Indices of sites taken in order, each if none taken before is within the spacing, up to `count`.
 
-    For sites in random order this is random sequential adsorption.
+    For sites in random order this is random sequential adsorption. The time is linear in the number of sites: the
+    sites taken are listed by squares of the horizontal plane, at least the spacing wide.
     """
-    tree = cKDTree(sites_m)
-    free = np.ones(len(sites_m), dtype=bool)
-    taken: list[int] = []
+    reach_m = np.abs(sites_m).max()
+    cell_m = max(spacing_m, 2 * reach_m / MAX_CELLS)
+    return _thin(
+        np.ascontiguousarray(sites_m), reach_m, cell_m, spacing_m, count or len(sites_m)
+    )
+
+
+@jit
+def _thin(
+    sites_m: Floats, reach_m: float, cell_m: float, spacing_m: float, count: int
+) -> Ints:
+    """`thin` with squares of width `cell_m` from -reach_m to reach_m, and a border of empty ones."""
+    side = int(2 * reach_m / cell_m) + 3
+    newest = np.full((side, side), -1, np.int32)  # the site taken last in each square
+    older = np.empty(len(sites_m), np.int32)  # the one taken before it there, or -1
+    taken = np.empty(len(sites_m), np.int64)
+    found = 0
     for site in range(len(sites_m)):
-        if free[site] and (count is None or len(taken) < count):
-            taken.append(site)
-            free[tree.query_ball_point(sites_m[site], spacing_m)] = False
-    return np.array(taken, dtype=np.int64)
+        if found == count:
+            break
+        x = int((sites_m[site, 0] + reach_m) / cell_m) + 1
+        y = int((sites_m[site, 1] + reach_m) / cell_m) + 1
+        is_free = True
+        for near in newest[x - 1 : x + 2, y - 1 : y + 2].flat:
+            while is_free and near >= 0:
+                distance2 = 0.0
+                for axis in range(3):
+                    distance2 += (sites_m[near, axis] - sites_m[site, axis]) ** 2
+                is_free = distance2 > spacing_m**2
+                near = older[near]
+        if is_free:
+            older[site] = newest[x, y]
+            newest[x, y] = site
+            taken[found] = site
+            found += 1
+    return taken[:found]
 
 
 def spacing_ok(place_m: Floats, spacing_m: float) -> bool:
