@@ -72,11 +72,21 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+WHOLE = "nothing is half-written"  # what a write that fails leaves
+
+
 @contextmanager
-def name_in_errors(path: Path) -> Iterator[None]:
+def name_in_errors(path: Path, needed_bytes: int = 0, left: str = WHOLE) -> Iterator[None]:
     """Re-raise an OSError with `path` and the system's own message.
 
     Some libraries do not name the file, or do not report a full disk by its error number.
+
+    Parameters
+    ----------
+    needed_bytes
+        Size of the whole file; 0 if it is not known
+    left
+        What a full disk leaves of the file
     """
     try:
         yield
@@ -88,23 +98,25 @@ def name_in_errors(path: Path) -> Iterator[None]:
         number = errno.ENOSPC if full else error.errno
         if number is None:
             raise
-        reason = f"{os.strerror(number)}{'; ' + room_left(path) if full else ''}"
+        reason = f"{os.strerror(number)}{'; ' + room_left(path, needed_bytes, left) if full else ''}"
         raise OSError(number, reason, str(path)) from error
 
 
-def room_left(path: Path) -> str:
-    """Text that says how much room is left for a file that could not be written."""
-    return f"{shutil.disk_usage(path.parent).free / 1e6:.3g} MB are free, nothing is half-written"
+def room_left(path: Path, needed_bytes: int = 0, left: str = WHOLE) -> str:
+    """Text that says how much room is left for a file that could not be written; see `name_in_errors`."""
+    needed = f" of {needed_bytes / 1e6:.3g} needed" if needed_bytes else ""
+    return f"{shutil.disk_usage(path.parent).free / 1e6:.3g} MB are free{needed}, {left}"
 
 
 @contextmanager
-def atomic_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path, needed_bytes: int = 0) -> Iterator[Path]:
     """Yield a temporary path beside `path`, whose file replaces that of `path` at the end.
 
-    If the body raises an exception, the temporary file is removed and `path` is unchanged.
+    If the body raises an exception, the temporary file is removed and `path` is unchanged. An error of a full disk
+    names the size of the whole file, unless that is 0: not known.
     """
     # Removed first, so that its room counts as free.
-    with name_in_errors(path), temporary_path(path) as temporary:
+    with name_in_errors(path, needed_bytes), temporary_path(path) as temporary:
         yield temporary
         os.replace(temporary, path)
 
@@ -215,13 +227,12 @@ def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> li
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8."""
-    with atomic_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode())
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Write a file of bytes."""
-    with atomic_file(path) as temporary:
+    with atomic_file(path, memoryview(data).nbytes) as temporary:
         temporary.write_bytes(data)
 
 

@@ -72,7 +72,7 @@ def attitude(angles: AttitudeConfig) -> Rotation:
     )
 
 
-def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Rotation:
+def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> Rotation:
     """lab_from_body at the start; the identity for a pointing, since then the body's axes define the lab's."""
     if motion.start == "profile":
         return quaternion.to_rotation(profile_start(motion, profiles)[0])
@@ -83,7 +83,7 @@ def start_attitude(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()
     )
 
 
-def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = ()) -> Floats:
+def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline]) -> Floats:
     """(3,) rate at the start, in body axes, rad/s; 0 of `sidereal`, which has no controller to follow it."""
     if motion.start == "profile":
         return profile_start(motion, profiles)[1]
@@ -91,7 +91,7 @@ def start_rate_rad_s(motion: MotionConfig, profiles: Sequence[AttitudeSpline] = 
 
 
 def body_rate_rad_s(
-    scene: Scene, lab_from_body: Rotation, profiles: Sequence[AttitudeSpline] = ()
+    scene: Scene, lab_from_body: Rotation, profiles: Sequence[AttitudeSpline]
 ) -> Floats:
     """(3,) rate of a vehicle at this attitude at the start, in body axes; `sidereal` is that of the Earth."""
     if scene.motion.rate_deg_s == SIDEREAL:

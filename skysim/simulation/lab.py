@@ -24,7 +24,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import JITTER, random_stream
-from skysim.core.types import Mount, Sources, frozen
+from skysim.core.types import Floats, Mount, Sources, frozen
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.controllers import CONTROLLERS
@@ -282,6 +282,11 @@ class Lab:
         return guidance.plan(self.scene.motion, self.start, self.profiles)
 
     @property
+    def start_rate_rad_s(self) -> Floats:
+        """(3,) rate of the vehicle at the start, in body axes."""
+        return guidance.body_rate_rad_s(self.scene, self.start, self.profiles)
+
+    @property
     def vibration(self) -> Vibration:
         """The vibration of the run, with that of its maneuvers."""
         rng = random_stream(self.scene.seed, JITTER, 0)
@@ -310,7 +315,9 @@ class Lab:
 
     def export_mjcf(self) -> str:
         """The lab as MJCF text, for MuJoCo's viewer and for pictures."""
-        return mjcf_export.mjcf(self.vehicle, self.scene, self.camera.sources, self.start)
+        return mjcf_export.mjcf(
+            self.vehicle, self.scene, self.camera.sources, self.start, self.start_rate_rad_s
+        )
 
 
 def build_lab(scene: Scene, parts: UserParts = NO_PARTS) -> Lab:

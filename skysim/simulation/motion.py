@@ -355,9 +355,8 @@ class Motion:
                 vehicle, lambda t_s: self.reference.state_at(t_s)[:2], duration_s, kept_s
             )
         else:
-            rate = guidance.body_rate_rad_s(scene, lab.start, lab.profiles)
             self.simulation = multibody.Simulation(
-                vehicle, lab.start, rate, duration_s, kept_s
+                vehicle, lab.start, lab.start_rate_rad_s, duration_s, kept_s
             )
         self.vibration = lab.vibration
         if kept_s is None:

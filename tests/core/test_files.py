@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import json
 import os
 import shutil
@@ -289,6 +290,22 @@ def test_a_full_disk_that_only_a_text_reports_is_named_with_the_room_left(
     with pytest.raises(OSError, match=r"No space left on device; .* MB are free") as raised:
         break_off_as_numpy()
     assert raised.value.filename == str(tmp_path / "new.fits")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_names_the_room_that_a_whole_file_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for write, data in (
+        (files.write_text, "µ" * 1_000_000),
+        (files.write_bytes, b"12" * 10**6),
+    ):
+        with pytest.raises(OSError, match=r"; \S+ MB are free of 2 needed, nothing is half-"):
+            write(tmp_path / "new", data)  # type: ignore[operator]
     assert not list(tmp_path.iterdir())
 
 

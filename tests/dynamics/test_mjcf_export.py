@@ -14,12 +14,13 @@ from scipy.spatial.transform import Rotation
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
 from skysim.core.types import Sources
-from skysim.dynamics import multibody
+from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody import mjcf_export, scene_picture
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.scene.loader import load
+from skysim.scene.loader import list_scenes, load
 from skysim.scene.scene import Scene
+from skysim.simulation.flight import open_flight
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
@@ -48,6 +49,14 @@ def dome_lab(
     assert scene.light.kind == "dome"
     band = Band.from_efficiency(scene.camera.detector.quantum_efficiency)
     return scene, multibody.build(scene.vehicle), dome.sources(scene.light, band)
+
+
+def mjcf(
+    vehicle: multibody.VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation
+) -> str:
+    """The export of a scene without profiles."""
+    rate_rad_s = guidance.body_rate_rad_s(scene, lab_from_body, ())
+    return mjcf_export.mjcf(vehicle, scene, sources, lab_from_body, rate_rad_s)
 
 
 def star_lab() -> tuple[Scene, multibody.VehicleModel, Sources, Rotation]:
@@ -91,7 +100,7 @@ def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> Non
     angles_deg, rate = STARTS[start]
     scene, vehicle, sources = dome_lab(EVERYTHING | {"motion.rate_deg_s": rate})
     lab_from_body = Rotation.from_euler("ZYX", angles_deg, degrees=True)
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
+    model, data = loaded(mjcf(vehicle, scene, sources, lab_from_body))
     flight = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
     np.testing.assert_allclose(data.qpos, flight.angles_rad, rtol=0, atol=1e-14)
     np.testing.assert_allclose(data.qvel, flight.speeds_rad_s, rtol=1e-14, atol=1e-14)
@@ -108,6 +117,26 @@ def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> Non
     np.testing.assert_allclose(data.qvel, flight.speeds_rad_s, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list_scenes())
+def test_the_keyframe_of_every_shipped_scene_is_the_start_of_its_flight(name: str) -> None:
+    flight = open_flight(load(name))
+    lab = flight.lab
+    _, data = loaded(lab.export_mjcf())
+    simulation = flight.motion.simulation
+    lab_from_body = Rotation.from_quat(data.body("bus").xquat, scalar_first=True)
+    assert (lab_from_body.inv() * lab.start).magnitude() < 1e-9
+    if isinstance(simulation, Simulation) and not lab.scene.motion.is_prescribed:
+        np.testing.assert_allclose(data.qvel, simulation.speeds_rad_s, rtol=1e-14, atol=1e-14)
+    if lab.scene.motion.start == "profile":
+        state_at = lab.reference.state_at
+        begin, end = (
+            Rotation.from_quat(state_at(t_s)[0], scalar_first=True) for t_s in (0.0, 1e-4)
+        )
+        rate_rad_s = (begin.inv() * end).as_rotvec() / 1e-4
+        np.testing.assert_allclose(data.qvel[:3], rate_rad_s, rtol=1e-3, atol=1e-5)
+
+
 def test_the_second_initial_attitude_reaches_the_tilt_stop() -> None:
     """The flight above compares the tendon's limit only if that is felt."""
     angles_deg, rate = STARTS["against the stop"]
@@ -121,7 +150,7 @@ def test_the_second_initial_attitude_reaches_the_tilt_stop() -> None:
 
 def test_a_free_vehicle_flies_like_the_stepped_model_under_the_stars() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
+    model, data = loaded(mjcf(vehicle, scene, sources, lab_from_body))
     flight = Simulation(vehicle, lab_from_body, np.radians(scene.motion.rate_deg_s), 1.0)
     flight.advance(np.full((1000, 3), 0.3))
     data.ctrl = 0.3
@@ -134,7 +163,7 @@ def test_export_adds_no_mass_and_does_not_change_the_stepped_model() -> None:
     scene, vehicle, sources = dome_lab(EVERYTHING)
     before = vehicle.spec.to_xml()
     geoms = vehicle.model.ngeom
-    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, _ = loaded(mjcf(vehicle, scene, sources, LEVEL))
     assert vehicle.spec.to_xml() == before
     assert vehicle.model.ngeom == geoms < model.ngeom
     np.testing.assert_allclose(model.body_mass, vehicle.model.body_mass, rtol=1e-14)
@@ -163,7 +192,7 @@ def test_an_exported_vehicle_contains_its_mesh_files(tmp_path: Path) -> None:
             "vehicle.center_of_mass": "[0 m, 0 m, 0 m]",
         }
     )
-    text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
+    text = mjcf(vehicle, scene, sources, LEVEL)
     assert "tetra.obj" not in text
     own = mujoco.MjData(vehicle.model)
     mujoco.mj_forward(vehicle.model, own)
@@ -186,7 +215,7 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
         }
     )
     with pytest.raises(InputError, match="lab") as refused:
-        mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
+        mjcf(vehicle, scene, sources, LEVEL)
     assert "\n" not in str(refused.value)
 
 
@@ -196,7 +225,7 @@ def test_a_vehicle_that_has_its_own_camera_lab_is_refused(tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_exported_dome_and_leds_have_the_scene_s_positions() -> None:
     scene, vehicle, sources = dome_lab()
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, data = loaded(mjcf(vehicle, scene, sources, LEVEL))
     inside = surface.build_surface(scene.light.surface)
     shell = vertices_m(model, data, "stage_dome_")
     on_it = np.sum(((shell - inside.center_m) / inside.semi_axes_m) ** 2, axis=1)
@@ -213,9 +242,7 @@ def test_exported_dome_and_leds_have_the_scene_s_positions() -> None:
 def test_a_flat_panel_is_a_disk_at_its_height_that_covers_its_leds() -> None:
     flat = {"light.surface": "{kind: flat, apex: 1.2 m}", "light.layout.cap_deg": "20"}
     scene, vehicle, sources = dome_lab(flat)
-    shell = vertices_m(
-        *loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL)), "stage_dome_"
-    )
+    shell = vertices_m(*loaded(mjcf(vehicle, scene, sources, LEVEL)), "stage_dome_")
     np.testing.assert_allclose(shell[:, 2], 1.2, rtol=0, atol=1e-6)
     assert np.hypot(*shell[:, :2].T).max() > np.hypot(*sources.place[:, :2].T).max()
 
@@ -226,7 +253,7 @@ def test_a_dome_for_a_room_ends_at_its_cap_and_stands_in_the_room() -> None:
     sphere = "{kind: sphere, apex: 1.2 m, radius: 1.2 m}"
     changes = {"light.surface": sphere, "light.layout.cap_deg": "25", "light.room": room}
     scene, vehicle, sources = dome_lab(changes)
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, data = loaded(mjcf(vehicle, scene, sources, LEVEL))
     shell = vertices_m(model, data, "stage_dome_")
     tilt_rad = np.arctan2(np.hypot(shell[:, 0], shell[:, 1]), shell[:, 2])
     assert np.degrees(tilt_rad.max()) == pytest.approx(25, abs=1e-3)
@@ -241,7 +268,7 @@ def test_a_dome_for_a_room_ends_at_its_cap_and_stands_in_the_room() -> None:
 def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
     """OpenGL draws a triangle whose corners go against the clock's hands as seen by the eye."""
     scene, vehicle, sources = dome_lab()
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, data = loaded(mjcf(vehicle, scene, sources, LEVEL))
     middle = surface.build_surface(scene.light.surface).center_m
     for name, sign in (("inside", -1), ("outside", 1)):
         mesh = model.mesh(f"stage_dome_{name}")
@@ -254,7 +281,7 @@ def test_the_dome_s_sheets_face_inwards_and_outwards() -> None:
 def test_the_field_s_corners_are_the_chip_s_projected_onto_the_dome() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", [30.0, 8.0, -5.0], degrees=True)
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body))
+    model, data = loaded(mjcf(vehicle, scene, sources, lab_from_body))
     here = multibody.camera_mount(vehicle)
     corner = vertices_m(model, data, "stage_field")
     tip_m = lab_from_body.apply(here.camera_body_m)
@@ -273,9 +300,7 @@ def test_the_field_s_corners_are_the_chip_s_projected_onto_the_dome() -> None:
 
 def test_the_brightest_stars_are_on_a_sphere_in_their_true_directions() -> None:
     scene, vehicle, sources, lab_from_body = star_lab()
-    grains = vertices_m(
-        *loaded(mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_"
-    )
+    grains = vertices_m(*loaded(mjcf(vehicle, scene, sources, lab_from_body)), "stage_stars_")
     star_m = grains.reshape(-1, 6, 3).mean(axis=1)
     assert len(star_m) == mjcf_export.MAX_STARS
     np.testing.assert_allclose(
@@ -299,7 +324,7 @@ SURFACES = {
 @pytest.mark.parametrize("surface", SURFACES)
 def test_the_lab_camera_sees_the_whole_dome_and_vehicle(surface: str) -> None:
     scene, vehicle, sources = dome_lab(SURFACES[surface])
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, data = loaded(mjcf(vehicle, scene, sources, LEVEL))
     hardware = data.geom_xpos[model.body_rootid[model.geom_bodyid] == model.body("bus").id]
     deck_m = [[0.45 * np.cos(a), 0.45 * np.sin(a), -0.2] for a in np.arange(12) * np.pi / 6]
     parts = [
@@ -317,8 +342,8 @@ def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
     scene, vehicle, sources = dome_lab()
     star_scene, star_vehicle, stars, lab_from_body = star_lab()
     for text in (
-        mjcf_export.mjcf(vehicle, scene, sources, LEVEL),
-        mjcf_export.mjcf(star_vehicle, star_scene, stars, lab_from_body),
+        mjcf(vehicle, scene, sources, LEVEL),
+        mjcf(star_vehicle, star_scene, stars, lab_from_body),
     ):
         model, data = loaded(text)
         azimuth, elevation = np.radians(
@@ -337,7 +362,7 @@ def test_the_viewer_starts_where_the_lab_s_camera_looks() -> None:
 def test_the_edges_of_the_camera_s_field_are_thin_capsules_along_it() -> None:
     """Each ray from the camera to a corner, and each edge between corners: under a hundredth of its length thick."""
     scene, vehicle, sources = dome_lab()
-    model, data = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, data = loaded(mjcf(vehicle, scene, sources, LEVEL))
     tip_m = multibody.camera_mount(vehicle).camera_body_m
     corner_m = vertices_m(model, data, "stage_field")
     corner_m = corner_m[np.linalg.norm(corner_m - tip_m, axis=1) > 0.1]
@@ -381,8 +406,8 @@ def opengl() -> None:
 def drawn(opengl: None) -> Drawn:
     """The dome with its LEDs, the vehicle level and tilted; and the same without LEDs."""
     scene, vehicle, sources = dome_lab()
-    text = mjcf_export.mjcf(vehicle, scene, sources, LEVEL)
-    dark = mjcf_export.mjcf(vehicle, scene, sources.take(np.zeros(len(sources), bool)), LEVEL)
+    text = mjcf(vehicle, scene, sources, LEVEL)
+    dark = mjcf(vehicle, scene, sources.take(np.zeros(len(sources), bool)), LEVEL)
     lit = np.array(list(scene_picture.film(text, states(LEVEL, TILTED), SIZE_PX)), float)
     return (
         sources,
@@ -446,7 +471,7 @@ def test_the_picture_changes_where_the_vehicle_tilts(drawn: Drawn) -> None:
 def test_stars_are_drawn_around_a_free_vehicle(opengl: None) -> None:
     """The room is black: whatever is white and small is a star, and half of the sphere or less is in the field."""
     scene, vehicle, sources, lab_from_body = star_lab()
-    text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
+    text = mjcf(vehicle, scene, sources, lab_from_body)
     drawn = scene_picture.picture(text, states(lab_from_body), SIZE_PX)
     count, _, boxes, _ = cv2.connectedComponentsWithStats(
         (drawn.min(axis=2) > 90).astype(np.uint8)
@@ -530,7 +555,7 @@ def test_the_backdrop_is_dim_and_space_is_black(on_earth: bool) -> None:
 
 def test_all_colors_are_within_zero_and_one() -> None:
     scene, vehicle, sources = dome_lab()
-    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, _ = loaded(mjcf(vehicle, scene, sources, LEVEL))
     for colors in (model.geom_rgba, model.mat_rgba, model.site_rgba):
         assert len(colors)
         assert colors.min() >= 0
@@ -539,7 +564,7 @@ def test_all_colors_are_within_zero_and_one() -> None:
 
 def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
     scene, vehicle, sources = dome_lab()
-    model, _ = loaded(mjcf_export.mjcf(vehicle, scene, sources, LEVEL))
+    model, _ = loaded(mjcf(vehicle, scene, sources, LEVEL))
     tendons = [(model.tendon(k).name, model.tendon_group[k]) for k in range(model.ntendon)]
     sites = [(model.site(k).name, model.site_group[k]) for k in range(model.nsite)]
     for named in (tendons, sites):
@@ -563,7 +588,7 @@ def test_the_tilt_stop_is_hidden_and_no_hardware_is() -> None:
 def test_the_shapes_of_a_laboratory_are_the_file_s_without_its_lights() -> None:
     scene, vehicle, sources = dome_lab()
     lab_from_body = Rotation.from_euler("ZYX", (30.0, -5.0, 10.0), degrees=True)
-    text = mjcf_export.mjcf(vehicle, scene, sources, lab_from_body)
+    text = mjcf(vehicle, scene, sources, lab_from_body)
     lab = multibody.Laboratory(text)
     (model, data) = loaded(text)
     by_name = {shape.name: shape for shape in lab.shapes}

@@ -395,7 +395,7 @@ def test_pid_flies_the_afit_maneuver() -> None:
         return wanted
 
     flight = multibody.simulate(
-        flown, start_attitude(motion), STILL, reference.duration_s, steer
+        flown, start_attitude(motion, ()), STILL, reference.duration_s, steer
     )
     t = np.append(np.arange(0, reference.duration_s, 0.2), reference.duration_s)
     error_deg = np.degrees((reference.attitudes(t).inv() * flight.attitude_at(t)).magnitude())

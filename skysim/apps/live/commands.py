@@ -24,7 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, check_name
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats
 from skysim.dynamics.flight_computer import Commands
@@ -37,6 +37,8 @@ LEAST_VARIANCE_RAD2 = 1e-18  # about each axis: the filter loses less than 0.000
 MOST_VARIANCE_RAD2 = 1.0
 ROUNDING = 1e-9  # relative difference of what is symmetric
 QUATERNION_TOLERANCE = 1e-3  # of the length of a quaternion
+# Of a command, beside the actuators of its scene.
+KEYS = ("torque_nm", "attitude", "exposure_s", "triggered", "trigger", "abort")
 SOLUTION_KEYS = ("t_s", "cam_from_ref_xyzw", "covariance_rad2")
 
 Reply = Callable[[str], None]
@@ -131,6 +133,9 @@ class CommandState:
         """Check a command as a whole, then take it. Raises InputError."""
         flight = self.flight
         schedule = flight.schedules[0]
+        allowed = (*KEYS, *flight.motion.flight_computer.actuator_sets)
+        for key in command:
+            check_name("", "key", key[:40], allowed)
         actuators = dict(command)
         exposure_s = actuators.pop("exposure_s", None)
         if exposure_s is not None:

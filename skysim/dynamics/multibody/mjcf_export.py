@@ -21,7 +21,6 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Floats, Ints, Mount, Sources, normalized
-from skysim.dynamics import guidance
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -56,7 +55,11 @@ FIELD_RGB = np.array([0.25, 0.75, 1.0])
 
 
 def mjcf(
-    vehicle: VehicleModel, scene: Scene, sources: Sources, lab_from_body: Rotation
+    vehicle: VehicleModel,
+    scene: Scene,
+    sources: Sources,
+    lab_from_body: Rotation,
+    rate_rad_s: Floats,
 ) -> str:
     """The laboratory as the text of one MJCF file, which MuJoCo's own viewer can open and simulate.
 
@@ -71,8 +74,8 @@ def mjcf(
     ----------
     sources
         LEDs in lab coordinates (m), or stars; the brightest stars are put on a sphere
-    lab_from_body
-        Attitude in the keyframe `start`, which also has the scene's speeds and gimbal angles
+    lab_from_body, rate_rad_s
+        Attitude and (3,) rate in body axes in the keyframe `start`, which also has the scene's speeds and gimbal angles
 
     Raises
     ------
@@ -106,7 +109,6 @@ def mjcf(
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
     add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
-    rate_rad_s = guidance.body_rate_rad_s(scene, lab_from_body)
     start = Simulation(vehicle, lab_from_body, rate_rad_s, 0.0).data
     spec.add_key(
         name="start", qpos=start.qpos, qvel=start.qvel, act=start.act, ctrl=start.ctrl

@@ -476,7 +476,7 @@ def measure(
     with closing(engine), store.writing(folder / store.STORE) as kept:
         # The rates that an earlier call has added.
         points = kept.points()[len(cells) :: 2]
-        added = (point.levels.get("cell", "").partition(" ")[0] for point in points)
+        added = (str(point.levels.get("cell")).partition(" ")[0] for point in points)
         designer.add_faster(cells, (name for name in added if name in RATES))
         plan = planned(path, scene_name, designer, overrides, cells)
         runner.prepare_store(plan, kept, resume=kept.counts()["done"] > 0)

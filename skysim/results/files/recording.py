@@ -256,8 +256,9 @@ def write_fits(path: Path, frame: Frame, truth: Truth, scene: Scene) -> None:
         comment = (
             "WCS: of the true mean attitude in the exposure; apparent directions in ICRS axes"
         )
-    with atomic_file(path) as temporary:
-        fits_image(frame, scene, cards, comment).writeto(temporary, overwrite=True)
+    image = fits_image(frame, scene, cards, comment)
+    with atomic_file(path, image.filebytes()) as temporary:
+        image.writeto(temporary, overwrite=True)
 
 
 def fits_image(frame: Frame, scene: Scene, wcs_cards: Any, comment: str) -> Any:

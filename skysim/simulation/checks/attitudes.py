@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.types import Floats
-from skysim.dynamics import guidance, multibody
+from skysim.dynamics import multibody
 from skysim.simulation.lab import Lab
 
 MAX_FRAMES = 400  # frames among which the fastest and the most tilted one are sought
@@ -93,7 +93,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
     jitter, _ = jitter_in_exposures(lab, t_s, exposure.time_s)
     if scene.motion.control is None:
         # Without a controller the rate is the initial one.
-        rates = guidance.body_rate_rad_s(scene, lab.start)
+        rates = lab.start_rate_rad_s
         lab_from_body = lab.start * Rotation.from_rotvec(np.outer(t_s, rates))
     else:
         reference = lab.reference

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
+import re
 import sys
 import time
 from collections import Counter
@@ -247,6 +249,25 @@ def test_a_full_disk_leaves_a_whole_file_and_counts_what_it_lacks(
     assert len(images) == sink.sent["frame"] == room // (3_840_000 + 100)
     for index, image in enumerate(images):
         assert bytes(image.data) == noisy_frame(flown, index).pixels.tobytes()
+
+
+@pytest.mark.parametrize("step", ["add_message", "finish"])
+def test_the_message_of_a_full_disk_says_that_whole_chunks_are_kept(
+    flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path = tmp_path / "flight.mcap"
+    sink = McapSink(RosEncoder(flown.live), path)
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(sink.writer, step, full)
+    sink.offer(noisy_frame(flown, 0), patient=True)
+    sink.close()
+    assert re.fullmatch(
+        rf"{path}: No space left on device; \S+ MB are free, its whole chunks are kept",
+        sink.fault,
+    )
 
 
 def test_a_file_is_never_overwritten(flown: Flown, tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from estimator.core.types import ra_dec_roll_rad
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd, ut1_jd
-from skysim.dynamics import guidance
 from skysim.experiments.study.execution.detections import simulate_detections
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene import loader
@@ -79,7 +78,7 @@ def test_the_earth_turns_about_its_pole_of_the_date() -> None:
 def test_a_sidereal_rate_is_the_earth_s_in_body_axes() -> None:
     scene = loader.load("ptase_table_2")
     lab = build_lab(scene)
-    rate = guidance.body_rate_rad_s(scene, lab.start)
+    rate = lab.start_rate_rad_s
     np.testing.assert_allclose(
         lab.start.apply(rate), earth_rate_rad_s(scene.start_time), rtol=0, atol=1e-18
     )

@@ -25,6 +25,7 @@ from skysim.experiments.study.execution.outcomes import Outcome
 from skysim.experiments.study.execution.trials import Row, TrialSetup
 from skysim.experiments.study.factors import Point
 from skysim.experiments.study.report import maps
+from tests.helpers.clusters import study
 from tests.helpers.study_stores import STRAYS, contents, done, queue_of
 
 
@@ -283,6 +284,58 @@ def test_a_row_that_is_none_of_the_study_s_is_refused(
             pass
         assert str(refused.value).startswith(f"{path}: not a valid study store: {message}")
         assert "; allowed: " in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("levels", "message"),
+    [
+        (
+            '{"renamed": 0}',
+            r": not a valid study store: point 0 of 3, levels of renamed; .*, levels of strays$",
+        ),
+        (
+            "{}",
+            r": not a valid study store: point 0 of 3, levels of no factor; .*, levels of strays$",
+        ),
+        ('{"strays": 7}', r": its points are not the study's"),
+        ('{"strays": [1]}', r": its points are not the study's"),
+    ],
+)
+def test_levels_that_are_none_of_the_study_s_are_refused_at_all_points(
+    tmp_path: Path, levels: str, message: str
+) -> None:
+    plan = study(tmp_path, STRAYS.replace("40", "1"))
+    path = tmp_path / "odd.sqlite"
+    done(plan, path)
+    with closing(sqlite3.connect(path)) as db, db:
+        assert db.execute("UPDATE points SET levels = ?", (levels,)).rowcount == 3
+    with pytest.raises(InputError, match=message):
+        done(plan, path, resume=True)
+
+
+def test_a_study_whose_factors_have_another_order_is_not_resumed(tmp_path: Path) -> None:
+    """Its points have other numbers, so that new trials would be stored as those of other levels."""
+    factors = (
+        "strays: {key: trial.false_lights, values: [0, 5]}",
+        "noise: {key: trial.noise_px, values: [0.1, 3]}",
+    )
+    plans = [
+        study(
+            tmp_path,
+            STRAYS.replace("40", "1").replace(
+                "strays: {key: trial.false_lights, values: [0, 5, 9]}", ", ".join(one)
+            ),
+        )
+        for one in (factors, factors[::-1])
+    ]
+    path = tmp_path / "s.sqlite"
+    done(plans[0], path)
+    assert plans[0].digest == plans[1].digest
+    assert done(plans[0], path, resume=True).now == 0
+    with pytest.raises(
+        InputError, match=r"factors in another order; allowed: another store, or"
+    ):
+        done(plans[1], path, resume=True)
 
 
 def test_several_rows_of_a_trial_are_refused(tmp_path: Path) -> None:

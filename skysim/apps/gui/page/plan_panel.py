@@ -331,10 +331,11 @@ def survey_flight(
     tilted attitudes the vehicle may tilt more than at either; if this exceeds the limit, it is leveled in between.
     Raises InputError.
     """
-    before = forms.validated_scene(scene, overrides)
+    # Without maneuvers, which may not begin with a profile that the start refers to.
+    before = forms.validated_scene(scene, {**overrides, "motion.maneuver": "[]"})
     rate_hz = min(SURVEY_RATE_HZ, before.exposure.rate_hz)
     legs: list[dict[str, object]] = []
-    at = guidance.start_attitude(before.motion)
+    at = guidance.start_attitude(before.motion, ())
     for angles in angles_deg:
         attitude = survey_frames.from_angles(np.array([angles]))[0]
         if greatest_tilt_deg(at, attitude) > before.vehicle.tilt_stop_deg - TILT_MARGIN_DEG:

@@ -42,6 +42,7 @@ from skysim.experiments.study.plan import (
     FlightTrial,
     FrameTrial,
     Plan,
+    digest,
     resolve_point,
 )
 from skysim.results import run_report, scoring, telemetry_report
@@ -245,6 +246,7 @@ def begin_store(
         code=code_version(),
         digest=plan.digest,
         functions=json.dumps(plan.spec.digests),
+        factors=", ".join(plan.study.factors),
         replicates=str(plan.study.replicates),
         overrides=json.dumps(dict(overrides or {})),
     )
@@ -279,8 +281,14 @@ def check_functions(plan: Plan, store: Store) -> None:
 
 
 def check_scene(plan: Plan, store: Store) -> None:
-    """Raise InputError if the scene of the first or the last stored point, or a file it names, has changed."""
+    """Raise InputError if a point, the scene of the first or the last stored one, or a file it names, has changed."""
     points = store.points()
+    if plan.study.optimize is None and digest(points) != digest(plan.points):
+        raise InputError(
+            store.path,
+            "its points are not the study's: other levels, or factors in another order",
+            "another store, or the original study",
+        )
     for point, replicate, stored in store.scenes():
         with store.corruption_as_input_error():
             settings = plan.spec.trial_settings(points[point].settings, replicate)

@@ -71,7 +71,8 @@ CREATE TABLE IF NOT EXISTS parts (
 STRAY = """
 WITH study AS (
   SELECT COALESCE(MAX(CAST(value AS INTEGER)), 0) AS each, (SELECT COUNT(*) FROM points) AS points,
-    (SELECT group_concat(key, ', ') FROM json_each((SELECT levels FROM points ORDER BY point LIMIT 1))) AS factors
+    COALESCE((SELECT value FROM meta WHERE key = 'factors'), (SELECT group_concat(key, ', ') FROM json_each(
+      (SELECT levels FROM points ORDER BY point LIMIT 1)))) AS factors
   FROM meta WHERE key = 'replicates')
 SELECT 'not a valid study store: trial ' || trial || ', point ' || quote(point) || ', replicate ' || quote(replicate),
   'trial ' || each || ' * point + replicate, of ' || points || ' points and ' || each || ' replicates'
