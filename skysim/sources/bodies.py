@@ -33,8 +33,6 @@ Albedo = tuple[float, float, float, float]
 # Effective wavelengths of B, V, Cousins' R and I (Bessell 2005, ARA&A 43, 293).
 BANDS_M = (438e-9, 545e-9, 641e-9, 798e-9)
 WHITE: Albedo = (1.0, 1.0, 1.0, 1.0)
-# B-V = 0.85, that of Europa, Ganymede and Callisto within 0.02. Io's is 1.17, Vesta's 0.78 and Ceres's 0.71.
-ICE_AND_ROCK: Albedo = (0.832, 1.0, 1.0, 1.0)
 
 
 def reflected_flux_e_s_m2(v_mag: float, albedo: Albedo, band: Band) -> float:
@@ -89,13 +87,14 @@ class Body(NamedTuple):
     law
         Law of its surface's brightness, see `body_discs.brightness`
     albedo
-        Albedos at BANDS_M; only their ratios count
+        Albedos at BANDS_M; only their ratios count. If not given, B-V is 0.85, as that of Europa, Ganymede and Callisto
+        within 0.02 (Io's is 1.17, Vesta's 0.78 and Ceres's 0.71), and they are gray beyond V
     """
 
     naif: int
     radius_km: float
     law: int = LOMMEL_SEELIGER
-    albedo: Albedo = ICE_AND_ROCK
+    albedo: Albedo = (0.832, 1.0, 1.0, 1.0)
 
     @property
     def id(self) -> int:

@@ -56,7 +56,7 @@ class Ephemeris(NamedTuple):
     earth_moon_ratio: float
     series: dict[str, ChebyshevSeries]
     moons_rad_day: Floats
-    moons_km: NDArray[np.complex128]
+    moons_km: NDArray
 
     def position_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km, ICRS axes: from the solar system's barycenter, or from the body that CENTERS gives.

@@ -239,7 +239,8 @@ class Refraction:
         across = zenith - cosine[:, None] * directions
         sine = np.linalg.norm(across, axis=1)
         zenith_rad = np.arctan2(sine, cosine)
-        half_rad = (scale - 1) / 2 * self.bending_rad(zenith_rad)
-        bending = scale * self.bending_rad(zenith_rad - half_rad)
+        bending = scale * self.bending_rad(
+            zenith_rad - (scale - 1) / 2 * self.bending_rad(zenith_rad)
+        )
         along = np.sin(bending) / np.maximum(sine, 1e-12)
         return np.cos(bending)[:, None] * directions + along[:, None] * across
