@@ -247,11 +247,12 @@ class Scene(ConfigModel, metaclass=SceneKind):
             raise InputError(
                 "motion.rate_deg_s", "sidereal requires light of kind stars", "[0, 0, 0]"
             )
-        if not sky and any(glow.kind == "faint_stars" for glow in self.background):
-            raise InputError(
-                "background",
-                f"faint_stars requires light of kind stars, not {self.light.kind}",
-            )
+        for glow in self.background:
+            if not sky and glow.kind in ("faint_stars", "zodiacal"):
+                raise InputError(
+                    "background",
+                    f"{glow.kind} requires light of kind stars, not {self.light.kind}",
+                )
         read_s = getattr(self.camera.shutter, "row_time_s", 0.0) * (self.camera.height_px - 1)
         if read_s > 1 / self.exposure.rate_hz:
             raise InputError(

@@ -185,8 +185,7 @@ class Air:
     wavelength_m
         Wavelength of scintillation: the mean of a G2 star's photo-electrons
     dispersion
-        (N + 1,) refraction at the stars' mean colors, over that at the weather's wavelength; the Sun's is the last. A
-        star's is that of its refractivity: 1 % of the difference is missing at an altitude of 5 deg
+        (N + 1,) refractivity at the stars' mean colors, over that at the weather's wavelength; the Sun's is the last
     """
 
     config: AirConfig

@@ -81,19 +81,20 @@ class Body(NamedTuple):
     Attributes
     ----------
     naif
-        NAIF's number of the body
+        NAIF's number of the body; an asteroid's is less 2,000,000
     radius_km
         Mean radius
     law
         Law of its surface's brightness, see `body_discs.brightness`
     albedo
-        Albedos at BANDS_M; only their ratios count
+        Albedos at BANDS_M; only their ratios count. If not given, B-V is 0.85, as that of Europa, Ganymede and Callisto
+        within 0.02 (Io's is 1.17, Vesta's 0.78 and Ceres's 0.71), and they are gray beyond V
     """
 
     naif: int
     radius_km: float
-    law: int
-    albedo: Albedo
+    law: int = LOMMEL_SEELIGER
+    albedo: Albedo = (0.832, 1.0, 1.0, 1.0)
 
     @property
     def id(self) -> int:
@@ -103,9 +104,7 @@ class Body(NamedTuple):
 # Planets: geometric albedos of Mallama, Krobusek & Pavlov 2017, Icarus 282, 19 (arXiv:1609.05048), table 7. The Moon,
 # relative to V: Kieffer & Stone 2005, AJ 129, 2887, equation 10 and table 4 at a phase angle of 45 degrees without
 # libration, smoothed by a parabola in the logarithms; it reddens by 0.1 mag in V-I from full to quarter.
-BODIES = {
-    "sun": Body(10, 695_700.0, LIMB_DARKENED, WHITE),
-    "moon": Body(301, 1737.4, LOMMEL_SEELIGER, (0.786, 1.0, 1.169, 1.402)),
+PLANETS = {
     "mercury": Body(199, 2439.4, LOMMEL_SEELIGER, (0.105, 0.142, 0.158, 0.180)),
     "venus": Body(299, 6051.8, LAMBERT, (0.658, 0.689, 0.658, 0.640)),
     "mars": Body(499, 3389.5, LOMMEL_SEELIGER, (0.088, 0.170, 0.250, 0.285)),
@@ -113,6 +112,20 @@ BODIES = {
     "saturn": Body(699, 58_232.0, LAMBERT, (0.339, 0.499, 0.646, 0.543)),
     "uranus": Body(799, 25_362.0, LAMBERT, (0.561, 0.488, 0.264, 0.089)),
     "neptune": Body(899, 24_622.0, LAMBERT, (0.562, 0.442, 0.226, 0.072)),
+}
+MINOR = {
+    "io": Body(501, 1821.5),
+    "europa": Body(502, 1560.8),
+    "ganymede": Body(503, 2631.2),
+    "callisto": Body(504, 2410.3),
+    "ceres": Body(1, 470.0),
+    "vesta": Body(4, 255.0),
+}
+BODIES = {
+    "sun": Body(10, 695_700.0, LIMB_DARKENED, WHITE),
+    "moon": Body(301, 1737.4, LOMMEL_SEELIGER, (0.786, 1.0, 1.169, 1.402)),
+    **PLANETS,
+    **MINOR,
 }
 NAMES = {body.id: name.capitalize() for name, body in BODIES.items()}
 
@@ -195,8 +208,12 @@ def bodies_from(config: BodiesConfig, observer: ObserverPlace, band: Band) -> li
 
 def chosen(config: BodiesConfig) -> list[str]:
     """The names of the bodies that the section switches on."""
-    planets = [name for name in BODIES if name not in ("sun", "moon")]
-    return ["sun"] * config.sun + ["moon"] * config.moon + planets * config.planets
+    return (
+        ["sun"] * config.sun
+        + ["moon"] * config.moon
+        + list(PLANETS) * config.planets
+        + list(MINOR) * config.minor
+    )
 
 
 def body_light(name: str, at: Place, tt_jd: float, band: Band) -> BodyLight:

@@ -1,4 +1,4 @@
-"""Sunlight from the Moon and the planets: V magnitudes by phase, and how brightness is distributed over a disc.
+"""Sunlight from moons, planets and asteroids: V magnitudes by phase, and how brightness is distributed over a disc.
 
 The disc's plane is spanned by x, toward the Sun (the bright limb), and y; its rim is the unit circle. At (x, y) the
 cosine of the emission angle is mu = sqrt(1 - x^2 - y^2), and at a phase angle a that of the incidence angle is
@@ -348,6 +348,8 @@ def magnitude(name: str, place: Place, tt_jd: float) -> float:
         return moon_magnitude(place.distance_km, sun_au, phase_deg)
     if name in PLANETS:
         at_1_au = PLANETS[name](phase_deg, place, tt_jd)
+    elif name in ASTEROIDS:
+        at_1_au = asteroid(phase_deg, *ASTEROIDS[name])
     else:
         at_1_au = by_phase(name, phase_deg)
     return float(5 * np.log10(sun_au * place.distance_km / AU_KM) + at_1_au)
@@ -408,6 +410,10 @@ PHASE_LAWS: dict[str, dict[float, tuple[float, ...]]] = {
     "jupiter": {180.0: (-9.395, -3.7e-4, 6.16e-4)},
     "uranus": {3.1: (0.0,), 180.0: (0.0, 6.587e-3, 1.045e-4)},
     "neptune": {1.9: (0.0,), 180.0: (0.0, 7.944e-3, 9.617e-5)},
+    "io": {180.0: (-1.68, 0.046, -0.0010)},
+    "europa": {180.0: (-1.41, 0.0312, -0.00125)},
+    "ganymede": {180.0: (-2.09, 0.0323, -0.00066)},
+    "callisto": {180.0: (-1.05, 0.078, -0.00274)},
 }
 
 
@@ -449,6 +455,19 @@ def neptune(phase_deg: float, _place: Place, tt_jd: float) -> float:
     at_full = min(max(-6.89 - 0.0054 * (year - 1980), -7.0), -6.89)
     return at_full + by_phase("neptune", phase_deg)
 
+
+def asteroid(phase_deg: float, h_mag: float, slope: float) -> float:
+    """V magnitude of an asteroid at 1 au from Sun and observer, by its H and G (Bowell et al. 1989, Asteroids II, 524).
+
+    H - 2.5 log10((1 - G) exp(-3.33 t^0.63) + G exp(-1.87 t^1.22)), with t = tan(a / 2) of the phase angle.
+    """
+    tangent = math.tan(math.radians(phase_deg) / 2)
+    steep = (1 - slope) * math.exp(-3.33 * tangent**0.63)
+    return h_mag - 2.5 * math.log10(steep + slope * math.exp(-1.87 * tangent**1.22))
+
+
+# H and G of asteroids (Minor Planet Center).
+ASTEROIDS = {"ceres": (3.34, 0.12), "vesta": (3.20, 0.32)}
 
 # Planets whose magnitude depends on more than the phase.
 PLANETS: dict[str, Callable[[float, Place, float], float]] = {

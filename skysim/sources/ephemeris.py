@@ -1,7 +1,8 @@
-"""The solar system: barycentric positions, the observer's place, and apparent places of Sun, Moon and planets.
+"""The solar system: barycentric positions, the observer's place, and apparent places of Sun, Moon, planets and others.
 
-Positions are Chebyshev series fitted to JPL's DE423, made by `data/ephemeris/build.py`. They are within 0.005" of DE423
-as seen from the Earth, over 1972 to 2100.
+Positions are Chebyshev series fitted to JPL's DE423, of Ceres and Vesta to JPL's SB441-N16, made by
+`data/ephemeris/build.py`. They are within 0.005" of them as seen from the Earth, over 1972 to 2100. Jupiter's moons are
+sums of vibrations, within 0.3" of JPL's JUP365.
 """
 
 import datetime
@@ -18,7 +19,10 @@ from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Floats
 from skysim.scene.sections.vehicle import SiteConfig
 
-EPHEMERIS = DATA / "ephemeris" / "de423.npz"
+EPHEMERIS = DATA / "ephemeris" / "bodies.npz"
+GALILEAN = ("io", "europa", "ganymede", "callisto")
+# Bodies whose position is given from another one.
+CENTERS = {"moon": "earth"} | dict.fromkeys(GALILEAN, "jupiter")
 
 
 class ChebyshevSeries(NamedTuple):
@@ -40,18 +44,32 @@ class ChebyshevSeries(NamedTuple):
 
 
 class Ephemeris(NamedTuple):
-    """The series of all bodies, from first_jd (TDB) on, and the ratio of the Earth's mass to the Moon's."""
+    """The series of all bodies, from first_jd (TDB) on, and the ratio of the Earth's mass to the Moon's.
+
+    Attributes
+    ----------
+    moons_rad_day, moons_km
+        (4, K) rates and (4, K, 3) complex amplitudes of the vibrations of Jupiter's moons
+    """
 
     first_jd: float
     earth_moon_ratio: float
     series: dict[str, ChebyshevSeries]
+    moons_rad_day: Floats
+    moons_km: NDArray
 
     def position_km(self, name: str, tdb_jd: float) -> Floats:
-        """(3,) position in km, ICRS axes: from the solar system's barycenter, the Moon's from the Earth.
+        """(3,) position in km, ICRS axes: from the solar system's barycenter, or from the body that CENTERS gives.
 
         x(t) = sum_k c_k T_k(s), with s from -1 to 1 over the interval. The outer planets' places are their systems'
-        barycenters: Jupiter and Saturn are up to 0.07" from them.
+        barycenters: Jupiter and Saturn are up to 0.07" from them. Jupiter's moons, whose orbits perturb each other
+        quasi-periodically, are at x(t) = Re sum_k c_k exp(i w_k t), fitted to the theory L1.2 (Lainey, Duriez & Vienne
+        2006, A&A 456, 783).
         """
+        if name in GALILEAN:
+            moon = GALILEAN.index(name)
+            turned = np.exp(1j * self.moons_rad_day[moon] * (tdb_jd - self.first_jd))
+            return (turned @ self.moons_km[moon]).real
         if name == "earth":
             # The Earth is opposite to the Moon about their barycenter.
             to_moon_km = self.position_km("moon", tdb_jd)
@@ -66,11 +84,10 @@ class Ephemeris(NamedTuple):
         return np.cos(angle * np.arange(len(coefficients))) @ coefficients
 
     def barycentric_km(self, name: str, tdb_jd: float) -> Floats:
-        """(3,) position in km from the solar system's barycenter, for the Moon too."""
+        """(3,) position in km from the solar system's barycenter, for moons too."""
         position_km = self.position_km(name, tdb_jd)
-        return (
-            position_km + self.position_km("earth", tdb_jd) if name == "moon" else position_km
-        )
+        center = CENTERS.get(name)
+        return position_km + self.position_km(center, tdb_jd) if center else position_km
 
 
 @lru_cache(maxsize=1)
@@ -86,7 +103,13 @@ def load_ephemeris() -> Ephemeris:
             )
             for name in names
         }
-        return Ephemeris(float(arrays["first_jd"]), float(arrays["earth_moon_ratio"]), series)
+        return Ephemeris(
+            float(arrays["first_jd"]),
+            float(arrays["earth_moon_ratio"]),
+            series,
+            arrays["moons_rad_day"],
+            arrays["moons_km"],
+        )
 
 
 # The observer: at the Earth's center or at a site on the turning Earth.
@@ -157,7 +180,7 @@ def earth_rate_rad_s(time: datetime.datetime) -> Floats:
     return EARTH_RATE_RAD_S * pole
 
 
-# Apparent places of the Sun, the Moon and the planets, with distances and the geometry of their light.
+# Apparent places of the bodies, with distances and the geometry of their light.
 
 
 # Of `erfa.ld`: within 3' of the Sun's center its deflection is reduced

@@ -216,6 +216,11 @@ class Refraction:
     ) -> Floats:
         """Turn directions toward the zenith, each in its vertical plane.
 
+        Light of another color, with s times the refractivity, is bent by s R(z - (s - 1) R(z) / 2): to second order in
+        the refractivity a, refraction is a f(z - R / 2) of the zenith distance z without air, since it is
+        a tan z' + a^2 / 2 tan^3 z' of the apparent one, z' = z - R, apart from terms that are linear in a (Stone 1996,
+        PASP 108, 1051, equation 4). The difference between colors is within 0.1 % above an altitude of 2 deg.
+
         Parameters
         ----------
         directions
@@ -233,6 +238,9 @@ class Refraction:
         cosine = directions @ zenith
         across = zenith - cosine[:, None] * directions
         sine = np.linalg.norm(across, axis=1)
-        bending = scale * self.bending_rad(np.arctan2(sine, cosine))
+        zenith_rad = np.arctan2(sine, cosine)
+        bending = scale * self.bending_rad(
+            zenith_rad - (scale - 1) / 2 * self.bending_rad(zenith_rad)
+        )
         along = np.sin(bending) / np.maximum(sine, 1e-12)
         return np.cos(bending)[:, None] * directions + along[:, None] * across

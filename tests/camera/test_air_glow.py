@@ -15,7 +15,7 @@ from skysim.camera.glow.background import (
 )
 from skysim.core.types import Floats
 from skysim.scene.loader import load
-from skysim.scene.sections.surroundings import SkyGlowConfig
+from skysim.scene.sections.surroundings import AirGlowConfig, SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
 from skysim.simulation.lights.atmosphere import AirEffects, AirGlow
@@ -51,6 +51,29 @@ def test_airglow_is_proportional_to_the_path_through_its_shell() -> None:
     assert mag_arcsec2(float(dark[0])) == pytest.approx(21.7, abs=1e-9)
     assert (np.diff(dark) > 0).all()
     assert airglow_nl(21.7, zenith, 0.3)[-1] < dark[-1] * 10 ** (-0.4 * 0.3 * 2)
+
+
+def test_the_dark_sky_is_paranal_s() -> None:
+    """Patat 2003, A&A 400, 1183: V 21.61 +- 0.20 at the zenith, and by his equation C.3 as 0.4 + 0.6 X below it.
+
+    Without extinction. Taking all light as airglow is 0.23 mag too bright at a zenith distance of 60 deg.
+    """
+    assert AirGlowConfig().dark_mag_arcsec2 == pytest.approx(21.61, abs=0.20)
+    zenith = np.radians([0.0, 30.0, 45.0, 60.0])
+    masses = (1 - 0.96 * np.sin(zenith) ** 2) ** -0.5
+    patat = 21.7 - 2.5 * np.log10(0.4 + 0.6 * masses)
+    found = [mag_arcsec2(float(each)) for each in airglow_nl(21.7, zenith, 0.0)]
+    np.testing.assert_allclose(patat - found, [0.0, 0.05, 0.13, 0.23], atol=0.015)
+
+
+def test_airglow_is_van_rhijn_s_at_leinert_s_height() -> None:
+    """Leinert et al. 1998, A&AS 127, 1, section 4: a layer at 100 km; 2 % fainter here to 60 deg, 7 % to 80 deg."""
+    for zenith_deg, part in ((30.0, 0.003), (60.0, 0.02), (80.0, 0.08)):
+        sine = 6371 / 6471 * np.sin(np.radians(zenith_deg))
+        layer = (1 - sine**2) ** -0.5
+        assert float(diffuse_air_mass(np.radians(zenith_deg))) == pytest.approx(
+            layer, rel=part
+        )
 
 
 def test_twilight_at_the_zenith_matches_paranal() -> None:

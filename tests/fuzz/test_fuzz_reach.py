@@ -47,6 +47,7 @@ OUT_OF_REACH = {
     "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.live.http.Handler.do_GET": SHIPPED,
+    "skysim.camera.glow.background.zodiacal_table": SHIPPED,
     "skysim.apps.live.ros.Topic.definition": SHIPPED,
     "skysim.apps.live.wire.WireClient.read": "lines of a socket, each of which goes to `parse`",
     "skysim.apps.plate_solver.picture.load_picture": "hands the file on to `read_picture`",

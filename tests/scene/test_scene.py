@@ -544,7 +544,7 @@ UNIONS = [
         "exposure: {",
         "background: [{kind: uniform, e_s: 3}, {kind: aurora}]\nexposure: {",
         "background.1.kind",
-        "uniform, sky, moon, stray, faint_stars",
+        "uniform, sky, moon, stray, faint_stars, zodiacal",
     ),
     (
         "control: pid",

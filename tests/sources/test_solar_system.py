@@ -362,7 +362,7 @@ def test_reflected_light_follows_the_albedo() -> None:
 
 def test_the_light_of_all_bodies_is_their_magnitudes() -> None:
     lights = bodies_from(
-        BodiesConfig(),
+        BodiesConfig(minor=True),
         ephemeris.observe_from(datetime.datetime(2012, 6, 24, 21), GEOCENTER),
         BAND,
     )

@@ -13,14 +13,18 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import erfa
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 from scipy.special import erfc
 
 from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
+from skysim.core.paths import DATA
+from skysim.core.time import J2000_JD
 from skysim.core.types import Floats, frozen, normalized
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
@@ -30,6 +34,7 @@ from skysim.scene.sections.surroundings import (
     SkyGlowConfig,
     StrayLightConfig,
     UniformGlowConfig,
+    ZodiacalGlowConfig,
 )
 from skysim.sources.photometry import SUN, Band, sky_radiance_e_s_m2_sr, star_flux_e_s_m2
 from skysim.sources.stars import directions
@@ -124,6 +129,11 @@ class ViewingGeometry:
         throughput = self.optics.throughput(np.cos(field_rad))
         return self.optics.collecting_m2 * throughput * self.pixel_sr
 
+    def electrons_s(self, mag_arcsec2: float, relative: Floats) -> Floats:
+        """(M,) electrons per second and pixel of (M,) surface brightnesses relative to one in V, of the Sun's color."""
+        radiance = sky_radiance_e_s_m2_sr(mag_arcsec2, self.band)
+        return radiance * relative * self.etendue_m2_sr()
+
 
 class PointedCamera(NamedTuple):
     """A camera in the lab: its lens, attitude, entrance pupil (3,) and the response of its chip."""
@@ -167,8 +177,7 @@ def sky_glow(config: SkyGlowConfig, view: ViewingGeometry) -> Floats:
     # Gradient along x, then along y.
     slope = np.degrees(np.arctan2(x, z)) * config.gradient_per_deg[0]
     slope = slope + np.degrees(np.arctan2(y, z)) * config.gradient_per_deg[1]
-    radiance = sky_radiance_e_s_m2_sr(config.mag_arcsec2, view.band)
-    return radiance * np.maximum(1 + slope, 0.0) * view.etendue_m2_sr()
+    return view.electrons_s(config.mag_arcsec2, np.maximum(1 + slope, 0.0))
 
 
 def moon_glow(config: MoonGlowConfig, view: ViewingGeometry) -> Floats:
@@ -259,8 +268,34 @@ def transmittance(
 def faint_star_glow(config: FaintStarsGlowConfig, view: ViewingGeometry) -> Floats:
     """Light of the stars fainter than those that are drawn, by galactic latitude; the lab's axes are the ICRS."""
     s10 = faint_starlight_s10(galactic_latitude_deg(view.toward_lab), config.fainter_than_mag)
-    of_one = sky_radiance_e_s_m2_sr(S10_MAG_ARCSEC2, view.band)
-    return of_one * s10 * view.etendue_m2_sr()
+    return view.electrons_s(S10_MAG_ARCSEC2, s10)
+
+
+def zodiacal_glow(config: ZodiacalGlowConfig, view: ViewingGeometry) -> Floats:
+    """Sunlight that interplanetary dust scatters; the lab's axes are the ICRS.
+
+    Its logarithm is linear in the ecliptic longitude from the Sun and in the latitude between the nodes of
+    `zodiacal_table`. Left out: the light is redder than the Sun's, and over a year it changes by some 10 %, as the dust
+    is inclined to the ecliptic.
+    """
+    longitude_deg, latitude_deg = np.degrees(
+        erfa.c2s(view.toward_lab @ erfa.ecm06(J2000_JD, 0.0).T)
+    )
+    # Both sides of the Sun are alike: from 0 to 180 and back.
+    from_sun_deg = 180 - abs((longitude_deg - config.sun_longitude_deg) % 360 - 180)
+    s10 = np.exp(zodiacal_table().ev(from_sun_deg, abs(latitude_deg)))
+    return view.electrons_s(S10_MAG_ARCSEC2, s10)
+
+
+@lru_cache(maxsize=1)
+def zodiacal_table() -> RectBivariateSpline:
+    """The logarithm of zodiacal light in S10 at ecliptic longitudes from the Sun's, 0 to 180 deg, and latitudes.
+
+    Source: Leinert et al. 1998, A&AS 127, 1, table 17, to 10 or 20 %. It is blank within 15 deg of the Sun, where the
+    light is brighter than here.
+    """
+    s10 = np.loadtxt(DATA / "zodiacal_light.csv", delimiter=",")
+    return RectBivariateSpline(s10[1:, 0], s10[0, 1:], np.log(s10[1:, 1:]), kx=1, ky=1)
 
 
 # Radiance models by kind. To add one, add a class to scene/sections/surroundings.py and a function here.
@@ -270,6 +305,7 @@ BACKGROUNDS: dict[str, Callable[[Any, ViewingGeometry], Floats]] = {
     "moon": moon_glow,
     "stray": stray_light,
     "faint_stars": faint_star_glow,
+    "zodiacal": zodiacal_glow,
 }
 
 

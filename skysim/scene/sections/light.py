@@ -376,15 +376,20 @@ class BodiesConfig(ConfigModel):
     ----------
     planets
         Whether to show Mercury, Venus, Mars, Jupiter, Saturn, Uranus and Neptune
+    minor
+        Whether to show Jupiter's four large moons, Ceres and Vesta; without planets Jupiter does not hide its moons
     """
 
     sun: bool = True
     moon: bool = True
     planets: bool = True
+    minor: bool = False
 
     def check(self) -> None:
-        if not (self.sun or self.moon or self.planets):
-            raise InputError("", "no body is left", "sun, moon or planets, or no bodies")
+        if not (self.sun or self.moon or self.planets or self.minor):
+            raise InputError(
+                "", "no body is left", "sun, moon, planets or minor, or no bodies"
+            )
 
 
 class StarsConfig(ConfigModel):

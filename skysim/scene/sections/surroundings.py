@@ -425,11 +425,25 @@ class FaintStarsGlowConfig(ConfigModel):
     fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
 
 
+class ZodiacalGlowConfig(ConfigModel):
+    """Sunlight scattered by interplanetary dust, for skies of kind stars.
+
+    Attributes
+    ----------
+    sun_longitude_deg
+        Ecliptic longitude of the Sun, 0 at the March equinox, 90 at the June solstice
+    """
+
+    kind: Literal["zodiacal"]
+    sun_longitude_deg: RightAscension
+
+
 Glow = Annotated[
     UniformGlowConfig
     | SkyGlowConfig
     | MoonGlowConfig
     | StrayLightConfig
-    | FaintStarsGlowConfig,
+    | FaintStarsGlowConfig
+    | ZodiacalGlowConfig,
     BY_KIND,
 ]
