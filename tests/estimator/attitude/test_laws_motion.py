@@ -229,6 +229,42 @@ def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
 
 
+def test_streaks_in_one_direction_leave_the_rate_about_it_to_its_prior() -> None:
+    """That of 10 rad/s: a variance of 100 rad^2/s^2, as streaks of lights on the boresight say nothing of the roll."""
+    camera = replace(GLOBAL, distortion=(0.0,) * 5)
+    seen = Moving(
+        Rotation.identity(), np.array([0.02, 0.01, 0.0]), np.tile(camera.center_px, (5, 1))
+    )
+    both = rate.from_streaks(camera, replace(seen, camera=camera).centroids(), EXPOSURE_S)
+    for one in both:
+        assert_allclose(one.covariance_rad2_s2[2], [0, 0, 100], rtol=1e-9, atol=1e-9)
+        # c = -f T J w: 5 chords of 0.1 px each
+        across = STREAK_SIGMA_PX / (camera.focal_px * EXPOSURE_S) / np.sqrt(5)
+        assert_allclose(
+            one.covariance_rad2_s2[:2, :2], across**2 * np.eye(2), rtol=1e-6, atol=0
+        )
+
+
+@pytest.mark.slow
+def test_the_covariance_of_noisy_streaks_is_that_of_their_noise() -> None:
+    """Eight times the claimed: the mean of its unbiased estimates with 3 rates taken from 2 N numbers is 64 times."""
+    factors = []
+    for seed in range(300):
+        rng = np.random.default_rng([26, seed])
+        seen = replace(moving(rng, any_rate(rng, 20.0), 5), camera=GLOBAL)
+        exactly = seen.centroids()
+        assert exactly.streak_px is not None
+        noise_px = 8 * STREAK_SIGMA_PX * rng.standard_normal(exactly.streak_px.shape)
+        noisy = replace(exactly, streak_px=exactly.streak_px + noise_px)
+        claimed, found = (
+            rate.from_streaks(GLOBAL, one, EXPOSURE_S)[0].covariance_rad2_s2
+            for one in (exactly, noisy)
+        )
+        factors.append(np.trace(np.linalg.solve(claimed, found)) / 3)
+    # The chi-square of 7 numbers, divided by 7, has the deviation sqrt(2 / 7).
+    assert np.mean(factors) == pytest.approx(64, rel=4 * np.sqrt(2 / 7 / 300))
+
+
 @law(rolling.fit)
 @given(rng=SEEDS)
 def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:

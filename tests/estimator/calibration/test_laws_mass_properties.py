@@ -393,6 +393,34 @@ def test_the_covariance_of_a_filter_never_grows(rng: np.random.Generator) -> Non
     np.testing.assert_array_equal(first.values, estimates[0].values)
 
 
+def test_a_filter_s_misfit_is_the_chi_square_of_each_number_of_its_innovations() -> None:
+    """Attitudes of 1,000 rad, from the third on, change nothing: the innovations are those of an integrated motion.
+
+    Three numbers an attitude, from the first innovation on.
+    """
+    assumed, vehicle = prior(SMALL, np.random.default_rng(12))
+    part = mass_properties.cut(RECORD, slice(0, 6))
+    sigma_rad = 1e3
+    covariance_rad2 = part.covariance_rad2.copy()
+    covariance_rad2[2:] = sigma_rad**2 * np.eye(3)
+    blind = replace(part, covariance_rad2=covariance_rad2)
+    known = MassEstimate(assumed.values, 1e-12 * np.diag(assumed.sigma**2), 1.0)
+    bias = Rotation.from_rotvec(assumed.values[mass_dynamics.BIAS])
+    states = mass_properties.first_states(blind, vehicle.lab, assumed.values).take(
+        slice(1, 2)
+    )
+    chi2 = 0.0
+    estimates = list(mass_properties.filter_from(known, blind, vehicle.lab, assumed))
+    assert len(estimates) == 4
+    for n, one in enumerate(estimates, 1):
+        states = mass_dynamics.transition(
+            blind, vehicle.lab, n, states, assumed.values, assumed
+        ).after
+        off = (states.rotation[0] * bias).inv() * part.lab_from_body[n + 1]
+        chi2 += off.magnitude() ** 2 / sigma_rad**2
+        assert one.misfit / chi2 == pytest.approx(1 / (3 * n), rel=1e-3)
+
+
 def test_a_longer_record_has_smaller_errors() -> None:
     assumed, vehicle = prior(SMALL, np.random.default_rng(3))
     short, long = (
