@@ -82,6 +82,13 @@ def is_left_out(node: Any) -> bool:
     # cosmic-ray replaces plain names of exceptions only.
     if node.type == "except_clause" and "." in node.get_code():
         return True
+    # `*` and `**` that unpack are no operators.
+    if (
+        node.type == "operator"
+        and node.value in ("*", "**")
+        and node.parent.type not in ("term", "power")
+    ):
+        return True
     while parent := node.parent:
         if parent.type in NO_PLACE:
             return True

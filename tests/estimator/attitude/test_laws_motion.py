@@ -457,6 +457,87 @@ def test_the_covariance_of_a_rate_from_disks_is_that_of_one_error_of_all_moments
     assert_allclose(doubled.covariance_rad2_s2, right.covariance_rad2_s2, rtol=1e-6, atol=0)
 
 
+@pytest.mark.parametrize("rate_deg_s", [(3.0, 4.0, 0.2), (-7.0, 1.0, 0.0), (0.5, -0.8, 0.1)])
+def test_the_motion_of_a_disk_is_a_root_of_its_moments(
+    rate_deg_s: tuple[float, float, float],
+) -> None:
+    """Of the exact moments, one of both roots is the motion from row to row; the other one has the same moments."""
+    seen = moving(np.random.default_rng(27), np.array(rate_deg_s), 12)
+    variance_px2 = 30.0
+    moments = moments_of(seen, variance_px2)
+    rows = EXPOSURE_S / CAMERA.row_time_s
+    velocity = rate.tangent_motion(GLOBAL.rays(seen.still_px), STARS) @ seen.rate_rad_s
+    u, w = CAMERA.focal_px * CAMERA.row_time_s * velocity.T
+    both = np.stack([rate._roots(moments, rows, side) for side in (1, -1)])
+    off = np.abs(both - (u + 1j * w)).min(axis=0)
+    assert_allclose(off, 0, rtol=0, atol=1e-9)
+    for z in both:
+        gain = 1 / (1 - z.imag)
+        streak = rows**2 / 12 * gain**2
+        # D D^T = [[1 + (u g)^2, u g^2], [u g^2, g^2]]; a from the sum of the diagonal
+        trace = 1 + (z.real * gain) ** 2 + gain**2
+        a = (moments[:, 2] - streak * np.abs(z) ** 2) / trace
+        shape = a * (1 + (z.real * gain) ** 2 - gain**2) + streak * (z.real**2 - z.imag**2)
+        cross = a * z.real * gain**2 + streak * z.real * z.imag
+        assert_allclose(
+            moments[:, :2], np.column_stack([shape, 2 * cross]), rtol=0, atol=1e-9
+        )
+
+
+def test_a_rate_from_disks_is_that_of_weighted_least_squares() -> None:
+    """By SciPy-free arithmetic: rows divided by their deviations; of two roots the one that is nearer counts."""
+    rng = np.random.default_rng(28)
+    motion_px = rng.standard_normal((6, 2, 3))
+    omega = np.array([0.5, -0.3, 0.2])
+    truth = motion_px @ omega @ [1, 1j]
+    noisy = truth + 0.01 * (rng.standard_normal(6) + 1j * rng.standard_normal(6))
+    roots = np.stack([noisy, noisy + 50.0])
+    roots[:, ::2] = roots[::-1, ::2]
+    sigma_px = np.tile(rng.uniform(0.5, 2.0, 6), (2, 1))
+    sigma_px[:, 5] = 0.0  # not usable
+    found = rate._fit_disks(roots, sigma_px, motion_px, complex(truth.mean()))
+    assert found is not None
+    scale = np.repeat(sigma_px[0, :5], 2)
+    design = motion_px[:5].reshape(-1, 3) / scale[:, None]
+    measured = np.column_stack([noisy.real, noisy.imag])[:5].ravel() / scale
+    expected, *_ = np.linalg.lstsq(design, measured, rcond=None)
+    assert_allclose(found.rate_rad_s, expected, rtol=0, atol=1e-12)
+    assert_allclose(
+        found.covariance_rad2_s2, 5 * np.linalg.inv(design.T @ design), rtol=1e-9, atol=0
+    )
+    sigma_px[:, 3:] = 0.0
+    assert rate._fit_disks(roots, sigma_px, motion_px, 0j) is not None
+    sigma_px[:, 2] = 0.0
+    assert rate._fit_disks(roots, sigma_px, motion_px, 0j) is None
+
+
+def test_three_lights_of_a_measurable_size_give_a_rate() -> None:
+    """Not two; the median of xx + yy is 8 px^2 or more. Three streaks do, too."""
+    seen = moving(np.random.default_rng(29), np.array([3.0, 4.0, 0.2]), 3)
+    moments = moments_of(seen, 30.0)
+    disks = replace(seen.centroids(), xy_px=seen.still_px, moments_px2=moments)
+    assert len(rate.from_moments(CAMERA, disks, EXPOSURE_S)) == 2
+    assert rate.from_moments(CAMERA, disks.take(np.arange(2)), EXPOSURE_S) == []
+    for total_px2, count in ((7.9, 0), (8.1, 2)):
+        sized = replace(disks, moments_px2=moments * total_px2 / np.median(moments[:, 2]))
+        assert len(rate.from_moments(CAMERA, sized, EXPOSURE_S)) == count
+    assert len(rate.from_streaks(CAMERA, disks, EXPOSURE_S)) == 2
+    assert rate.from_streaks(CAMERA, disks.take(np.arange(2)), EXPOSURE_S) == []
+
+
+def test_an_outlier_is_beyond_four_standard_deviations_of_the_noise_that_is_seen() -> None:
+    """Sixteen times the median of the squares, and not less than sixteen."""
+    information = np.tile(np.diag([4.0, 1.0]), (5, 1, 1))
+    for median, limit in ((0.2, 16.0), (1.0, 16.0), (2.5, 40.0)):
+        for factor, kept in ((0.99, True), (1.01, False)):
+            squares = np.array([0.1, 0.1, median, median, factor * limit])
+            squares[3] = squares[2] + 1e-9
+            residual = np.column_stack([np.sqrt(squares) / 2, 0 * squares])
+            found = rate.inliers(residual, information)
+            assert found[-1] == kept
+            assert found[:4].all()
+
+
 @law(classify.moments)
 @given(rng=SEEDS)
 def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generator) -> None:
