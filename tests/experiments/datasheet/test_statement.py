@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from pathlib import Path
@@ -15,12 +16,14 @@ from matplotlib.figure import Figure
 from skysim.core.types import Floats
 from skysim.experiments.datasheet import (
     datasheet_report,
+    model_fit,
     performance,
     scene_changes,
     statement,
     variance_components,
 )
 from skysim.experiments.datasheet.cells import AXES, Designer, MeasuredFrames, Size
+from skysim.experiments.datasheet.error_model import ErrorModel
 from skysim.experiments.datasheet.performance import Counts
 from skysim.experiments.datasheet.statement import Statement, StatementSection
 from skysim.experiments.datasheet.variance_components import Bounded
@@ -646,3 +649,191 @@ def test_a_dome_s_tilts_are_drawn_about_the_vertical() -> None:
     assert "the tilts of the vehicle" in " ".join(
         section_of(whole, "Right, refused and false attitudes").texts
     )
+
+
+# The constants of the error model.
+
+
+def variance(values: Floats) -> float:
+    """Unbiased, by its definition."""
+    return float(np.sum((values - np.mean(values)) ** 2) / (len(values) - 1))
+
+
+def test_products_of_a_sequence_are_means_over_fields_and_both_axes(
+    sheet: MeasuredFrames,
+) -> None:
+    mean = np.array([0.5, -0.25, 9.0])
+    angles, products, squares = model_fit.lagged(sheet, mean)
+    expected = []
+    for rate in sheet.levels("sequence", "rate_deg_s"):
+        errors = chosen(sheet, "sequence", rate_deg_s=rate)[:2] - mean[:2, None, None]
+        steps = [0, 1, 2, 4, 8, 16]
+        for first, second in itertools.combinations(range(6), 2):
+            expected.append(
+                (
+                    rate * (steps[second] - steps[first]) / sheet.scene.exposure.rate_hz,
+                    np.nanmean(errors[:, first] * errors[:, second]),
+                    np.nanmean(errors**2),
+                )
+            )
+    np.testing.assert_allclose(np.transpose([angles, products, squares]), expected, rtol=1e-9)
+
+
+def test_the_noise_of_a_field_is_estimated_from_its_terms_and_its_sequence_at_rest(
+    sheet: MeasuredFrames,
+) -> None:
+    """The variance from frame to frame, mean over axes and all else; fields without one frame at rest are left out."""
+    axes = slice(0, 2)
+    terms = chosen(sheet, "terms").reshape(3, -1, 2, SIZE.fields)[axes]
+    rest = chosen(sheet, "sequence", rate_deg_s=0.0)[axes]
+    known = np.flatnonzero(np.isfinite(rest).all(axis=(0, 1)))
+    assert 3 < len(known) < SIZE.fields
+    first, second = model_fit.field_variances(sheet, axes)
+    for n, field in enumerate(known):
+        of_pairs = [variance(pair) for pair in terms[..., field].reshape(-1, 2)]
+        assert first[n] == pytest.approx(np.mean(of_pairs))
+        assert second[n] == pytest.approx(
+            np.mean([variance(one) for one in rest[..., field]])
+        )
+    assert len(first) == len(second) == len(known)
+
+
+def test_rates_are_those_of_the_sequences_and_of_faster_pairs(sheet: MeasuredFrames) -> None:
+    """Up to the first rate at which fewer than ten fields are right."""
+    found = model_fit.errors_by_rate(sheet)
+    sequenced = sheet.levels("sequence", "rate_deg_s")
+    faster = [rate for rate in sheet.levels("rate", "rate_deg_s") if rate > sequenced[-1]]
+    assert list(found) == [*sequenced, *faster]
+    for rate, errors in found.items():
+        kind = "sequence" if rate in sequenced else "rate"
+        np.testing.assert_array_equal(errors, chosen(sheet, kind, rate_deg_s=rate))
+    for right, last in ((10, None), (9, 1)):
+        solved = sheet.columns["solved"].copy()
+        solved[sheet.rows("rate", rate_deg_s=faster[1])] = 0
+        solved[sheet.rows("rate", rate_deg_s=faster[1])[0], :right] = 1
+        columns = sheet.columns | {"solved": solved, "wrong": 0 * solved}
+        rates = list(model_fit.errors_by_rate(sheet._replace(columns=columns)))
+        assert rates == [*sequenced, *faster[:last]]
+
+
+def test_the_streak_s_noise_is_what_is_about_the_rate_s_axis_beyond_the_other(
+    sheet: MeasuredFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Errors of 5 about an axis at 0.4 rad and 3 about the other: a mean square of 16 more; never below 0."""
+    rng = np.random.default_rng(3)
+    about, other = np.array([[5.0], [3.0]]) * np.sign(rng.standard_normal((2, 400)))
+    angle = np.full(400, 0.4)
+    x = 1.0 + about * np.cos(angle) - other * np.sin(angle)
+    y = -2.0 + about * np.sin(angle) + other * np.cos(angle)
+    errors = np.stack([x, y, 0 * x])[:, None]
+    mean = np.array([1.0, -2.0, 0.0])
+    monkeypatch.setattr(model_fit, "axes_rad", lambda sheet, rate: angle)
+    assert model_fit.along_square(sheet, 1.0, mean, errors) == pytest.approx(16)
+    assert model_fit.along_square(sheet, 0.0, mean, errors) == 0
+    turned = np.stack([y + 3.0, -(x - 1.0), 0 * x])[:, None]
+    assert model_fit.along_square(sheet, 1.0, mean, turned) == 0
+
+
+def test_the_correlation_angle_is_that_of_exact_products(
+    sheet: MeasuredFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Products of field and pixel terms in their ratio at rest, times any factor: one of 60 angles fits exactly."""
+    pixel_deg = sheet.designer.pixel_deg
+    half_deg = scene_changes.half_field_deg(sheet.scene)
+    field = np.array([2.0, 1.0, 50.0])
+    pixel = np.array([1.0, 1.5, 70.0])
+    tried = pixel_deg * (8 * half_deg / pixel_deg) ** (np.arange(60) / 59)
+    angles = np.geomspace(pixel_deg / 3, 10 * half_deg, 40)
+    squares = np.random.default_rng(4).uniform(1, 3, 40)
+    for n in (1, 20, 41, 58):
+        by_field = 5.0 * np.exp(-angles / tried[n])
+        products = 0.37 * (by_field + 3.25 * np.exp(-angles / pixel_deg))
+        monkeypatch.setattr(model_fit, "lagged", lambda *_, p=products: (angles, p, squares))
+        found = model_fit.field_angle_deg(sheet, field, pixel, np.zeros(3))
+        assert found == pytest.approx(tried[n], rel=1e-9)
+    none = model_fit.field_angle_deg(sheet, 0 * field, 0 * pixel, np.zeros(3))
+    assert none == pytest.approx(tried[-1])
+
+
+def test_the_constants_of_a_model_are_the_terms_of_its_sheet(
+    sheet: MeasuredFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise at a rate: what the first unit's mean, field, pixel and half of the streak's share leave of the square.
+
+    Not below a twentieth of it; at rest the temporal term.
+    """
+    monkeypatch.setattr(model_fit, "axes_rad", lambda sheet, rate: np.full(SIZE.fields, 0.3))
+    found = model_fit.constants(sheet)
+    errors, _ = variance_components.term_errors(sheet)
+    units = sheet.designer.units
+    assert found["mean"] == pytest.approx([one.mean() for one in errors])
+    by_field = errors[:, :, 0, 0].reshape(3, -1)
+    first_mean = by_field.mean(axis=1)
+    assert model_fit.unit_mean(sheet) == pytest.approx(first_mean)
+    shares = variance_components.contributions(errors)
+    field, pixel, temporal = (
+        np.sqrt(np.maximum(one.mean(axis=-1), 0))
+        for one in (shares.field, shares.pixel, shares.temporal)
+    )
+    assert found["field"] == pytest.approx(field)
+    assert found["pixel"] == pytest.approx(pixel)
+    assert found["noise"][0] == pytest.approx(temporal)
+    assert found["scale_deg"] == scene_changes.half_field_deg(sheet.scene)
+    assert found["pixel_deg"] == sheet.designer.pixel_deg
+    assert found["along"][0] == 0
+    assert units > 1
+    for n, (rate, one) in enumerate(model_fit.errors_by_rate(sheet).items()):
+        square = np.array([np.nanmean(axis**2) for axis in one])
+        slow = first_mean**2 + field**2 + pixel**2
+        slow[:2] += found["along"][n] ** 2 / 2
+        left = np.maximum(square - slow, 0.05 * square)
+        if rate:
+            assert found["noise"][n] == pytest.approx(np.sqrt(left))
+    assert found["scale"][0] == found["scale"][1]
+
+
+def test_a_model_s_correlation_is_compared_over_all_pairs_of_a_sequence(
+    sheet: MeasuredFrames, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mean over pairs and axes of products over the mean squares, after the model's mean is subtracted."""
+    monkeypatch.setattr(model_fit, "axes_rad", lambda sheet, rate: np.full(SIZE.fields, 0.3))
+    monkeypatch.setattr(model_fit, "DRAWN", 500)
+    model = ErrorModel(model_fit.constants(sheet))
+    rate = sheet.levels("sequence", "rate_deg_s")[2]
+    found = model_fit.agreement(model, sheet, rate, "even")
+    centered = chosen(sheet, "sequence", rate_deg_s=rate) - model.mean[:, None, None]
+    measured = []
+    expected = []
+    steps = [0, 1, 2, 4, 8, 16]
+    for one, two in itertools.combinations(range(6), 2):
+        for axis in centered:
+            measured.append(np.nanmean(axis[one] * axis[two]) / np.nanmean(axis**2))
+        apart_deg = rate * (steps[two] - steps[one]) / sheet.scene.exposure.rate_hz
+        expected.append(model.correlation(apart_deg, rate))
+    assert found.correlation == pytest.approx(np.mean(measured))
+    assert found.expected_correlation == pytest.approx(np.mean(expected))
+    assert found.frames == np.isfinite(centered[0, 0]).sum()
+    assert found.rate_deg_s == rate
+
+
+def test_halves_of_the_solved_fields_test_each_other() -> None:
+    """Every second of the fields with terms, then of the others."""
+    made = made_sheet()
+    made = made._replace(size=made.size._replace(fields=16))
+    part = model_fit.some_fields(made, np.array([3, 0, 8]))
+    assert part.size.fields == 3
+    for name, values in part.columns.items():
+        np.testing.assert_array_equal(values, made.columns[name][:, [3, 0, 8]])
+    none = model_fit.rms_of_term(np.array([[4.0, 4.0], [-1.0, -3.0], [1.0, 17.0]]))
+    assert none == pytest.approx([2.0, 0.0, 3.0])
+
+
+def test_the_scatter_of_two_units_is_their_unbiased_variance() -> None:
+    """Units 1 and 3, the same in all fields, states and attitudes: a variance of 2; one unit has none."""
+    errors = np.broadcast_to(np.array([1.0, 3.0])[:, None, None, None], (3, 12, 2, 2, 2, 2))
+    assert model_fit.unit_scatter(errors) == pytest.approx(np.sqrt([2.0] * 3))
+    assert model_fit.unit_scatter(errors[:, :, :1]) == pytest.approx([0.0] * 3)
+    # Only what changes from field to field has no part in it.
+    rng = np.random.default_rng(5)
+    more = errors + 0.01 * rng.standard_normal((3, 12, 1, 2, 2, 2))
+    assert model_fit.unit_scatter(more) == pytest.approx(np.sqrt([2.0] * 3))
