@@ -340,7 +340,7 @@ def test_the_lab_is_known_as_the_scene_has_it() -> None:
     air = calm.vehicle.disturbances.air_current
     if air is None:
         np.testing.assert_allclose(lab.torque_rms_nm, 1e-7)
-        assert lab.correlation_s == 2.0
+        assert lab.torque_correlation_s == 2.0
     windy = scene_of(
         "simsat_slew",
         vehicle__disturbances__air_current='{rms: ["3e-6 N m", "2e-6 N m", "0 N m"], correlation: 7 s}',
@@ -348,7 +348,7 @@ def test_the_lab_is_known_as_the_scene_has_it() -> None:
     )
     found = balance_flight.known_lab(windy, vehicle, UNCERTAINTY)
     np.testing.assert_allclose(found.torque_rms_nm, [3e-6, 2e-6, 1e-7])
-    assert found.correlation_s == 7
+    assert found.torque_correlation_s == 7
     # A sidereal day
     assert np.linalg.norm(found.earth_lab_rad_s) == pytest.approx(
         2 * np.pi / 86164.1, rel=1e-4
