@@ -275,9 +275,20 @@ def test_unmatched_detections_near_a_star_are_counted_within_their_gates(
             tangent, tracker.sky, truth.as_matrix(), 1.03, matched, gates
         ) == np.count_nonzero(close)
     assert 5 < np.count_nonzero(nearest < 0.03) < 55
+    # The catalog's first star too
+    for star in (0, 1):
+        ray = tracker.sky.vectors[star]
+        beside = Rotation.align_vectors([[0.0, 0.0, 1.0]], [ray])[0].as_matrix()
+        none = np.zeros(0, int)
+        assert (
+            misfit.count_near.py_func(
+                np.full((1, 2), 1e-6), tracker.sky, beside, 1.0, none, np.full(1, 1e-4)
+            )
+            == 1
+        )
 
 
-@pytest.mark.parametrize("count", [4, 25])
+@pytest.mark.parametrize("count", [1, 4, 25])
 def test_residuals_are_too_great_beyond_three_deviations_of_their_chi_square(
     count: int,
 ) -> None:
