@@ -245,7 +245,7 @@ def test_phases_are_kept_within_25_of_the_best_with_their_neighbors(
 
 
 def test_a_tangent_errs_by_direction_map_and_lever() -> None:
-    """An angle's error grows by 1 / cos^2 in the tangent; the lever's as the tangent, over the nearest LED's distance."""
+    """An angle's error grows by 1 / cos^2 in the tangent; the lever's as the tangent, over the nearest distance."""
     eye = tracker()
     centroids = lights(6)
     rays, sigma = eye._tangents(centroids)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from skysim.core.errors import InputError
 from skysim.experiments.datasheet.cells import (
@@ -20,6 +22,8 @@ from skysim.experiments.datasheet.cells import (
     attitudes,
     check_scene,
     measure,
+    planned,
+    read,
     require_fields,
     states_c,
     unit_seeds,
@@ -383,3 +387,36 @@ def test_faster_rates_are_twice_the_last_ones():
     assert [one.experiment for one in added] == ["rate"] * 2 + ["boresight"] * 2
     for one in added:
         assert one.levels["rate_deg_s"] == 2 * fastest[one.experiment]
+
+
+def test_the_study_of_a_datasheet_has_its_cells_fields_and_overrides(tmp_path):
+    """The seed is the scene's, and all else that was set on the command line is in the file."""
+    overrides = {"seed": "11", "camera.f_number": "2.5"}
+    scene = load("shefex2", overrides)
+    designer = Designer(scene, QUICK)
+    cells = list(designer.terms())
+    plan = planned(tmp_path / "sheet.yaml", "shefex2", designer, overrides, cells)
+    written = yaml.safe_load((tmp_path / "sheet.yaml").read_text(encoding="utf-8"))
+    assert written["set"] == {"camera.f_number": 2.5}
+    assert written["seed"] == 11
+    assert written["schema"] == 1
+    assert written["replicates"] == QUICK.fields
+    assert written["trial"] == {"kind": "frames"}
+    assert len(plan.points) == len(cells)
+    assert plan.trials == len(cells) * QUICK.fields
+    assert list(written["factors"]["cell"]["levels"]) == [cell.name for cell in cells]
+    plain = planned(tmp_path / "plain.yaml", "shefex2", designer, {}, cells)
+    assert "set" not in yaml.safe_load((tmp_path / "plain.yaml").read_text(encoding="utf-8"))
+    assert plain.trials == plan.trials
+
+
+def test_results_are_read_by_cell_and_field():
+    """Trial n is field n modulo the fields of cell n over the fields; the first failure is told with its cell."""
+    points = [SimpleNamespace(levels={"cell": f"cell {n}"}) for n in range(3)]
+    plan = SimpleNamespace(points=points, study=SimpleNamespace(replicates=4))
+    kept = SimpleNamespace(failures=list, columns=lambda: {"x": np.arange(12)})
+    found = read(plan, kept)
+    np.testing.assert_array_equal(found["x"], [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]])
+    kept.failures = lambda: [(7, "Traceback\n  line\nValueError: why\n"), (9, "other")]
+    with pytest.raises(InputError, match="cell 1: ValueError: why"):
+        read(plan, kept)
