@@ -637,3 +637,17 @@ def test_the_noise_is_scaled_until_the_misfit_is_one(monkeypatch: pytest.MonkeyP
         )
         mass_properties.estimate_with_noise([RECORD], vehicle.lab, assumed)
         np.testing.assert_allclose(factors, [1.0] + 7 * [bound], rtol=1e-9)
+
+
+def test_a_misfit_falls_with_the_assumed_noise_where_attitudes_tell_little() -> None:
+    """Nine attitudes hardly move the parameters: the fit goes on until the states have settled too."""
+    rng = np.random.default_rng([41, 0])
+    short = mass_properties.cut(record(SMALL, rng, 26.0), slice(0, 9))
+    assumed, _ = prior(SMALL, rng)
+    known = Prior(SMALL.truth, assumed.sigma)
+    misfits = [
+        mass_properties.estimate_mass([short.with_noise(factor)], SMALL.lab, known).misfit
+        for factor in (1.0, 9.0, 81.0)
+    ]
+    # Of nearly the same residuals
+    assert misfits[0] > 3 * misfits[1] > 9 * misfits[2]
