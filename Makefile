@@ -126,12 +126,13 @@ fuzzer: $(READY)
 	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
 
 # How many of MUTANTS random small changes of the code the tests notice: docs/findings/mutants.md. It takes an hour, and
-# goes on where it was stopped; `AGAIN=--again` tries the survivors once more, after tests were added.
+# goes on where it was stopped; `AGAIN=--again` tries the survivors once more, after tests were added. Of some packages
+# or modules: PACKAGES="skysim/sources/air.py skysim/experiments/datasheet".
 MUTANTS ?= 300
 SEED ?= 1
 mutants: $(READY)
 	$(PIP) -e '.[mutants]'
-	$(BIN)/python -m tests.mutants $(MUTANTS) $(SEED) $(AGAIN)
+	$(BIN)/python -m tests.mutants $(MUTANTS) $(SEED) $(PACKAGES) $(AGAIN)
 
 lint: $(READY)
 	$(BIN)/ruff check .

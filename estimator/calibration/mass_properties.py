@@ -98,6 +98,7 @@ def estimate_mass(
     motions = [first_states(record, lab, values) for record in records]
     information = np.diag(prior.sigma**-2)
     attitudes = sum(len(record.t_s) for record in records)
+    small = False
     for _ in range(MAX_ITERATIONS):
         # 1. Linearization and elimination
         parts = [
@@ -116,7 +117,10 @@ def estimate_mass(
         for k, part in enumerate(parts):
             change = part.states_step - part.states_by_parameter @ step
             motions[k] = motions[k].moved(change.reshape(-1, STATE).T)
-        if np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))):
+        # Chi-square is that before the step: the states of a small step have taken part in one before.
+        was_small = small
+        small = bool(np.all(np.abs(step) < CONVERGED_SIGMA * np.sqrt(np.diag(covariance))))
+        if small and was_small:
             covariance = covariance + considered(records, parts, covariance)
             from_prior = np.sum(((prior.values - values) / prior.sigma) ** 2)
             chi2 = sum(part.chi2 for part in parts) + from_prior

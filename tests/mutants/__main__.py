@@ -1,9 +1,9 @@
 """Mutation score: the share of small changes of the code that the tests notice.
 
-`python -m tests.mutants [COUNT] [SEED] [--again] [--control]`. COUNT places are drawn uniformly from all that
-cosmic-ray's operators can change in PACKAGES (numbers, operators, comparisons, conditions, loops), and one change of
-each. Left out are type annotations, decorators, errors' messages (whole raise statements and f-strings) and
-__init__.py.
+`python -m tests.mutants [COUNT] [SEED] [PACKAGE ...] [--again] [--control]`. COUNT places are drawn uniformly from all
+that cosmic-ray's operators can change in the packages (numbers, operators, comparisons, conditions, loops), and one
+change of each. A package is a folder or a module of skysim or estimator; PACKAGES unless one is given. Left out are
+type annotations, decorators, errors' messages (whole raise statements and f-strings) and __init__.py.
 
 The tests run once without a mutant, and what each enters is noted. A mutant is tested, in a copy, by the tests that
 enter the changed function, nearest file first, up to BUDGET_S; if these take less than OTHERS_S, others of near files
@@ -11,9 +11,9 @@ fill it. tests/mutants/server.py runs them, in a process forked after all import
 tested in a process that imports all packages anew. A mutant is killed if a test fails, crashes, or takes 60 s and ten
 times its time.
 
-Results are added to out/mutants/SEED.jsonl, and a run that was stopped goes on. --again tries the survivors of that
-file once more, with more tests and those that were added. --control tests the places without the change: all must
-survive.
+Results are added to out/mutants/SEED.jsonl (of given packages: SEED-DIGEST.jsonl), and a run that was stopped goes on.
+--again tries the survivors of that file once more, with more tests and those that were added. --control tests the
+places without the change: all must survive.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from functools import cache
 from multiprocessing import Pipe
 from pathlib import Path
@@ -63,13 +64,11 @@ CACHE = OUT / "cache"
 SCRATCH = OUT / "scratch"
 BASELINE = OUT / "baseline.json"
 CONTROL = "--control" * ("--control" in sys.argv)
-PACKAGES = {  # where the tests of each are
-    "estimator": ("estimator",),
-    "skysim/camera": ("camera",),
-    "skysim/sources": ("sources",),
-    "skysim/dynamics": ("dynamics",),
-}
+PACKAGES = ("estimator", "skysim/camera", "skysim/sources", "skysim/dynamics")
 USERS = ("simulation", "tracking", "results")  # tests of the packages that use them
+# Of given packages only the test files that are so few import steps away are run; for survivors, one step more. To run
+# all files once takes half an hour.
+STEPS = 2 if "--again" in sys.argv else 1
 # Of tests that enter the changed function, and of others if these are few: at first, and for survivors once more.
 BUDGET_S, OTHERS_S = (90.0, 30.0) if "--again" in sys.argv else (20.0, 5.0)
 # Operators that are left out: bits of floating-point numbers, which raise TypeError, so any test notices; decorators,
@@ -82,6 +81,13 @@ def is_left_out(node: Any) -> bool:
     """Whether a parso node is in an annotation, a decorator, an error's message or an import, or cannot be changed."""
     # cosmic-ray replaces plain names of exceptions only.
     if node.type == "except_clause" and "." in node.get_code():
+        return True
+    # `*` and `**` that unpack are no operators.
+    if (
+        node.type == "operator"
+        and node.value in ("*", "**")
+        and node.parent.type not in ("term", "power")
+    ):
         return True
     while parent := node.parent:
         if parent.type in NO_PLACE:
@@ -111,15 +117,44 @@ def places(module: Path) -> dict[tuple[int, int], list[tuple[str, int]]]:
     return found
 
 
-def draw(count: int, seed: int) -> list[dict[str, Any]]:
+def modules_of(packages: Iterable[str]) -> list[Path]:
+    """Modules of packages, which are folders or modules of the copy."""
+    found: set[Path] = set()
+    for package in packages:
+        path = TREE / package
+        if not path.exists() or package.split("/")[0] not in ("estimator", "skysim"):
+            raise SystemExit(f"{package!r} is no folder or module of estimator or skysim")
+        found |= {path} if path.is_file() else set(path.rglob("*.py"))
+    return sorted(path for path in found if path.name != "__init__.py")
+
+
+def tests_folder(module: str) -> str:
+    """Where the tests of a module's package are, which have its name."""
+    first, second, *_ = module.split("/")
+    return f"tests/{second if first == 'skysim' else first}/"
+
+
+def test_files(modules: list[Path], nearest: bool) -> list[str]:
+    """Test files of the modules' packages and of USERS; of given packages those that are few import steps away."""
+    found: set[str] = set()
+    for path in modules:
+        module = str(path.relative_to(TREE))
+        folders = (tests_folder(module), *(f"tests/{name}/" for name in USERS))
+        if nearest:
+            files = {file for file, steps in importers(module).items() if steps <= STEPS}
+        else:
+            files = {
+                str(file.relative_to(TREE))
+                for one in folders
+                for file in (TREE / one).rglob("*.py")
+            }
+        found |= {file for file in files if file.startswith(folders)}
+    return sorted(file for file in found if Path(file).name.startswith("test_"))
+
+
+def draw(modules: list[Path], count: int, seed: int) -> list[dict[str, Any]]:
     """So many mutants, in random order."""
-    modules = sorted(path for package in PACKAGES for path in (TREE / package).rglob("*.py"))
-    every = [
-        (path, at, how)
-        for path in modules
-        if path.name != "__init__.py"
-        for at, how in places(path).items()
-    ]
+    every = [(path, at, how) for path in modules for at, how in places(path).items()]
     random = Random(seed)
     chosen = random.sample(every, min(count, len(every)))
     print(f"{len(every)} places in {len(modules)} modules; seed {seed}", flush=True)
@@ -171,15 +206,7 @@ def importers(module: str) -> dict[str, int]:
 class Tests:
     """The tests of the packages: what each enters, the time that it takes, and a server that runs them on mutants."""
 
-    def __init__(self) -> None:
-        folders = [
-            TREE / "tests" / name for names in (*PACKAGES.values(), USERS) for name in names
-        ]
-        files = sorted(
-            str(path.relative_to(TREE))
-            for folder in folders
-            for path in folder.rglob("test_*.py")
-        )
+    def __init__(self, files: list[str]) -> None:
         self.recorded = record(files)
         self.imported = set(map(tuple, self.recorded["imported"]))
         self.times_s = Counter(
@@ -197,15 +224,9 @@ class Tests:
     def chosen(self, module: str, keys: list[Key]) -> list[str]:
         """Tests that enter one of these functions, nearest first, then others of the nearest files."""
         steps = importers(module)
-        own = tuple(
-            f"tests/{name}/"
-            for package in PACKAGES
-            if module.startswith(package)
-            for name in PACKAGES[package]
-        )
 
         def distance(file: str) -> float:
-            return steps.get(file, 99) + 0.5 * (not file.startswith(own))
+            return steps.get(file, 99) + 0.5 * (not file.startswith(tests_folder(module)))
 
         first = order(self.ask("tests_of", keys), distance, self.times_s, BUDGET_S)
         rest = [
@@ -228,7 +249,7 @@ def record(files: list[str]) -> dict[str, Any]:
     digests = {file: hashlib.sha1((TREE / file).read_bytes()).hexdigest() for file in files}
     changed = [file for file in files if old["digests"].get(file) != digests[file]]
     if not changed:
-        return old
+        return of_files(old, files)
     part = OUT / "part.json"
     part.unlink(missing_ok=True)
     forked(lambda: session(changed, Recorder(TREE, part)), 7200)
@@ -241,12 +262,20 @@ def record(files: list[str]) -> dict[str, Any]:
     if new["failed"]:
         print("left out, for they fail without a mutant:", *new["failed"], sep="\n  ")
     merged = {
-        "digests": digests,
+        "digests": old["digests"] | digests,
         "imported": old["imported"] + new["imported"],
         "tests": kept | new["tests"],
     }
     BASELINE.write_text(json.dumps(merged))
-    return merged
+    return of_files(merged, files)
+
+
+def of_files(recorded: dict[str, Any], files: list[str]) -> dict[str, Any]:
+    """What was recorded, of the tests in these files only."""
+    tests = {
+        name: test for name, test in recorded["tests"].items() if name.split("::")[0] in files
+    }
+    return recorded | {"tests": tests}
 
 
 def session(words: list[str], plugin: Any) -> str:
@@ -415,6 +444,7 @@ def copy_tree() -> None:
     listed = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout
+    changed = []
     for name in filter(None, listed.split("\0")):
         source = ROOT / name
         copy = TREE / name
@@ -422,7 +452,11 @@ def copy_tree() -> None:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(source, copy)
             if source.suffix == ".py" and not name.startswith("tests"):
-                forget(CACHE, name)
+                changed.append(name)
+    for (
+        name
+    ) in changed:  # once all are there: who imports whom is read from the copy, and kept
+        forget(CACHE, name)
 
 
 def key_of(mutant: dict[str, Any]) -> tuple[Any, ...]:
@@ -431,7 +465,9 @@ def key_of(mutant: dict[str, Any]) -> tuple[Any, ...]:
 
 def main() -> None:
     words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    count, seed = (int(word) for word in (words + ["300", "1"][len(words) :]))
+    numbers = [word for word in words if word.isdecimal()]
+    count, seed = (int(word) for word in (numbers + ["300", "1"][len(numbers) :]))
+    given = sorted({word.rstrip("/") for word in words if not word.isdecimal()})
     if os.environ.get("NUMBA_CACHE_DIR") != str(CACHE):  # before any import reads them
         os.execve(
             sys.executable,
@@ -441,9 +477,11 @@ def main() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     copy_tree()
     use_copy()
-    results = OUT / f"{seed}{CONTROL}.jsonl"
-    tests = Tests()
-    drawn = draw(count, seed)
+    digest = hashlib.sha1(" ".join(given).encode()).hexdigest()[:6]
+    results = OUT / f"{seed}{f'-{digest}' * bool(given)}{CONTROL}.jsonl"
+    modules = modules_of(given or PACKAGES)
+    tests = Tests(test_files(modules, nearest=bool(given)))
+    drawn = draw(modules, count, seed)
     lines = results.read_text().splitlines() if results.exists() else []
     # Of a mutant that was tried again, the last.
     done = {key_of(result): result for result in map(json.loads, lines)}

@@ -492,3 +492,91 @@ def test_rendered_stars_are_raised_by_the_colors_of_their_spectra() -> None:
     assert len(wanted) > 10
     assert np.abs(wanted).max() > 0.2
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.03 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    ("altitude_deg", "air_masses"),
+    [(2.0, 19.6427), (5.0, 10.3337), (10.0, 5.58074), (30.0, 1.993154), (60.0, 1.154058)],
+)
+def test_air_masses_are_those_of_the_published_formula(
+    altitude_deg: float, air_masses: float
+) -> None:
+    """1 / sin(h + 244 / (165 + 47 h^1.1)), in degrees, worked out by hand (Pickering 2002)."""
+    found = starlight.air_mass(np.radians([altitude_deg]))[0]
+    assert found == pytest.approx(air_masses, rel=3e-6)
+
+
+def test_turbulence_and_wind_have_their_published_values() -> None:
+    """Hufnagel-Valley 5/7 (A = 1.7e-14, W = 21 m/s) on the ground, and its high layer at 10 km; Bufton's jet at 9.4 km.
+
+    0.00594 (7/9)^2 1e-10 e^-10 = 1.6314e-17, and 2.7e-16 e^(-20/3) = 3.436e-19.
+    """
+    ground, high, site = starlight.hufnagel_valley(
+        np.array([0.0, 10_000.0, 1500.0]), np.array([0.0, 10_000.0, 100.0])
+    )
+    assert ground == pytest.approx(1.7e-14 + 2.7e-16, rel=1e-9)
+    assert high == pytest.approx(1.6314e-17 + 3.436e-19, rel=2e-4)
+    assert site == pytest.approx((1.7e-14 + 2.7e-16) / np.e, rel=1e-3)
+    jet = starlight.wind(np.array([9400.0, 4600.0, 14_200.0]))
+    np.testing.assert_allclose(jet, [35.0, 5 + 30 / np.e, 5 + 30 / np.e], rtol=1e-12)
+
+
+def test_layers_of_the_air_integrate_to_25_km() -> None:
+    """Of the model's turbulence, to 0.1 %, by the trapezoidal rule at steps of half a meter."""
+    for height_m in (0.0, 2400.0):
+        above_m, strength = starlight.layers(height_m)
+        fine_m = np.arange(0.0, 25_000.1, 0.5)
+        profile = starlight.hufnagel_valley(height_m + fine_m, fine_m)
+        for power in (0, 5 / 6, 2):
+            expected = np.trapezoid(profile * fine_m**power, fine_m)
+            assert np.sum(strength * above_m**power) == pytest.approx(expected, rel=1e-3)
+
+
+def test_apertures_and_exposures_filter_by_their_means() -> None:
+    """A disc's mean of a wave, by quadrature; the mean of sinc^2 over all directions of the wind."""
+    for x in (0.3, 1.0, 2.7):
+        r = (np.arange(4000) + 0.5) / 8000
+        disc = np.sum(
+            np.cos(2 * np.pi * x * r[:, None] * np.cos(np.arange(360) * np.pi / 180))
+            * r[:, None]
+        )
+        disc /= 360 * np.sum(r)
+        assert starlight.airy(np.array([x]))[0] == pytest.approx(disc, abs=1e-4)
+    assert starlight.airy(np.zeros(1))[0] == pytest.approx(1)
+    around = (np.arange(20_000) + 0.5) * np.pi / 20_000
+    for turns in (0.1, 1.3, 20.0):
+        mean = np.mean(np.sinc(turns * np.cos(around)) ** 2)
+        assert starlight.exposure_filter(np.array([turns]))[0] == pytest.approx(
+            mean, rel=1e-4
+        )
+    assert starlight.exposure_filter(np.zeros(1))[0] == pytest.approx(1, abs=1e-6)
+
+
+def test_a_star_s_light_varies_about_its_mean_by_the_variance() -> None:
+    """Log-normal: never negative, of the mean 1."""
+    variances = np.repeat([0.0, 0.04, 0.5], 200_000)
+    found = starlight.factors(variances, np.random.default_rng(5)).reshape(3, -1)
+    assert found.min() > 0
+    np.testing.assert_allclose(found.mean(axis=1), 1, atol=0.01)
+    np.testing.assert_allclose(found.var(axis=1), [0.0, 0.04, 0.5], rtol=0.03)
+    skew = np.mean(np.log(found[2]))
+    assert skew == pytest.approx(-np.log(1.5) / 2, abs=0.01)
+
+
+def test_lights_of_no_catalog_have_the_row_of_the_sun() -> None:
+    """Beside, between and beyond the catalog's numbers."""
+    air = air_at(SITES[0])
+    last = int(air.star_id[-1])
+    known = air.star_id[[0, 5, -1]]
+    between = next(n for n in range(1, 500) if n not in set(air.star_id.tolist()))
+    found = air.rows(np.array([*known, between, last + 1, 10**12, 0]))
+    assert found.tolist() == [0, 5, len(air.star_id) - 1, -1, -1, -1, -1]
+    assert len(air.b_v) == len(air.star_id) + 1
+    assert air.extinction_mag(0.5) == pytest.approx(
+        air.config.extinction_mag + 0.5 * air.config.color_extinction_mag
+    )
+
+
+def test_light_fades_by_its_magnitudes_of_extinction() -> None:
+    found = starlight.transmission(np.array([0.0, 1.0, 2.5]), 2.0)
+    np.testing.assert_allclose(found, [1.0, 10**-0.8, 0.01])

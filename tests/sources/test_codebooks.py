@@ -163,3 +163,166 @@ def test_a_code_with_too_few_words_is_refused() -> None:
         match=r"light.led.code: 70000 LEDs; allowed: at most the \d+ words of kind gold",
     ):
         codebook(PlainCodeConfig(kind="gold"), 70_000)
+
+
+def test_polynomials_are_primitive_and_pairs_preferred() -> None:
+    """x has the order 2^m - 1; the correlations of a pair are -1 and -1 +- 2^floor((m + 2) / 2) (Gold 1967)."""
+    tables = [*codebooks.PRIMITIVE.items(), *codebooks.PREFERRED.items()]
+    assert [degree for degree, _ in tables] == [3, 4, 5, 6, 7, 5, 6, 7]
+    for degree, polynomial in tables:
+        power = 2
+        order = 1
+        while power != 1 and order < 2**degree:
+            power <<= 1
+            power ^= polynomial if power >> degree else 0
+            order += 1
+        assert order == 2**degree - 1
+        sequence = codebooks.maximal_sequence(polynomial, degree)
+        assert len(sequence) == 2**degree - 1
+        assert sequence[:degree].tolist() == [1] * degree
+        assert sequence.sum() == 2 ** (degree - 1)
+        signs = 1 - 2 * sequence.astype(int)
+        for shift in range(1, len(signs)):
+            assert signs @ np.roll(signs, shift) == -1
+        # The recursion of the polynomial, of all its shifts
+        taps = [k for k in range(degree + 1) if polynomial >> k & 1]
+        cyclic = np.array([np.roll(sequence, -k) for k in taps]).sum(axis=0) % 2
+        assert not cyclic.any()
+    for degree, second in codebooks.PREFERRED.items():
+        u, v = (
+            1 - 2 * codebooks.maximal_sequence(one, degree).astype(int)
+            for one in (codebooks.PRIMITIVE[degree], second)
+        )
+        found = {int(u @ np.roll(v, shift)) for shift in range(len(u))}
+        t = 1 + 2 ** ((degree + 2) // 2)
+        assert found == {-1, -t, t - 2}
+
+
+@pytest.mark.parametrize(
+    ("count", "bits"), [(1, 2), (2, 2), (3, 3), (6, 3), (7, 4), (14, 4), (15, 5), (510, 9)]
+)
+def test_data_bits_leave_out_the_two_constant_words(count: int, bits: int) -> None:
+    assert codebooks.data_bits(count) == bits
+    words = codebook(PlainCodeConfig(kind="gray"), count)
+    assert words.shape == (count, bits)
+
+
+@pytest.mark.parametrize(
+    ("count", "bits"),
+    [(2, 2 + 3 + 1), (14, 4 + 3 + 1), (15, 5 + 4 + 1), (400, 9 + 4 + 1), (2000, 11 + 4 + 1)],
+)
+def test_a_hamming_code_has_the_least_check_bits_and_the_distance_of_four(
+    count: int, bits: int
+) -> None:
+    """Of r checks for 2^r - r - 1 data bits, and the parity of the whole word; also of the words of that."""
+    words = codebook(PlainCodeConfig(kind="hamming"), count)
+    assert words.shape == (count, bits)
+    assert not (words.sum(axis=1) % 2).any()
+    assert least_distance(words[:200]) >= 4
+
+
+@pytest.mark.parametrize(
+    ("count", "distance", "bits"),
+    [
+        # [7, 4], [15, 11], [15, 7], [31, 21] and [63, 51] codes, shortened (Lin and Costello, table 6.1)
+        (14, 3, 7),
+        (15, 3, 5 + 4),
+        (2000, 3, 15),
+        (126, 5, 15),
+        (127, 5, 8 + 10),
+        (30, 7, 15),
+        (31, 7, 6 + 15),
+    ],
+)
+def test_a_bch_code_is_the_shortest_of_its_distance(
+    count: int, distance: int, bits: int
+) -> None:
+    words = codebook(BchCodeConfig(kind="bch", distance=distance), count)
+    assert words.shape == (count, bits)
+    assert least_distance(words[:300]) >= distance
+
+
+@pytest.mark.parametrize(("count", "bits"), [(1023, 31), (1024, 63), (4095, 63), (4096, 127)])
+def test_gold_sequences_are_the_shortest_that_are_enough(count: int, bits: int) -> None:
+    """n (n + 2) of n bits; none beyond 127 (129)."""
+    words = codebooks.gold(count)
+    assert words.shape == (count, bits)
+    assert len(np.unique(words, axis=0)) == count
+    assert len(codebooks.gold(127 * 129)) == 127 * 129
+    assert codebooks.gold(127 * 129 + 1).shape == (0, 1)
+
+
+def test_codes_without_enough_words_are_empty() -> None:
+    assert codebooks.bch(2**20, 63).shape == (0, 1)
+    assert codebooks.cyclic(2**20 + 1, 3).shape == (0, 1)
+
+
+@pytest.mark.parametrize(("count", "distance"), [(1, 3), (2, 3), (5, 5), (50, 7)])
+def test_a_cyclic_code_is_the_shortest_with_enough_orbits(count: int, distance: int) -> None:
+    """By listing all words of all lengths: the orbits of their full length under shifts."""
+    words = codebook(CyclicCodeConfig(kind="cyclic", distance=distance), count)
+    found = None
+    for degree in (3, 4, 5):
+        generator = codebooks.bch_generator(degree, distance)
+        length = 2**degree - 1
+        data = length - generator.bit_length() + 1
+        if data < 1:
+            continue
+        every = [0]
+        for k in range(data):
+            every += [one ^ generator << k for one in every]
+        full = set()
+        for one in every:
+            shifts = {
+                (one << k | one >> (length - k)) & (2**length - 1) for k in range(length)
+            }
+            if len(shifts) == length:
+                full.add(min(shifts))
+        if len(full) >= count and 2**data >= count:
+            found = length
+            break
+    assert found == words.shape[1]
+    numbers = [int("".join(map(str, word)), 2) for word in words.tolist()]
+    assert set(numbers) <= full
+    assert len(set(numbers)) == count
+
+
+def test_orbits_are_the_least_shifts_of_words_without_symmetry() -> None:
+    """Of 6 bits: 9 necklaces of the full length (Moebius: (64 - 8 - 4 + 2) / 6)."""
+    found = codebooks.orbits(np.arange(64), 6)
+    assert found.tolist() == [1, 3, 5, 7, 11, 13, 15, 23, 31]
+
+
+def test_products_over_two_elements_are_sums_of_shifts() -> None:
+    """(x + 1)^2 is x^2 + 1, and (x^2 + x + 1)(x + 1) is x^3 + 1."""
+    products = codebooks.multiply(np.array([0b11, 0b111, 0b1, 0b1011]), 0b11)
+    assert products.tolist() == [0b101, 0b1001, 0b11, 0b11101]
+
+
+def test_words_with_as_many_ones_as_zeros_come_first() -> None:
+    words = codebooks.bits_of(np.arange(32), 5)
+    found = codebooks.balanced(words)
+    ones = found.sum(axis=1).astype(int)
+    assert len(found) == 30
+    assert (np.diff(np.abs(2 * ones - 5)) >= 0).all()
+    # Else in their order
+    numbers = found @ (1 << np.arange(5)[::-1])
+    assert (np.diff(numbers[:20]) > 0).all()
+    assert codebooks.bits_of(np.array([6]), 4).tolist() == [[0, 1, 1, 0]]
+
+
+def test_a_word_is_readable_that_has_the_highest_level_and_another() -> None:
+    words = np.array([[0, 3], [3, 3], [2, 2], [3, 2], [0, 2]])
+    assert codebooks.readable(words, 4).tolist() == [[0, 3], [3, 2]]
+
+
+@pytest.mark.parametrize(
+    ("count", "levels", "k"), [(2, 2, 2), (4, 2, 2), (5, 2, 3), (9, 3, 2)]
+)
+def test_a_de_bruijn_sequence_is_the_shortest_with_enough_shifts(
+    count: int, levels: int, k: int
+) -> None:
+    """Two symbols at least, so that one frame alone does not say which LED it is."""
+    words = codebooks.de_bruijn(count, levels)
+    assert words.shape == (count, levels**k)
+    assert words[0, :k].tolist() == [0] * k

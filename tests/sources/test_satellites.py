@@ -7,10 +7,13 @@ import datetime
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import erfa
 import numpy as np
 import pytest
+from scipy import stats
 
 from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
 from skysim.core.errors import InputError
@@ -321,3 +324,159 @@ def test_random_satellites_have_their_density_rates_and_magnitudes() -> None:
     assert [light.truth for light in other_run] != [light.truth for light in drawn[3]]
     again = list(satellites.random_satellites(config, view, 1, 3))
     assert [str(light.truth) for light in again] == [str(light.truth) for light in drawn[3]]
+
+
+RANGE_M = 1e6
+
+
+def seen_of(
+    monkeypatch: pytest.MonkeyPatch,
+    places_m: np.ndarray,
+    velocities_m_s: np.ndarray,
+    **state: float,
+) -> list[satellites.MovingLight]:
+    """The lights of satellites at these places from a camera at 7,000 km that looks away from the Earth, sun at y."""
+    here = GcrsState(np.array([7e6, 0.0, 0.0]), np.zeros(3))
+    failed = np.zeros((len(places_m), 1))
+    failed[: int(state.get("failed", 0))] = 6
+    monkeypatch.setattr(
+        satellites,
+        "gcrs_states",
+        lambda elements, time, after_s: (places_m[:, None], velocities_m_s[:, None], failed),
+    )
+    monkeypatch.setattr(satellites, "sun_m", lambda _: np.array([7e6, 1.5e11, 0.0]))
+    monkeypatch.setattr(
+        satellites,
+        "sunlit_fraction",
+        lambda place, sun: np.full(len(place), state.get("sunlit", 1.0)),
+    )
+    monkeypatch.setattr(
+        satellites,
+        "path",
+        lambda one, *_: (
+            np.array([1.0, 0.0, 0.0]),
+            np.array([[0.0, 0.02, 0.0], [0.0, 0.0, 0.0]]),
+        ),
+    )
+    elements = [SimpleNamespace(number=n, name=f"number {n}") for n in range(len(places_m))]
+    view = ExposureView(
+        np.array([1.0, 0.0, 0.0]),
+        0.05,
+        state.get("turn_rad", 0.0),
+        state.get("duration_s", 1.0),
+    )
+    unused: Any = elements
+    return list(satellites.known_satellites(unused, 6.0, view, DATE, lambda _: here))
+
+
+def at_angles(angles_rad: np.ndarray, range_m: float = RANGE_M) -> np.ndarray:
+    along = np.column_stack([np.cos(angles_rad), np.sin(angles_rad), 0 * angles_rad])
+    return np.array([7e6, 0.0, 0.0]) + range_m * along
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "rate", "duration_s"), [(0, 0, 1), (0.02, 0, 1), (0, 0.01, 3)]
+)
+def test_a_satellite_counts_as_far_as_camera_and_satellite_turn(
+    monkeypatch: pytest.MonkeyPatch, turn_rad: float, rate: float, duration_s: float
+) -> None:
+    """Beyond the corner of the field by a thousandth and half of both turns; its speed along the ray moves nothing."""
+    limit = 0.05 + 1e-3 + (turn_rad + rate * duration_s) / 2
+    angles = np.array([0.0, -limit + 1e-5, limit - 1e-5, limit + 1e-5, -limit - 1e-5])
+    places = at_angles(angles)
+    across = np.column_stack([-np.sin(angles), np.cos(angles), 0 * angles])
+    toward = np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
+    velocities = rate * RANGE_M * across + 3000.0 * toward
+    state = {"turn_rad": turn_rad, "duration_s": duration_s}
+    found = seen_of(monkeypatch, places, velocities, **state)
+    assert [one.truth.id - satellites.ID_BASE for one in found] == [0, 1, 2]
+    # A camera that turns more than half a circle sees everything.
+    everything = at_angles(np.array([0.5, 2.0]), 2e7)
+    found = seen_of(monkeypatch, everything[:1], 0 * everything[:1], turn_rad=9.0)
+    assert len(found) == 1
+
+
+def test_a_satellite_s_truth_is_that_of_its_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 2,000 km and 0.04 rad toward the Sun's side: the phase is the angle at it between Sun and camera."""
+    angle = np.array([0.04])
+    (found,) = seen_of(monkeypatch, at_angles(angle, 2e6), np.zeros((1, 3)), sunlit=0.5)
+    phase = np.pi / 2 + 0.04
+    truth = found.truth
+    assert truth.phase_deg == pytest.approx(np.degrees(phase), abs=2e-3)
+    assert truth.range_km == pytest.approx(2000)
+    assert truth.sunlit == 0.5
+    # 5 log 2, half of the Sun, and the Lambert sphere at this phase
+    light = np.sin(phase) + (np.pi - phase) * np.cos(phase)
+    expected = 6 + 5 * np.log10(2) + 2.5 * np.log10(2) - 2.5 * np.log10(light)
+    assert truth.v_mag == pytest.approx(expected, abs=1e-4)
+    assert truth.rate_deg_s == pytest.approx(np.degrees(0.02))
+    assert seen_of(monkeypatch, at_angles(angle), np.zeros((1, 3)), sunlit=0.0) == []
+    assert seen_of(monkeypatch, at_angles(angle), np.zeros((1, 3)), failed=1) == []
+    for range_m, count in ((9.0, 0), (11.0, 1)):
+        near = at_angles(angle, range_m)
+        assert len(seen_of(monkeypatch, near, np.zeros((1, 3)))) == count
+
+
+def test_a_satellite_behind_the_earth_is_not_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Through the Earth: at 20,000 km on its other side, seen by a camera that turns all around."""
+    behind = at_angles(np.array([np.pi, np.pi - 1.3]), 2e7)
+    found = seen_of(monkeypatch, behind, np.zeros((2, 3)), turn_rad=9.0)
+    assert [one.truth.id - satellites.ID_BASE for one in found] == [1]
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.3])
+def test_random_satellites_fill_the_cone_of_all_paths(turn_rad: float) -> None:
+    """Uniform in the cosine to the field's edge and half of both turns; a great circle's acceleration; any heading."""
+    config = RandomSatellitesConfig(
+        per_field=20.0, rate_deg_s=(0.5, 4.0), v_mag=(3.0, 5.0), seed=8
+    )
+    boresight = np.array([0.6, 0.0, 0.8])
+    view = ExposureView(boresight, 0.1, turn_rad, 2.0)
+    reach = 0.1 + (turn_rad + np.radians(4.0) * 2.0) / 2
+    mean = 20.0 * (1 - np.cos(reach)) / (1 - np.cos(0.1))
+    frames = [
+        list(satellites.random_satellites(config, view, 1, index)) for index in range(40)
+    ]
+    lights = [light for frame in frames for light in frame]
+    assert len(lights) / 40 == pytest.approx(mean, abs=4 * np.sqrt(mean / 40))
+    place = np.array([light.place for light in lights])
+    motion = np.array([light.motion for light in lights])
+    np.testing.assert_allclose(np.linalg.norm(place, axis=1), 1, rtol=1e-12)
+    share = (1 - place @ boresight) / (1 - np.cos(reach))
+    assert 0 <= share.min() < 0.02
+    assert 0.98 < share.max() <= 1
+    assert stats.kstest(share, "uniform").pvalue > 1e-3
+    outward = place - (place @ boresight)[:, None] * boresight
+    turned = np.arctan2(outward @ [0.0, 1.0, 0.0], outward @ [0.8, 0.0, -0.6]) % (2 * np.pi)
+    assert stats.kstest(turned / (2 * np.pi), "uniform").pvalue > 1e-3
+    rate = np.linalg.norm(motion[:, 0], axis=1)
+    np.testing.assert_allclose(np.sum(motion[:, 0] * place, axis=1), 0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(motion[:, 1], -(rate**2)[:, None] * place, rtol=1e-12)
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    inward = outward - np.sum(outward * place, axis=1)[:, None] * place
+    inward /= np.linalg.norm(inward, axis=1)[:, None]
+    heading = np.arctan2(
+        np.sum(np.cross(place, inward) * motion[:, 0], axis=1),
+        np.sum(inward * motion[:, 0], axis=1),
+    )
+    assert stats.kstest(heading / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
+    logarithm = np.log(np.degrees(rate) / 0.5) / np.log(8)
+    assert stats.kstest(logarithm, "uniform").pvalue > 1e-3
+    assert all(np.isnan(light.truth.range_km) for light in lights)
+    assert {light.truth.sunlit for light in lights} == {1.0}
+    ids = [light.truth.id for light in frames[0]]
+    assert ids == [satellites.RANDOM_BASE + n for n in range(len(ids))]
+
+
+def test_lights_without_a_star_are_named_by_their_numbers() -> None:
+    mirrored = satellites.MIRRORED
+    for number, name in (
+        (mirrored - 1, str(mirrored - 1)),
+        (mirrored, "reflection of 0"),
+        (2 * mirrored + 17, "reflection of 17"),
+        (satellites.ID_BASE, str(satellites.ID_BASE)),
+        (satellites.GHOST - 1, str(satellites.GHOST - 1)),
+        (satellites.GHOST + 32349, "ghost of 32349"),
+        (3 * satellites.GHOST + mirrored + 5, "ghost of reflection of 5"),
+    ):
+        assert satellites.light_name(number) == name

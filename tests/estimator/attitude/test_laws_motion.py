@@ -229,6 +229,42 @@ def test_the_rate_from_streaks_has_its_claimed_covariance() -> None:
     assert np.mean(nees) == pytest.approx(3, abs=4 * np.sqrt(6 / 300))
 
 
+def test_streaks_in_one_direction_leave_the_rate_about_it_to_its_prior() -> None:
+    """That of 10 rad/s: a variance of 100 rad^2/s^2, as streaks of lights on the boresight say nothing of the roll."""
+    camera = replace(GLOBAL, distortion=(0.0,) * 5)
+    seen = Moving(
+        Rotation.identity(), np.array([0.02, 0.01, 0.0]), np.tile(camera.center_px, (5, 1))
+    )
+    both = rate.from_streaks(camera, replace(seen, camera=camera).centroids(), EXPOSURE_S)
+    for one in both:
+        assert_allclose(one.covariance_rad2_s2[2], [0, 0, 100], rtol=1e-9, atol=1e-9)
+        # c = -f T J w: 5 chords of 0.1 px each
+        across = STREAK_SIGMA_PX / (camera.focal_px * EXPOSURE_S) / np.sqrt(5)
+        assert_allclose(
+            one.covariance_rad2_s2[:2, :2], across**2 * np.eye(2), rtol=1e-6, atol=0
+        )
+
+
+@pytest.mark.slow
+def test_the_covariance_of_noisy_streaks_is_that_of_their_noise() -> None:
+    """Eight times the claimed: the mean of its unbiased estimates with 3 rates taken from 2 N numbers is 64 times."""
+    factors = []
+    for seed in range(300):
+        rng = np.random.default_rng([26, seed])
+        seen = replace(moving(rng, any_rate(rng, 20.0), 5), camera=GLOBAL)
+        exactly = seen.centroids()
+        assert exactly.streak_px is not None
+        noise_px = 8 * STREAK_SIGMA_PX * rng.standard_normal(exactly.streak_px.shape)
+        noisy = replace(exactly, streak_px=exactly.streak_px + noise_px)
+        claimed, found = (
+            rate.from_streaks(GLOBAL, one, EXPOSURE_S)[0].covariance_rad2_s2
+            for one in (exactly, noisy)
+        )
+        factors.append(np.trace(np.linalg.solve(claimed, found)) / 3)
+    # The chi-square of 7 numbers, divided by 7, has the deviation sqrt(2 / 7).
+    assert np.mean(factors) == pytest.approx(64, rel=4 * np.sqrt(2 / 7 / 300))
+
+
 @law(rolling.fit)
 @given(rng=SEEDS)
 def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:
@@ -419,6 +455,87 @@ def test_the_covariance_of_a_rate_from_disks_is_that_of_one_error_of_all_moments
     assert np.sqrt(size) == pytest.approx(1, abs=0.1)
     doubled = nearest(disks.take(np.tile(np.arange(40), 2)))
     assert_allclose(doubled.covariance_rad2_s2, right.covariance_rad2_s2, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("rate_deg_s", [(3.0, 4.0, 0.2), (-7.0, 1.0, 0.0), (0.5, -0.8, 0.1)])
+def test_the_motion_of_a_disk_is_a_root_of_its_moments(
+    rate_deg_s: tuple[float, float, float],
+) -> None:
+    """Of the exact moments, one of both roots is the motion from row to row; the other one has the same moments."""
+    seen = moving(np.random.default_rng(27), np.array(rate_deg_s), 12)
+    variance_px2 = 30.0
+    moments = moments_of(seen, variance_px2)
+    rows = EXPOSURE_S / CAMERA.row_time_s
+    velocity = rate.tangent_motion(GLOBAL.rays(seen.still_px), STARS) @ seen.rate_rad_s
+    u, w = CAMERA.focal_px * CAMERA.row_time_s * velocity.T
+    both = np.stack([rate._roots(moments, rows, side) for side in (1, -1)])
+    off = np.abs(both - (u + 1j * w)).min(axis=0)
+    assert_allclose(off, 0, rtol=0, atol=1e-9)
+    for z in both:
+        gain = 1 / (1 - z.imag)
+        streak = rows**2 / 12 * gain**2
+        # D D^T = [[1 + (u g)^2, u g^2], [u g^2, g^2]]; a from the sum of the diagonal
+        trace = 1 + (z.real * gain) ** 2 + gain**2
+        a = (moments[:, 2] - streak * np.abs(z) ** 2) / trace
+        shape = a * (1 + (z.real * gain) ** 2 - gain**2) + streak * (z.real**2 - z.imag**2)
+        cross = a * z.real * gain**2 + streak * z.real * z.imag
+        assert_allclose(
+            moments[:, :2], np.column_stack([shape, 2 * cross]), rtol=0, atol=1e-9
+        )
+
+
+def test_a_rate_from_disks_is_that_of_weighted_least_squares() -> None:
+    """By SciPy-free arithmetic: rows divided by their deviations; of two roots the one that is nearer counts."""
+    rng = np.random.default_rng(28)
+    motion_px = rng.standard_normal((6, 2, 3))
+    omega = np.array([0.5, -0.3, 0.2])
+    truth = motion_px @ omega @ [1, 1j]
+    noisy = truth + 0.01 * (rng.standard_normal(6) + 1j * rng.standard_normal(6))
+    roots = np.stack([noisy, noisy + 50.0])
+    roots[:, ::2] = roots[::-1, ::2]
+    sigma_px = np.tile(rng.uniform(0.5, 2.0, 6), (2, 1))
+    sigma_px[:, 5] = 0.0  # not usable
+    found = rate._fit_disks(roots, sigma_px, motion_px, complex(truth.mean()))
+    assert found is not None
+    scale = np.repeat(sigma_px[0, :5], 2)
+    design = motion_px[:5].reshape(-1, 3) / scale[:, None]
+    measured = np.column_stack([noisy.real, noisy.imag])[:5].ravel() / scale
+    expected, *_ = np.linalg.lstsq(design, measured, rcond=None)
+    assert_allclose(found.rate_rad_s, expected, rtol=0, atol=1e-12)
+    assert_allclose(
+        found.covariance_rad2_s2, 5 * np.linalg.inv(design.T @ design), rtol=1e-9, atol=0
+    )
+    sigma_px[:, 3:] = 0.0
+    assert rate._fit_disks(roots, sigma_px, motion_px, 0j) is not None
+    sigma_px[:, 2] = 0.0
+    assert rate._fit_disks(roots, sigma_px, motion_px, 0j) is None
+
+
+def test_three_lights_of_a_measurable_size_give_a_rate() -> None:
+    """Not two; the median of xx + yy is 8 px^2 or more. Three streaks do, too."""
+    seen = moving(np.random.default_rng(29), np.array([3.0, 4.0, 0.2]), 3)
+    moments = moments_of(seen, 30.0)
+    disks = replace(seen.centroids(), xy_px=seen.still_px, moments_px2=moments)
+    assert len(rate.from_moments(CAMERA, disks, EXPOSURE_S)) == 2
+    assert rate.from_moments(CAMERA, disks.take(np.arange(2)), EXPOSURE_S) == []
+    for total_px2, count in ((7.9, 0), (8.1, 2)):
+        sized = replace(disks, moments_px2=moments * total_px2 / np.median(moments[:, 2]))
+        assert len(rate.from_moments(CAMERA, sized, EXPOSURE_S)) == count
+    assert len(rate.from_streaks(CAMERA, disks, EXPOSURE_S)) == 2
+    assert rate.from_streaks(CAMERA, disks.take(np.arange(2)), EXPOSURE_S) == []
+
+
+def test_an_outlier_is_beyond_four_standard_deviations_of_the_noise_that_is_seen() -> None:
+    """Sixteen times the median of the squares, and not less than sixteen."""
+    information = np.tile(np.diag([4.0, 1.0]), (5, 1, 1))
+    for median, limit in ((0.2, 16.0), (1.0, 16.0), (2.5, 40.0)):
+        for factor, kept in ((0.99, True), (1.01, False)):
+            squares = np.array([0.1, 0.1, median, median, factor * limit])
+            squares[3] = squares[2] + 1e-9
+            residual = np.column_stack([np.sqrt(squares) / 2, 0 * squares])
+            found = rate.inliers(residual, information)
+            assert found[-1] == kept
+            assert found[:4].all()
 
 
 @law(classify.moments)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 from scipy import linalg
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import mass_dynamics, mass_properties
@@ -16,12 +17,14 @@ from estimator.calibration.mass_dynamics import (
     STATE,
     BearingRecord,
     EquationsOfMotion,
+    LabConstants,
     MassEstimate,
     Prior,
     States,
     inertia_matrix,
     inertia_six,
 )
+from estimator.core.errors import ImageError
 from estimator.filter.error_models import TrackerModel
 from tests.helpers.bearing_motion import SMALL, prior, record
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn
@@ -393,6 +396,34 @@ def test_the_covariance_of_a_filter_never_grows(rng: np.random.Generator) -> Non
     np.testing.assert_array_equal(first.values, estimates[0].values)
 
 
+def test_a_filter_s_misfit_is_the_chi_square_of_each_number_of_its_innovations() -> None:
+    """Attitudes of 1,000 rad, from the third on, change nothing: the innovations are those of an integrated motion.
+
+    Three numbers an attitude, from the first innovation on.
+    """
+    assumed, vehicle = prior(SMALL, np.random.default_rng(12))
+    part = mass_properties.cut(RECORD, slice(0, 6))
+    sigma_rad = 1e3
+    covariance_rad2 = part.covariance_rad2.copy()
+    covariance_rad2[2:] = sigma_rad**2 * np.eye(3)
+    blind = replace(part, covariance_rad2=covariance_rad2)
+    known = MassEstimate(assumed.values, 1e-12 * np.diag(assumed.sigma**2), 1.0)
+    bias = Rotation.from_rotvec(assumed.values[mass_dynamics.BIAS])
+    states = mass_properties.first_states(blind, vehicle.lab, assumed.values).take(
+        slice(1, 2)
+    )
+    chi2 = 0.0
+    estimates = list(mass_properties.filter_from(known, blind, vehicle.lab, assumed))
+    assert len(estimates) == 4
+    for n, one in enumerate(estimates, 1):
+        states = mass_dynamics.transition(
+            blind, vehicle.lab, n, states, assumed.values, assumed
+        ).after
+        off = (states.rotation[0] * bias).inv() * part.lab_from_body[n + 1]
+        chi2 += off.magnitude() ** 2 / sigma_rad**2
+        assert one.misfit / chi2 == pytest.approx(1 / (3 * n), rel=1e-3)
+
+
 def test_a_longer_record_has_smaller_errors() -> None:
     assumed, vehicle = prior(SMALL, np.random.default_rng(3))
     short, long = (
@@ -421,3 +452,202 @@ def test_momentum_scales_with_the_inertia(rng: np.random.Generator, factor: floa
     np.testing.assert_allclose(
         inverse @ inertia_matrix(scaled[:6]), np.eye(3), rtol=0, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("duration_s", [0.35, 2.0])
+def test_a_motion_under_all_torques_is_that_of_its_equations(duration_s: float) -> None:
+    """Against SciPy's integration with matrices: skew wheels, trim masses, drag, gravity, lab, Earth, random torque.
+
+    The random torque is that of the assumed inertia, and decays meanwhile.
+    """
+    rng = np.random.default_rng(40)
+    axes = np.array([[1.0, 0.2, 0.0, 0.5], [0.0, 0.9, 0.3, 0.5], [0.1, 0.0, 0.8, 0.7]])
+    axes /= np.linalg.norm(axes, axis=0)
+    wheel_t_s = np.arange(0.0, 4.0, 0.001)
+    momenta = 2e-3 * np.sin(wheel_t_s[:, None] * [1.0, 0.7, 1.3, 0.5] + [0.1, 0.2, 0.3, 0.4])
+    added = np.array([[2e-3, 3e-4, -1e-4], [3e-4, 1e-3, 2e-4], [-1e-4, 2e-4, 3e-3]])
+    full = replace(
+        RECORD,
+        t_s=np.arange(4.0) * 0.9,
+        lab_from_body=RECORD.lab_from_body[:4],
+        covariance_rad2=RECORD.covariance_rad2[:4],
+        wheel_t_s=wheel_t_s,
+        wheel_momentum_nms=momenta,
+        added_inertia_kg_m2=added,
+        added_moment_kg_m=np.array([1e-4, -2e-4, 3e-4]),
+    )
+    earth = np.array([3e-2, -1e-2, 2e-2])
+    tau = 1.7
+    lab = LabConstants(9.8, axes, np.full(3, 1e-4), tau, earth)
+    values = np.concatenate(
+        [
+            [0.1, 0.13, 0.09, 0.004, -0.002, 0.003],
+            [2e-3, -1e-3, -3e-3],
+            [3e-4, -2e-4, 5e-4],
+            [2e-3, 4e-3],
+            [0.0, 0.0, 0.0],
+            [0.02, -0.01, 0.03, 0.05],
+        ]
+    )
+    assumed = values.copy()
+    assumed[:6] = [0.12, 0.12, 0.1, -0.003, 0.001, 0.002]
+    states = drawn_states(rng, 3)
+    states = states._replace(momentum=3 * states.momentum, torque=0.02 * states.torque)
+    begin_s = np.array([0.1, 0.6, 1.3])
+    motion = EquationsOfMotion(full, lab, np.tile(values[:, None], 3), assumed)
+    after = motion.integrate(begin_s, begin_s + duration_s, states, tau)
+    J = inertia_matrix(values[:6]) + added
+    J0 = inertia_matrix(assumed[:6]) + added
+    moment = values[6:9] + full.added_moment_kg_m
+    for n in range(3):
+        first_torque = states.torque[:, n]
+
+        def slope(
+            t_s: float,
+            state: np.ndarray,
+            d: np.ndarray = first_torque,
+            begin: float = begin_s[n],
+        ) -> np.ndarray:
+            R = state[:9].reshape(3, 3)
+            H = state[9:]
+            h = [np.interp(t_s, wheel_t_s, one) for one in momenta.T]
+            stored = axes @ ((1 + values[17:]) * h)
+            w = np.linalg.inv(J) @ (R.T @ H - stored) - R.T @ earth
+            random = R @ J @ np.linalg.inv(J0) @ R.T @ d * np.exp(-(t_s - begin) / tau)
+            drag = R @ ((values[12] + values[13] * np.abs(w)) * w)
+            weight = np.cross(R @ moment, [0.0, 0.0, -9.8])
+            torque = weight - np.cross(earth, H) + values[9:12] + random - drag
+            skew = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+            return np.concatenate([(R @ skew).ravel(), torque])
+
+        start = np.concatenate(
+            [states.rotation[n].as_matrix().ravel(), states.momentum[:, n]]
+        )
+        times = (begin_s[n], begin_s[n] + duration_s)
+        exact = solve_ivp(slope, times, start, rtol=1e-10, atol=1e-13, max_step=0.02).y[:, -1]
+        turned = Rotation.from_matrix(exact[:9].reshape(3, 3)).inv() * after.rotation[n]
+        # Each step feels the mean of the random torque.
+        assert turned.magnitude() < 2e-6
+        np.testing.assert_allclose(after.momentum[:, n], exact[9:], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            after.torque[:, n], first_torque * np.exp(-duration_s / tau), rtol=1e-9
+        )
+
+
+def test_first_states_have_the_momentum_of_body_and_wheels() -> None:
+    """The mean rate between two attitudes holds in the middle; at the ends that of the first and the last pair."""
+    lab = SMALL.lab
+    t_s = np.array([0.0, 1.0, 3.0, 4.0, 4.5])
+    axis = np.array([0.0, 0.6, 0.8])
+    rates = np.array([0.01, 0.02, 0.04, 0.01])
+    angles = np.concatenate([[0.0], np.cumsum(rates * np.diff(t_s))])
+    start = Rotation.from_euler("xyz", [0.2, -0.4, 0.9])
+    attitudes = start * Rotation.from_rotvec(np.outer(angles, axis))
+    wheels = np.tile([1e-3, -2e-3, 3e-3], (6, 1))
+    flown = BearingRecord(
+        t_s,
+        attitudes,
+        np.tile(1e-9 * np.eye(3), (5, 1, 1)),
+        np.arange(6.0),
+        wheels,
+        added_inertia_kg_m2=np.diag([1e-3, 2e-3, 3e-3]),
+    )
+    values = SMALL.truth.copy()
+    values[17:] = [0.1, 0.0, -0.1]
+    found = mass_properties.first_states(flown, lab, values)
+    middle_s = np.array([0.5, 2.0, 3.5, 4.25])
+    rate = np.interp(t_s, middle_s, rates)
+    inertia = SMALL.inertia_kg_m2 + np.diag([1e-3, 2e-3, 3e-3])
+    own = rate[:, None] * (inertia @ axis) + [1.1e-3, -2e-3, 2.7e-3]
+    np.testing.assert_allclose(found.momentum.T, attitudes.apply(own), rtol=1e-9)
+    assert not found.torque.any()
+    np.testing.assert_allclose(found.rotation.as_matrix(), attitudes.as_matrix(), atol=1e-12)
+
+
+def test_a_record_s_times_ascend_within_those_of_its_wheels() -> None:
+    attitudes = RECORD.lab_from_body[:4]
+    covariance = np.tile(1e-9 * np.eye(3), (4, 1, 1))
+    wheels = np.zeros((5, 3))
+
+    def record_of(t_s: list[float], wheel_t_s: list[float], count: int = 4) -> BearingRecord:
+        return BearingRecord(
+            np.array(t_s), attitudes[:count], covariance[:count], np.array(wheel_t_s), wheels
+        )
+
+    record_of([0, 1, 2, 4], [0, 1, 2, 3, 4])
+    for t_s, wheel_t_s in (
+        ([0.0, 1, 1, 4], [0.0, 1, 2, 3, 4]),
+        ([0.0, 1, 2, 4], [0.0, 1, 1, 3, 4]),
+        ([0.0, 2, 1, 4], [0.0, 1, 2, 3, 4]),
+    ):
+        with pytest.raises(ImageError, match="do not ascend"):
+            record_of(t_s, wheel_t_s)
+    for t_s in ([-0.1, 1, 2, 4], [0, 1, 2, 4.1]):
+        with pytest.raises(ImageError, match="wheel speeds from 0 to 4 s"):
+            record_of(t_s, [0.0, 1, 2, 3, 4])
+    with pytest.raises(ImageError, match="3 attitudes; allowed: 4 or more"):
+        record_of([0, 1, 2], [0, 1, 2, 3, 4], 3)
+
+
+def test_the_misfit_of_a_fit_is_one_where_the_errors_are_as_assumed() -> None:
+    """Three numbers an attitude less six of the start: of 40 records with drawn noise; less with more noise."""
+    found = []
+    for seed in range(40):
+        rng = np.random.default_rng([41, seed])
+        short = mass_properties.cut(record(SMALL, rng, 26.0), slice(0, 9))
+        assumed, _ = prior(SMALL, rng)
+        drawn = SMALL.truth + assumed.sigma * rng.standard_normal(20)
+        known = Prior(drawn, assumed.sigma)
+        one = mass_properties.estimate_mass([short], SMALL.lab, known)
+        found.append(one.misfit)
+        if seed == 0:
+            twice = mass_properties.estimate_mass([short, short], SMALL.lab, known)
+            assert twice.misfit == pytest.approx(one.misfit, rel=0.3)
+            doubled = short.with_noise(9.0)
+            quiet = mass_properties.estimate_mass([doubled], SMALL.lab, known).misfit
+            assert quiet < one.misfit
+    # The chi-square of 21 numbers
+    assert np.mean(found) == pytest.approx(1, abs=4 * np.sqrt(2 / 21 / 40))
+
+
+def test_the_noise_is_scaled_until_the_misfit_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A misfit of 5 over the factor: the next is the last one times misfit^1.5, within a thousand; eight fits."""
+    factors: list[float] = []
+
+    def fit(records: list[BearingRecord], *_: object) -> MassEstimate:
+        factors.append(
+            float(records[0].covariance_rad2[0, 0, 0] / RECORD.covariance_rad2[0, 0, 0])
+        )
+        return MassEstimate(SMALL.truth, np.eye(20), 5.0 / factors[-1])
+
+    monkeypatch.setattr(mass_properties, "estimate_mass", fit)
+    assumed, vehicle = prior(SMALL, np.random.default_rng(3))
+    last = mass_properties.estimate_with_noise([RECORD], vehicle.lab, assumed)
+    assert abs(np.log(last.misfit)) < 0.1
+    expected = [1.0]
+    while abs(np.log(5 / expected[-1])) >= 0.1:
+        expected.append(expected[-1] * (5 / expected[-1]) ** 1.5)
+    np.testing.assert_allclose(factors, expected, rtol=1e-9)
+    for misfit, bound in ((1e9, 1e3), (1e-9, 1e-3)):
+        factors.clear()
+        monkeypatch.setattr(
+            mass_properties,
+            "estimate_mass",
+            lambda records, *_, m=misfit: replace(fit(records), misfit=m),
+        )
+        mass_properties.estimate_with_noise([RECORD], vehicle.lab, assumed)
+        np.testing.assert_allclose(factors, [1.0] + 7 * [bound], rtol=1e-9)
+
+
+def test_a_misfit_falls_with_the_assumed_noise_where_attitudes_tell_little() -> None:
+    """Nine attitudes hardly move the parameters: the fit goes on until the states have settled too."""
+    rng = np.random.default_rng([41, 0])
+    short = mass_properties.cut(record(SMALL, rng, 26.0), slice(0, 9))
+    assumed, _ = prior(SMALL, rng)
+    known = Prior(SMALL.truth, assumed.sigma)
+    misfits = [
+        mass_properties.estimate_mass([short.with_noise(factor)], SMALL.lab, known).misfit
+        for factor in (1.0, 9.0, 81.0)
+    ]
+    # Of nearly the same residuals
+    assert misfits[0] > 3 * misfits[1] > 9 * misfits[2]

@@ -134,3 +134,71 @@ def test_bad_air_is_refused(change: dict, name: str) -> None:
             **{"latitude_deg": 50.0, "longitude_deg": 8.0, "epoch": "2012-06-24T23:00"}
             | change
         )
+
+
+def edlen_1966(wavelength_um: float) -> float:
+    """n - 1 of standard air, at 15 deg C (Edlen 1966, Metrologia 2, 71), within 1e-8 of the formula of 1953."""
+    per_um2 = wavelength_um**-2
+    return 1e-8 * (8342.13 + 2406030 / (130 - per_um2) + 15997 / (38.9 - per_um2))
+
+
+@pytest.mark.parametrize("wavelength_um", [0.35, 0.45, 0.6, 0.9, 2.0])
+@pytest.mark.parametrize(("pressure_hpa", "temperature_c"), [(1013.25, 15.0), (700.0, -20.0)])
+def test_the_constants_of_refraction_follow_from_the_refractivity(
+    wavelength_um: float, pressure_hpa: float, temperature_c: float
+) -> None:
+    """In proportion to the density, with air whose scale height is 0.001254 of the Earth's radius at 0 deg C."""
+    t_k = 273.15 + temperature_c
+    g = edlen_1966(wavelength_um) * pressure_hpa / 1013.25 * 288.15 / t_k
+    beta = 0.001254 * t_k / 273.15
+    found = refraction.refraction_constants(pressure_hpa, temperature_c, 1e-6 * wavelength_um)
+    expected = g * (1 - beta), -g * (beta - g / 2)
+    np.testing.assert_allclose(found, expected, rtol=6e-5)
+
+
+@pytest.mark.parametrize("centuries", [-0.5, -0.2, 0.12, 0.3, 0.6])
+def test_precession_is_that_of_1976_and_sidereal_time_that_of_1982(centuries: float) -> None:
+    """By ERFA's, whose cubic terms are below 0.02" in these years."""
+    days = 36525 * centuries + 0.3
+    latitude = np.radians(41.0)
+    longitude = np.radians(-77.0)
+    theta = erfa.gmst82(erfa.DJ00, days) + longitude
+    of_date = erfa.s2c(theta, latitude)
+    wanted = erfa.pmat76(erfa.DJ00, days).T @ of_date
+    ours = refraction.zenith_icrs(days, latitude, longitude)
+    assert apart(ours, wanted) < 0.03 * ARCSEC
+
+
+def test_a_star_is_lowered_by_its_apparent_zenith_distance_up_to_85_degrees() -> None:
+    """A tan z + B tan^3 z; below, where the formula fails, as at 85 degrees; nothing at the zenith."""
+    a_rad, b_rad = 2.8e-4, -3e-7
+    zenith = np.array([0.0, 0.0, 1.0])
+    z_deg = np.array([0.0, 10.0, 60.0, 84.9, 85.0, 86.0, 89.0])
+    z = np.radians(z_deg)
+    seen = np.column_stack([np.sin(z), 0 * z, np.cos(z)])
+    found = refraction.lowered(seen, zenith, a_rad, b_rad)
+    tangent = np.tan(np.minimum(z, np.radians(85.0)))
+    true = z + a_rad * tangent + b_rad * tangent**3
+    np.testing.assert_allclose(
+        found, np.column_stack([np.sin(true), 0 * z, np.cos(true)]), rtol=0, atol=1e-12
+    )
+    # Back again, to what six rounds leave: below 85 degrees to the true place's own rounding.
+    again = refraction.raised(found[:5], zenith, a_rad, b_rad)
+    np.testing.assert_allclose(again, seen[:5], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("t_s", "solutions"), [(0.99, 1), (1.01, 3), (-0.99, 1), (-1.01, 3)])
+def test_the_air_of_a_second_ago_is_the_same(t_s: float, solutions: int) -> None:
+    """After it, two corrections."""
+    camera = Camera(640, 480, 900.0, (319.5, 239.5))
+    air = SiteAir(50.0, 8.0, "2012-06-24T23:00")
+    up = Rotation.align_vectors([[0.0, 0.0, 1.0]], [air.zenith(t_s)])[0]
+    tried = []
+
+    def solve(centroids: Centroids) -> Attitude:
+        tried.append(centroids)
+        return Attitude("solved", up)
+
+    lights = Centroids(np.full((3, 2), 100.0), np.full(3, 0.1), np.ones(3))
+    refraction.solve_through_air(solve, camera, air, t_s, lights)
+    assert len(tried) == solutions

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -203,6 +204,99 @@ def test_the_floor_of_the_errors_has_the_restricted_likelihood(
         * Rotation.from_quat(found.cam_from_ref_xyzw).inv()
     )
     np.testing.assert_allclose(moved.as_rotvec(), mean, atol=1e-3 * np.sqrt(wanted.max()))
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.02])
+def test_the_two_axes_of_an_error_ellipse_hold_a_match_s_whole_information(
+    tracker: StarTracker, ratio: float
+) -> None:
+    """[J r]^T W [J r] of rotation, focal length and residual is the sum over both axes, each with its own variance."""
+    _, centroids = field(tracker, 2, CAMERA)
+    detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    found = star_search.lost_in_space(detections, tracker.sky, 80, 100_000)
+    found = found._replace(focal_ratio=ratio)
+    rng = np.random.default_rng(9)
+    focal_px = CAMERA.focal_px
+    covariances_px2 = []
+    for n in range(len(detections.weight)):
+        root = rng.standard_normal((2, 2))
+        covariances_px2.append(root @ root.T + 0.1 * np.eye(2))
+        weight = focal_px**2 * np.linalg.inv(covariances_px2[n])
+        detections.weight[n] = weight[0, 0], weight[1, 1], weight[0, 1]
+    rotation = Rotation.from_quat(found.cam_from_ref_xyzw)
+    seen = rotation.apply(tracker.sky.vectors[found.star])
+    view = geometry(seen, seen)
+    for k, n in enumerate(found.observed):
+        whole = focal_px * np.column_stack(
+            [
+                ratio * view.jacobian.reshape(-1, 2, 3)[k],
+                ratio * view.tangent[k],
+                detections.tangent[n] - ratio * view.tangent[k],
+            ]
+        )
+        expected = whole.T @ np.linalg.inv(covariances_px2[n]) @ whole
+        total = np.zeros((5, 5))
+        variances_px2 = []
+        for axis in range(2):
+            row = np.empty(5)
+            variance_px2 = misfit._principal_row.py_func(
+                found,
+                detections,
+                tracker.sky,
+                rotation.as_matrix(),
+                2 * k + axis,
+                focal_px,
+                row,
+            )
+            total += np.outer(row, row) / variance_px2
+            variances_px2.append(variance_px2)
+        np.testing.assert_allclose(
+            variances_px2, np.linalg.eigvalsh(covariances_px2[n]), rtol=1e-9
+        )
+        np.testing.assert_allclose(total, expected, rtol=1e-8, atol=1e-8 * expected.max())
+
+
+def test_unmatched_detections_near_a_star_are_counted_within_their_gates(
+    tracker: StarTracker,
+) -> None:
+    """By the angles to all stars; gates of more than 0.05 rad count as 0.05."""
+    truth, _ = field(tracker, 2, CAMERA)
+    rng = np.random.default_rng(10)
+    tangent = rng.uniform(-0.1, 0.1, (60, 2))
+    rays = np.column_stack([tangent / 1.03, np.ones(60)])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    stars = truth.apply(tracker.sky.vectors)
+    nearest = np.arccos(np.minimum(rays @ stars.T, 1.0)).min(axis=1)
+    matched = np.array([3, 7, 20])
+    for gates in (np.full(60, 0.03), rng.uniform(0, 0.04, 60), np.full(60, 1.0)):
+        close = nearest < np.minimum(gates, 0.05)
+        close[matched] = False
+        assert misfit.count_near.py_func(
+            tangent, tracker.sky, truth.as_matrix(), 1.03, matched, gates
+        ) == np.count_nonzero(close)
+    assert 5 < np.count_nonzero(nearest < 0.03) < 55
+    # The catalog's first star too
+    for star in (0, 1):
+        ray = tracker.sky.vectors[star]
+        beside = Rotation.align_vectors([[0.0, 0.0, 1.0]], [ray])[0].as_matrix()
+        none = np.zeros(0, int)
+        assert (
+            misfit.count_near.py_func(
+                np.full((1, 2), 1e-6), tracker.sky, beside, 1.0, none, np.full(1, 1e-4)
+            )
+            == 1
+        )
+
+
+@pytest.mark.parametrize("count", [1, 4, 25])
+def test_residuals_are_too_great_beyond_three_deviations_of_their_chi_square(
+    count: int,
+) -> None:
+    """Of two numbers a star, divided by their number: a deviation of sqrt(2 / 2 n)."""
+    deviation = float(stats.chi2(2 * count).std()) / (2 * count)
+    for factor, great in ((2.9, False), (3.1, True)):
+        solution = SimpleNamespace(star=np.arange(count), chi2=1 + factor * deviation)
+        assert misfit.residuals_too_great.py_func(solution) == great
 
 
 @pytest.mark.parametrize("floor_px", [0.01, 0.1])

@@ -204,6 +204,50 @@ def test_the_first_guess_of_a_slow_rate_shears_the_field_by_a_given_length(
         )
 
 
+def test_the_prior_of_a_rate_is_what_the_frame_does_not_tell() -> None:
+    """Any rate to 10 rad/s from streaks; else four times the slow one, 0.5 deg/s where the exposure is unknown."""
+    found = Moving(
+        Rotation.identity(),
+        np.radians(RATE_DEG_S),
+        np.random.default_rng(2).uniform(200, 1000, (20, 2)),
+        camera=WIDE,
+    ).centroids()
+    both = list(rolling_shutter.candidates(WIDE, STARS, found, None, EXPOSURE_S))
+    assert len(both) == 2
+    for _, prior in both:
+        assert_allclose(prior.covariance_rad2_s2, 100 * np.eye(3), rtol=1e-12, atol=0)
+        assert_allclose(prior.rate_rad_s, 0, rtol=0, atol=0)
+    points = replace(found, streak_px=None)
+    # 0.5 deg/s move an image by f w tau of a row: no shear of a pixel in half of the rows of a fast readout
+    for row_time_s, count in ((3e-4, 2), (-3e-4, 2), (1e-6, 1)):
+        camera = replace(WIDE, row_time_s=row_time_s)
+        shear_px = np.radians(0.5) * WIDE.focal_px * abs(row_time_s) * WIDE.height_px / 2
+        assert (shear_px > 1) == (count == 2)
+        guesses = list(rolling_shutter.candidates(camera, STARS, points, None, None))
+        assert len(guesses) == count
+        last, prior = guesses[-1]
+        sigma = np.sqrt(np.diag(last.covariance_rad2_s2))
+        assert_allclose(sigma[:2], np.radians(0.5), rtol=1e-12, atol=0)
+        assert sigma[2] / sigma[0] == pytest.approx(WIDE.focal_px / (WIDE.height_px / 2))
+        for guess, own in guesses:
+            assert_allclose(
+                own.covariance_rad2_s2, 16 * last.covariance_rad2_s2, rtol=1e-12, atol=0
+            )
+            assert_allclose(guess.rate_rad_s, 0, rtol=0, atol=0)
+    assert_allclose(
+        guesses[0][0].covariance_rad2_s2, last.covariance_rad2_s2, rtol=1e-12, atol=0
+    )
+
+
+@pytest.mark.parametrize("ratio", [1.0019, 1.0021, 0.9981, 0.9979])
+def test_a_focal_length_is_the_calibrated_one_within_two_thousandths(ratio: float) -> None:
+    fitted = WIDE.zoomed(ratio)
+    attitude = Attitude("solved", camera=fitted)
+    same = abs(ratio - 1) < 0.002
+    assert rolling_shutter._lens(attitude, WIDE) is (WIDE if same else fitted)
+    assert rolling_shutter._lens(Attitude("solved"), WIDE) is WIDE
+
+
 def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(
     tracker: StarTracker,
 ) -> None:

@@ -149,6 +149,33 @@ def test_correlations_match_those_of_simulated_draws(model, turned_deg):
     assert found == pytest.approx(model.correlation(turned_deg, rate_deg_s), abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("angle_deg", "rate_deg_s"), [(0.0, 0.0), (0.01, 2.5), (2.0, 1.0), (9.0, 4.0)]
+)
+def test_a_correlation_is_the_mean_product_by_quadrature(
+    model: ErrorModel, angle_deg: float, rate_deg_s: float
+) -> None:
+    """Gauss-Hermite over two normal numbers of the scales; slow terms share their exponentials, the noise nothing."""
+    x, weight = np.polynomial.hermite_e.hermegauss(40)
+    weight = weight / weight.sum()
+    left = np.exp(-angle_deg / CONSTANTS["scale_deg"])
+    first = model.scales(x)[:, None]
+    second = model.scales((left * x[:, None] + np.sqrt(1 - left**2) * x).ravel())
+    second = second.reshape(40, 40, 3)
+    scales = np.einsum("i,j,ijk->k", weight, weight, first * second)
+    slow = model.field**2 * np.exp(-angle_deg / CONSTANTS["field_deg"])
+    slow = slow + model.pixel**2 * np.exp(-angle_deg / CONSTANTS["pixel_deg"])
+    rates = CONSTANTS["rates_deg_s"]
+    noise = np.array(
+        [np.interp(rate_deg_s, rates, one) for one in np.transpose(CONSTANTS["noise"])]
+    )
+    along = np.interp(rate_deg_s, rates, CONSTANTS["along"])
+    square = model.field**2 + model.pixel**2 + noise**2 + along**2 * np.array([0.5, 0.5, 0])
+    # The mean of the squared scale is 1.
+    assert model.correlation(angle_deg, rate_deg_s) == pytest.approx(scales * slow / square)
+    assert model.correlation(-angle_deg, -rate_deg_s) == pytest.approx(scales * slow / square)
+
+
 @pytest.mark.parametrize("rate_deg_s", [4.1, -50.0, np.nan])
 def test_a_rate_beyond_the_measured_ones_is_refused(model, rate_deg_s):
     """Not the noise of the last one: by draws, steps and correlations; the last rate itself is allowed."""
