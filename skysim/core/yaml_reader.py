@@ -561,3 +561,13 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
 
     visit(yaml.compose(text, yaml.SafeLoader), ())
     return lines
+
+
+def yaml_line(value: Any) -> str:
+    """Format a value as one line of YAML; strings are returned unchanged."""
+    if isinstance(value, str):
+        return value
+    text = yaml.safe_dump(
+        value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False
+    )
+    return text.strip().removesuffix("...").strip()

@@ -15,6 +15,7 @@ from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import context, forms, space, style, widgets
 from skysim.core.types import Floats, Ints
+from skysim.core.yaml_reader import yaml_line
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import survey_frames
 from skysim.scene.sections.motion import PRESCRIBED
@@ -345,7 +346,7 @@ def survey_flight(
         at = attitude
     flown = {
         **overrides,
-        "motion.maneuver": forms.yaml_line(legs),
+        "motion.maneuver": yaml_line(legs),
         "exposure.rate_hz": f"{rate_hz:g}",
         "exposure.first": "0 s",
     }

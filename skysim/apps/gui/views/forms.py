@@ -8,13 +8,12 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import Record
-from skysim.core.yaml_reader import OverrideTexts, read_yaml
+from skysim.core.yaml_reader import OverrideTexts, read_yaml, yaml_line
 from skysim.scene import unused
 from skysim.scene.loader import file_names, find, load, read, with_overrides
 from skysim.scene.provenance import plain
@@ -298,16 +297,6 @@ def section_at(scene: Scene, key: str) -> tuple[Any, Any]:
         info = model.model_fields[name]
         value = getattr(value, name)
     return info, value
-
-
-def yaml_line(value: Any) -> str:
-    """Format a value as one line of YAML; strings are returned unchanged."""
-    if isinstance(value, str):
-        return value
-    text = yaml.safe_dump(
-        value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False
-    )
-    return text.strip().removesuffix("...").strip()
 
 
 def absolute_path(scene: str) -> str:

@@ -24,10 +24,10 @@ from skysim.apps.gui.messages import (
     SceneInfo,
     TrackerResult,
 )
-from skysim.apps.gui.views.forms import yaml_line
 from skysim.apps.gui.worker import geometry
 from skysim.core import quaternion
 from skysim.core.types import Floats, Frame, Ints, Record, Trajectory, Truth
+from skysim.core.yaml_reader import yaml_line
 from skysim.experiments.dome_survey import survey_frames
 from skysim.results import plots, scoring
 from skysim.scene.loader import load
