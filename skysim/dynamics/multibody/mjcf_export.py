@@ -109,14 +109,18 @@ def mjcf(
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
     add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
-    start = Simulation(vehicle, lab_from_body, rate_rad_s, 0.0).data
-    spec.add_key(
-        name="start", qpos=start.qpos, qvel=start.qvel, act=start.act, ctrl=start.ctrl
-    )
+    add_start(spec, Simulation(vehicle, lab_from_body, rate_rad_s, 0.0).data)
     # 4. Text.
     with mujoco_warnings(), full_precision():
         compile_spec(spec, SCENES / scene.vehicle.model)
         return shorten_colors(spec.to_xml())
+
+
+def add_start(spec: Any, start: Any) -> None:
+    """Add MuJoCo's state at the start as the keyframe `start`."""
+    spec.add_key(
+        name="start", qpos=start.qpos, qvel=start.qvel, act=start.act, ctrl=start.ctrl
+    )
 
 
 def hide_tilt_stop(spec: Any) -> None:

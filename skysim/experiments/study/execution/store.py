@@ -72,8 +72,7 @@ STRAY = """
 WITH study AS (
   SELECT COALESCE(MAX(CAST(value AS INTEGER)), 0) AS each, (SELECT COUNT(*) FROM points) AS points,
     COALESCE((SELECT value FROM meta WHERE key = 'factors'), (SELECT group_concat(key, ', ') FROM json_each(
-      (SELECT levels FROM points ORDER BY point LIMIT 1)))) AS factors
-  FROM meta WHERE key = 'replicates')
+      (SELECT levels FROM points ORDER BY point LIMIT 1)))) AS factors FROM meta WHERE key = 'replicates')
 SELECT 'not a valid study store: trial ' || trial || ', point ' || quote(point) || ', replicate ' || quote(replicate),
   'trial ' || each || ' * point + replicate, of ' || points || ' points and ' || each || ' replicates'
 FROM trials, study
@@ -87,9 +86,8 @@ WHERE point < 0 OR point >= points OR (SELECT group_concat(key, ', ') FROM json_
 LIMIT 1
 """
 
-values_of = attrgetter(
-    *FIELDS
-)  # the values of an outcome; `astuple` takes twenty times longer
+# The values of an outcome; `astuple` takes twenty times longer.
+values_of = attrgetter(*FIELDS)
 times_of = attrgetter(*TIMES[1:])
 INSERT = f"INSERT OR REPLACE INTO trials VALUES ({', '.join('?' * (7 + len(FIELDS)))})"
 
