@@ -56,7 +56,7 @@ def causes(scene: Scene) -> Changes:
         "the focal length known": {"tracker.survey.focal_length_sigma": "0 mm"},
         "the pupil fixed": {"camera.pupil_walk": 2 * ["0 mm"]},
         "dies centered": {"light.led.die": 3 * ["0 mm"]},
-        "no sag": {"vehicle.sag_arcsec": [0, 0]},
+        "no sag": {"vehicle.sag_arcsec": [0, 0], "vehicle.mast": "0 m"},
         "a round ball": {"vehicle.runout": 3 * ["0 mm"]},
         "no lens errors": {"camera.lens_table": None},
         "no coma": {"camera.psf.coma_px": 0},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ import pytest
 import yaml
 
 from skysim.core.errors import InputError
+from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.datasheet.cells import (
     BENDS_PX,
     FULL,
@@ -420,3 +422,40 @@ def test_results_are_read_by_cell_and_field():
     kept.failures = lambda: [(7, "Traceback\n  line\nValueError: why\n"), (9, "other")]
     with pytest.raises(InputError, match="cell 1: ValueError: why"):
         read(plan, kept)
+
+
+@pytest.mark.parametrize(
+    ("name", "keys", "has"),
+    [
+        (
+            "afit_as_built",
+            {"camera.psf.coma_px": "1", "camera.detector.cti_serial": "1e-5"},
+            {
+                "no transfer loss",
+                "the lever known",
+                "the LEDs' map known",
+                "the pupil fixed",
+                "dies centered",
+                "no sag",
+                "a round ball",
+                "no coma",
+                "even pixels",
+                "straight edges",
+                "no brighter-fatter charge",
+            },
+        ),
+        (
+            "shefex2",
+            {"site.longitude_deg": "9", "light.air": "{dispersion: true}"},
+            {"no fixed pattern", "no dispersion by the air"},
+        ),
+    ],
+)
+def test_a_cause_that_is_switched_off_is_no_cause(
+    name: str, keys: dict[str, str], has: set[str]
+) -> None:
+    listed = scene_changes.causes(load(name, keys))
+    assert has <= set(listed)
+    for cause in has:
+        ideal = {key: json.dumps(value) for key, value in listed[cause].items()}
+        assert cause not in scene_changes.causes(load(name, keys | ideal))
