@@ -146,7 +146,8 @@ def entries(
         if isinstance(tree, str) and tree == value:
             raw = tree
             origin = origin_of(parent, raw, sources)
-        if isinstance(value, ConfigModel):
+        # A table is shown as a whole: its columns may be those of a file.
+        if isinstance(value, ConfigModel) and name != "lens_table":
             yield from entries(value, raw, sources, path)
         elif isinstance(value, dict) and any(
             isinstance(v, ConfigModel) for v in value.values()

@@ -18,7 +18,7 @@ from skysim.camera.render import Window, render
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Mount, Trajectory
 from skysim.experiments.datasheet.scene_changes import causes
-from skysim.scene import loader
+from skysim.scene import loader, provenance
 from skysim.scene.sections.camera import CameraConfig, read_columns
 from skysim.sources.stars import steady_points
 
@@ -74,6 +74,9 @@ def test_an_ecsv_file_beside_its_scene(tmp_path: Path) -> None:
     table = loader.load(str(scene)).camera.lens_table
     assert table is not None
     assert (table.field_deg, table.coma_um, table.lateral) == ((0, 12), (0, 9), None)
+    shown = {entry.path: entry for entry in provenance.effective(str(scene))}
+    entry = shown["camera", "lens_table"]
+    assert (entry.value, entry.origin.what) == (str(tmp_path / "lens.ecsv"), "this file")
 
 
 @pytest.mark.parametrize("distortion", [[0, 0, 0, 0, 0], DISTORTION])
