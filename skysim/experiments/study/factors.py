@@ -284,22 +284,18 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
         raise InputError(
             "design.points", f"{design.points} for {design.kind}", "a power of two"
         )
-    levels = [len(factor.options()) for factor in factors.values()]
-    for name, count_of_levels in zip(factors, levels, strict=True):
-        if not sampled and not count_of_levels:
+    for name, factor in factors.items():
+        if not sampled and not factor.options():
             raise InputError(
                 f"factors.{name}",
                 "a distribution has no levels",
                 "design.kind lhs, sobol, saltelli",
             )
     # Counts multiply, so they are checked before the points are made.
-    totals = {"factorial": math.prod(levels), "saltelli": count * (len(factors) + 2)}
+    levels = math.prod(len(factor.options()) for factor in factors.values())
+    totals = {"factorial": levels, "saltelli": count * (len(factors) + 2)}
     if (total := totals.get(design.kind, 0)) > MAX_POINTS:
-        raise InputError(
-            "design",
-            f"{design.kind} of {len(factors)} factors: {total} points",
-            f"up to {MAX_POINTS}",
-        )
+        raise InputError("design", f"{design.kind} of {total} points", f"up to {MAX_POINTS}")
     return list(DESIGNS[design.kind](design, factors, seed))
 
 

@@ -434,7 +434,7 @@ class Study(ConfigModel):
     set: Settings = Field(default_factory=dict)
     trial: Trial
     factors: dict[Annotated[str, Field(pattern=r"^[a-z]\w*$")], Factor] = Field(
-        default_factory=dict
+        default_factory=dict, max_length=100
     )
     design: Design = Design()
     replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
@@ -461,15 +461,9 @@ class Study(ConfigModel):
         return tree
 
     def check(self) -> None:
-        levels = 0
-        for name, factor in self.factors.items():
-            levels += len(factor.options())
-            if levels > MAX_LEVELS:
-                raise InputError(
-                    f"factors.{name}",
-                    f"{levels} levels, with those of the factors before it",
-                    f"up to {MAX_LEVELS} of all factors",
-                )
+        levels = sum(len(factor.options()) for factor in self.factors.values())
+        if levels > MAX_LEVELS:
+            raise InputError("factors", f"{levels} levels", f"up to {MAX_LEVELS}")
 
     @property
     def is_sampled(self) -> bool:

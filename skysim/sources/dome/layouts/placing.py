@@ -210,32 +210,21 @@ def spread(sites_m: Floats, spacing_m: float, count: int, bisections: int) -> In
     return chosen
 
 
-def thin(sites_m: Floats, spacing_m: float, count: int | None = None) -> Ints:
-    """Indices of sites taken in order, each if none taken before is within the spacing, up to `count`.
+@jit
+def thin(sites_m: Floats, spacing_m: float, count: int = 0) -> Ints:
+    """Indices of sites taken in order, each if none taken before is within the spacing; the first `count` if not 0.
 
     For sites in random order this is random sequential adsorption. The time is linear in the number of sites: the
-    sites taken are listed by squares of the horizontal plane, at least the spacing wide.
+    sites taken are listed by squares of the horizontal plane, at least the spacing wide, with a border of empty ones.
     """
     reach_m = np.abs(sites_m).max()
     cell_m = max(spacing_m, 2 * reach_m / MAX_CELLS)
-    return _thin(
-        np.ascontiguousarray(sites_m), reach_m, cell_m, spacing_m, count or len(sites_m)
-    )
-
-
-@jit
-def _thin(
-    sites_m: Floats, reach_m: float, cell_m: float, spacing_m: float, count: int
-) -> Ints:
-    """`thin` with squares of width `cell_m` from -reach_m to reach_m, and a border of empty ones."""
     side = int(2 * reach_m / cell_m) + 3
     newest = np.full((side, side), -1, np.int32)  # the site taken last in each square
     older = np.empty(len(sites_m), np.int32)  # the one taken before it there, or -1
     taken = np.empty(len(sites_m), np.int64)
     found = 0
     for site in range(len(sites_m)):
-        if found == count:
-            break
         x = int((sites_m[site, 0] + reach_m) / cell_m) + 1
         y = int((sites_m[site, 1] + reach_m) / cell_m) + 1
         is_free = True
@@ -251,6 +240,8 @@ def _thin(
             newest[x, y] = site
             taken[found] = site
             found += 1
+            if found == count:
+                break
     return taken[:found]
 
 
