@@ -1,9 +1,10 @@
 """Errors for the user, text that is safe to print on a terminal, and interrupts that are not lost."""
 
+import os
 import signal
 import sys
 import weakref
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple
@@ -148,11 +149,10 @@ CALLBACKS = (
 )
 
 
-def handle_signals() -> None:
-    """Let SIGTERM, and Ctrl-C unless it is ignored or handled, raise KeyboardInterrupt in the main thread."""
-    signal.signal(signal.SIGTERM, interrupt)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, interrupt)
+def stop(*_: object) -> None:
+    """Handler: end the process with a line on stderr. Some modules lose an exception that is raised in their import."""
+    os.write(2, b"skysim: stopped\n")
+    os._exit(130)
 
 
 def interrupt(_: int, frame: FrameType | None) -> None:
@@ -167,6 +167,13 @@ def interrupt(_: int, frame: FrameType | None) -> None:
     # A trace function may raise; Python calls the caller's at its next line, or when it returns.
     caller.f_trace = raise_interrupt
     sys.settrace(lambda *_: None)
+
+
+def handle_signals(handler: Callable[..., None] = interrupt) -> None:
+    """Let a handler take SIGTERM, and Ctrl-C unless it is ignored or handled: `interrupt`, or during imports `stop`."""
+    signal.signal(signal.SIGTERM, handler)
+    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, stop):
+        signal.signal(signal.SIGINT, handler)
 
 
 def loses_exceptions(code: CodeType) -> bool:

@@ -9,12 +9,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from multiprocessing import forkserver
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 
 from skysim.core import errors
+from skysim.core.errors import InputError
 from skysim.experiments.study.execution import engines, store, trials
 from skysim.experiments.study.plan import TrialSpec
 
@@ -194,3 +197,105 @@ def test_a_command_that_is_killed_ends_at_once(tmp_path: Path, words: list[str])
     for path in tmp_path.rglob("*.sqlite"):
         with store.open_store(path) as stored:
             assert stored.counts()["failed"] == 0
+
+
+# Before main(), and at the start of workers.
+
+SIGNALED = """
+import os, signal, sys
+from skysim.core import errors
+
+number, module = sys.argv[1:]
+
+class Finder:
+    def find_spec(self, name, *_):
+        if name == module:
+            os.kill(os.getpid(), int(number))
+
+sys.meta_path.insert(0, Finder())
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from skysim.__main__ import main
+sys.argv[1:] = ["--version"]
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "module", ["typer", "estimator.core.errors", "skysim.apps.cli.commands.survey"]
+)
+def test_a_signal_during_the_imports_of_the_command_is_one_line(
+    number: signal.Signals, module: str
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNALED, str(int(number)), module],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "skysim: stopped\n")
+
+
+def test_main_takes_signals_over_from_the_imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = [signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        for own, taken in ((signal.default_int_handler, True), (signal.SIG_IGN, False)):
+            signal.signal(signal.SIGINT, own)
+            for handler in (errors.stop, errors.interrupt):
+                errors.handle_signals(handler)
+                assert signal.getsignal(signal.SIGTERM) is handler
+                assert signal.getsignal(signal.SIGINT) is (handler if taken else own)
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(6))
+def test_processes_killed_at_the_start_of_a_pool_end_it_in_one_line_or_not_at_all(
+    seed: int, tmp_path: Path
+) -> None:
+    """The fork server or a worker, at the moment at which it appears or up to a second later."""
+    draw = np.random.default_rng(seed)
+    after_s = draw.uniform(0, 1)
+    killed = threading.Event()
+
+    def kill_one() -> None:
+        until_s = time.monotonic() + 60
+        while time.monotonic() < until_s:
+            found = [
+                one
+                for one in psutil.Process().children(recursive=True)
+                if "forkserver" in " ".join(one.cmdline())
+            ]
+            if len(found) > seed % 2:
+                time.sleep(after_s * (seed > 1))
+                found[-1].kill()
+                killed.set()
+                return
+
+    if forkserver._forkserver._forkserver_pid:
+        forkserver._forkserver._stop()  # type: ignore[attr-defined]
+    thread = threading.Thread(target=kill_one)
+    thread.start()
+    engine = engines.Pool(2)
+    rows = []
+    refused = ""
+    try:
+        for some in engine.run(trials.TrialJob(SKY), Chunks(40)):
+            rows += some
+    except InputError as error:
+        refused = str(error)
+    finally:
+        thread.join()
+        engine.close()
+    if refused:
+        assert (
+            refused == "workers: 2 processes do not start; allowed: fewer, or engine serial"
+        )
+    else:
+        assert sorted(row.trial for row in rows) == list(range(40))
+        assert [row.error for row in rows if row.error] == []
+    assert killed.is_set()

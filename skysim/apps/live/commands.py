@@ -133,8 +133,8 @@ class CommandState:
         """Check a command as a whole, then take it. Raises InputError."""
         flight = self.flight
         schedule = flight.schedules[0]
-        allowed = (*KEYS, *flight.motion.flight_computer.actuator_sets)
         for key in command:
+            allowed = *KEYS, *flight.motion.flight_computer.actuator_sets
             check_name("", "key", key[:40], allowed)
         actuators = dict(command)
         exposure_s = actuators.pop("exposure_s", None)

@@ -113,8 +113,8 @@ class Sink:
         except BrokenPipeError:
             return READER_GONE
         except OSError as error:
-            file = f"{error.filename}: " if error.filename else ""
-            return file + (error.strerror or str(error))
+            reason = error.strerror or str(error)
+            return f"{error.filename}: {reason}" if error.filename else reason
         # A dead thread without `fault` would block a patient offer() for ever.
         except Exception as error:
             return printable(f"{type(error).__name__}: {error}")

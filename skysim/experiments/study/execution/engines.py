@@ -21,6 +21,8 @@ from skysim.experiments.study.execution.trials import Segment, code_version, div
 
 AHEAD = 1  # chunks queued for each worker in addition to the one it runs
 MAX_ATTEMPTS = 3  # attempts of a trial whose worker dies
+# Raised by the start of a worker: it died, or before it the fork server.
+BROKEN = (BrokenProcessPool, EOFError, OSError)
 DIED = f"its worker process died, {MAX_ATTEMPTS} times"
 
 Chunk = tuple[Segment, ...]
@@ -109,10 +111,10 @@ class Pool:
                     ):
                         try:
                             in_flight[pool.submit(run_chunk, chunk)] = chunk
-                        except BrokenProcessPool:
+                        except BROKEN:
                             # A worker died while the caller stored rows.
                             retries.appendleft(chunk)
-                            raise
+                            raise BrokenProcessPool from None
                     if not in_flight:
                         return
                     finished = wait(in_flight, return_when=FIRST_COMPLETED).done
@@ -194,7 +196,7 @@ def start_pool(count: int, job: Job) -> ProcessPoolExecutor:
     try:
         for future in [pool.submit(code_version) for _ in range(count)]:
             future.result()
-    except BrokenProcessPool:
+    except BROKEN:
         raise InputError(
             "workers", f"{count} processes do not start", "fewer, or engine serial"
         ) from None
