@@ -603,6 +603,13 @@ def test_colors_in_the_air_turn_solutions_as_check_counts() -> None:
         detection.context_of(lab),
     )
     assert not gray.error.rad2["cross"]["dispersion"].any()
+    # The tracker knows the air, so refraction is no error of the hardware.
+    edge = keys | {"light.air.dispersion": "true", "camera.detector.edge_px": "1e-9"}
+    built = sampling.sampled(
+        attitudes.of_frames(lab := build_lab(loader.load("shefex2", edge))),
+        detection.context_of(lab),
+    )
+    assert built.error.rad2["cross"]["hardware as built"].max() < (1e-3 * ARCSEC_RAD) ** 2
 
 
 # A total station

@@ -238,17 +238,23 @@ def star_places(view: View, context: Context) -> Floats | None:
 
 def dispersion(view: View, context: Context) -> Floats | None:
     """Refraction of the stars in their own colors minus that at the wavelength of `light.air`."""
-    effects = find_light(context.lab.camera.lights, AirEffects)
-    if effects is None:
+    if find_light(context.lab.camera.lights, AirEffects) is None:
         return None
-    air = effects.air
+    own, common = (through_air(view, context, own_color) for own_color in (True, False))
+    return displacement(view, (own - common)[:, :3])
+
+
+def through_air(view: View, context: Context, own_color: bool) -> Floats:
+    """(n, 4) places of the lights as the air shows them, in their own colors or at the wavelength of `light.air`."""
     lights = context.beliefs.lights.take(view.row)
-    zenith = air.at(view.time).zenith
-    own, common = (
-        air.refraction.apparent(lights.place[:, :3], zenith, scale)
-        for scale in (air.dispersion[air.rows(lights.id)], 1.0)
-    )
-    return displacement(view, own - common)
+    place = lights.place.copy()
+    effects = find_light(context.lab.camera.lights, AirEffects)
+    if effects is not None:
+        air = effects.air
+        scale = air.dispersion[air.rows(lights.id)] if own_color else 1.0
+        zenith = air.at(view.time).zenith
+        place[:, :3] = air.refraction.apparent(place[:, :3], zenith, scale)
+    return place
 
 
 def rolling_shutter(view: View, context: Context) -> Floats | None:
@@ -269,7 +275,7 @@ def as_built(view: View, context: Context) -> Floats | None:
     if not any(differs(scene, key) for key in AS_BUILT_KEYS):
         return None
     mount = context.camera.mount
-    place = context.beliefs.lights.place[view.row]
+    place = through_air(view, context, own_color=True)
     surveyed_m = mount.toward(place, view.lab_from_cam * mount.cam_from_body)
     surveyed_px = context.camera.optics.project(surveyed_m)
     chromatic = context.beliefs.lights.chromatic
