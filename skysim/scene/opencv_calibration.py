@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.errors import InputError, reason, shortened
+from skysim.core.errors import InputError, shortened
 from skysim.core.types import frozen
 from skysim.core.yaml_reader import (
     StrictLoader,
@@ -163,7 +163,7 @@ def parse_file(path: Path) -> Tree:
         first, _, rest = text.partition("\n")
         node, tree = parse_yaml(f"\n{rest}" if first.startswith("%YAML") else text, Loader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
-        problem = shortened(getattr(error, "problem", None) or reason(error), 120)
+        problem = shortened(getattr(error, "problem", None) or error, 120)
         raise InputError(path, f"not OpenCV's YAML: {problem}") from None
     reject_duplicate_keys(node, path)
     if not isinstance(tree, dict):
