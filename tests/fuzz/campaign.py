@@ -766,6 +766,10 @@ def place(folder: Path, case: Case) -> None:
             path.is_dir() and path.name in ("study", "data")
         ):
             shutil.copytree(path, folder / path.name)
+        elif (
+            path.suffix == ".yaml" and path.name != own
+        ):  # files are sought beside a scene, not beside a link
+            shutil.copy(path, folder / path.name)
         elif path.name not in (own, "shown", "complete", "ignored", "surveyed", "dome"):
             (folder / path.name).symlink_to(path)
     if not case.file:
