@@ -17,7 +17,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import INCH_M
-from estimator.core.errors import ImageError
+from estimator.core.errors import ImageError, file_bytes, reason
 
 UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": INCH_M}
 SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one
@@ -126,10 +126,10 @@ def _read_leds(path: str | Path, unit: str | None) -> tuple[list[int], Floats]:
         checks.known("unit", unit, UNIT_M)
         units[""] = UNIT_M[unit]
     try:
-        text = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        text = file_bytes(path).decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ImageError(
-            f"{path}: cannot be read: {error}; allowed: a list of LEDs"
+            f"{path}: cannot be read: {reason(error)}; allowed: a list of LEDs"
         ) from None
     rows = [
         (n, [cell.strip() for cell in line.split("," if "," in line else None)])

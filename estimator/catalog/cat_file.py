@@ -17,7 +17,7 @@ import numpy as np
 
 from estimator.catalog.catalog import StarCatalog, from_angles
 from estimator.catalog.published_catalogs import BYTES_PER_ENTRY, OnBoard
-from estimator.core.errors import ImageError
+from estimator.core.errors import ImageError, file_bytes
 
 HEADER = np.dtype([("magic", "S12"), ("epoch_milliyear", "<u4"), ("entries", "<u4")])
 ENTRY = np.dtype(
@@ -65,7 +65,7 @@ def read(path: str | Path) -> OnBoard:
         For a file that cannot be read, of another format or length, and for a wrong checksum.
     """
     try:
-        data = Path(path).read_bytes()
+        data = file_bytes(path)
     except OSError as error:
         raise _not_cat(path, error.strerror) from None
     if data[: len(MAGIC)] != MAGIC or len(data) < HEADER.itemsize:

@@ -30,7 +30,7 @@ from estimator.core.constants import (
     SUN_DEFLECTION_RAD,
     TT_MINUS_UTC_S,
 )
-from estimator.core.errors import ImageError
+from estimator.core.errors import ImageError, file_bytes, reason
 from estimator.core.vectors import normalized
 
 EPOCHS_YR = 1800.0, 2200.0  # allowed: linear proper motions are good for a century or two
@@ -294,6 +294,8 @@ def _read(path: str | Path, *_state: int) -> StarCatalog:
     The last four are kept, because reading one takes 0.1 s.
     """
     table, epoch_yr = columns(path, COLUMNS)
+    if len(np.unique(table[0])) < len(table[0]):
+        raise ImageError(f"{path}: a star's number occurs twice; allowed: each once")
     return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 
 
@@ -350,7 +352,7 @@ def columns(
         If the file cannot be read.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
+        lines = file_bytes(path).decode().splitlines()
         epoch_yr = _epoch_yr(lines)
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
@@ -368,11 +370,11 @@ def columns(
             ndmin=2,
             converters=converters,
         )
-        if not np.isfinite(table[:, : len(names)]).all():
-            raise ValueError("some numbers are not finite")
+        if not (np.abs(table[:, : len(names)]) <= 1e15).all():
+            raise ValueError("some numbers are not finite up to 1e15")
     except (OSError, TypeError, ValueError, IndexError) as error:
         raise ImageError(
-            f"{path}: not a star catalog ({error}); allowed: ECSV with {', '.join((*names, *optional))}"
+            f"{path}: not a star catalog ({reason(error)}); allowed: ECSV with {', '.join((*names, *optional))}"
         ) from None
     return table.T, epoch_yr
 

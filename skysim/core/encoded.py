@@ -11,6 +11,7 @@ import io
 import os
 import struct
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from math import prod
@@ -191,30 +192,25 @@ def check_pixels(path: Path, *sides: int, each_bytes: int = 1) -> None:
         )
 
 
-@contextlib.contextmanager
-def silent_opencv() -> Iterator[None]:
-    """Suppress OpenCV's own messages, for example about a missing camera."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(level)
+SILENCE = (
+    threading.Lock()
+)  # threads in turn: one would save what another has put in the place of stderr
 
 
 @contextlib.contextmanager
 def silent_stderr() -> Iterator[None]:
     """Suppress output of C libraries: libpng and OpenCV write messages directly to file descriptor 2."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    devnull = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(devnull, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(devnull)
+    with SILENCE:
+        sys.stderr.flush()
+        saved = os.dup(2)
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(devnull, 2)
+            yield
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            os.close(devnull)
 
 
 # Decoding.

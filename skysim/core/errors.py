@@ -9,6 +9,9 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple
 
+# Numbers of characters of a message, and of a file or key in it.
+MAX_MESSAGE = 950
+MAX_NAME = 200
 running_as_command = False  # whether skysim runs as a command, with a user at the terminal
 
 
@@ -22,6 +25,19 @@ def printable(text: object) -> str:
     """Text from outside on one line, with ? for control and other characters that a terminal cannot show."""
     one_line = " ".join(str(text).split())
     return "".join(character if character.isprintable() else "?" for character in one_line)
+
+
+def shortened(text: object, most: int = MAX_MESSAGE) -> str:
+    """`printable` text of at most so many characters."""
+    line = printable(text)
+    return line if len(line) <= most else f"{line[:most]}…"
+
+
+def reason(error: Exception) -> str:
+    """Why something cannot be read, written or computed, without the words of Python for it."""
+    if isinstance(error, UnicodeDecodeError):
+        return f"not text in UTF-8, by byte {error.start + 1}"
+    return getattr(error, "strerror", None) or str(error.args[-1] if error.args else error)
 
 
 def unknown_name(kind: str, name: object, allowed: Iterable[object]) -> tuple[str, str]:
@@ -48,7 +64,7 @@ class Where(NamedTuple):
 
     def __str__(self) -> str:
         place = "" if self.line is None else f", {self.unit} {self.line}"
-        return printable(f"{self.file}{place}")
+        return shortened(self.file, MAX_NAME) + place
 
     def error(self, problem: object, allowed: object = "") -> "InputError":
         """An error in the file, at this place."""
@@ -85,10 +101,12 @@ class InputError(ValueError):
         self, key: object, problem: object, allowed: object = "", where: Where | None = None
     ) -> None:
         # The parts may quote a file, and a file may contain any character.
-        self.key = printable(key)
-        self.problem = printable(problem)
-        self.allowed = printable(allowed)
+        self.key = shortened(key, MAX_NAME)
+        self.problem = shortened(problem, 2 * MAX_NAME)
         self.where = where and where._replace(file=str(where.file))
+        # What is allowed may be a long list; it gets what the other parts leave.
+        used = len(self.key) + len(self.problem) + len(str(self.where or ""))
+        self.allowed = shortened(allowed, MAX_MESSAGE - 20 - used)
         # Unpickling calls the constructor with the arguments of the base class.
         super().__init__(self.key, self.problem, self.allowed, self.where)
 
@@ -101,7 +119,7 @@ class InputError(ValueError):
     @property
     def is_of_file(self) -> bool:
         """Whether the key is the file of `where`."""
-        return self.where is not None and printable(self.where.file) == self.key
+        return self.where is not None and shortened(self.where.file, MAX_NAME) == self.key
 
     @property
     def subject(self) -> str:

@@ -1,5 +1,6 @@
 """Atomic writes of files and folders, tables, images and JSON."""
 
+import bisect
 import errno
 import json
 import os
@@ -16,7 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where, shortened
+from skysim.core.text import Line, read_lines
 
 HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
@@ -194,16 +196,31 @@ def write_table(path: Path, table: Any) -> None:
 
 
 def read_table(path: Path) -> Any:
-    """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV."""
+    """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV, with the first bad line."""
     from astropy.table import Table
 
-    try:
-        return Table.read(path, format="ascii.ecsv")
-    except Exception as error:
-        # astropy's parsers raise many types of exception for a file that is not ECSV.
-        raise InputError(
-            path, f"not an ECSV table: {' '.join(str(error).split())[:120]}"
-        ) from None
+    lines = read_lines(path)
+
+    def parse(some: list[Line]) -> Any:
+        try:
+            return Table.read([line for _, line in some], format="ascii.ecsv")
+        except Exception as error:  # astropy's parsers raise many types
+            return error
+
+    def fails(some: list[Line]) -> bool:
+        return isinstance(parse(some), Exception)
+
+    if not isinstance(table := parse(lines), Exception):
+        return table
+    head = sum(line.startswith("#") for _, line in lines) + 1
+    count = bisect.bisect_left(
+        range(len(lines)), True, head + 1, key=lambda n: fails(lines[:n])
+    )
+    # With another row alone, the header is read.
+    other = head + (count == head + 1)
+    if fails([*lines[:head], *lines[other : other + 1]]):
+        raise InputError(path, f"not an ECSV table: {shortened(table, 120)}")
+    raise Where(path, lines[count - 1][0]).error("no row of the table")
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:

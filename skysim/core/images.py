@@ -11,6 +11,7 @@ import datetime
 import gzip
 import importlib.util
 import math
+import os
 import re
 import tempfile
 import warnings
@@ -28,8 +29,8 @@ from numpy.typing import NDArray
 
 from skysim.core import encoded
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.encoded import check_pixels, silent_opencv
-from skysim.core.errors import InputError
+from skysim.core.encoded import check_pixels, silent_stderr
+from skysim.core.errors import InputError, reason
 from skysim.core.guarded import run_guarded
 from skysim.core.types import Record, frozen
 from skysim.core.yaml_reader import check_bytes
@@ -65,6 +66,9 @@ MOSAIC_KEYS = ("BAYERPAT", "COLORTYP")
 TOP_DOWN = {"TOP-DOWN": True, "BOTTOM-UP": False}
 TOP_DOWN_CARD = ("ROWORDER", "TOP-DOWN", "the first row is the highest")
 ASSUMED_TOP_DOWN = "no ROWORDER in the header: its first row is the highest here, not the lowest as by the standard"
+
+# Messages of FFmpeg about a damaged film; OpenCV reads this at its first film.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def read_fits_images(path: Path) -> list["ViewedImage"]:
@@ -102,7 +106,7 @@ def read_fits_images(path: Path) -> list["ViewedImage"]:
     except (
         Exception
     ) as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
-        raise InputError(path, f"not a complete FITS file: {error}") from None
+        raise InputError(path, f"not a complete FITS file: {reason(error)}") from None
     raise InputError(path, "a FITS file without an image")
 
 
@@ -146,8 +150,8 @@ def unpack(path: Path, file: IO[bytes]) -> None:
                         path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
                     )
                 file.write(block)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise InputError(path, f"not a complete gzip file: {error}") from None
+    except (gzip.BadGzipFile, EOFError, zlib.error):
+        raise InputError(path, "not a complete gzip file") from None
     file.flush()
 
 
@@ -354,9 +358,11 @@ def read_npy(path: Path) -> NDArray:
     try:
         stored = np.lib.format.open_memmap(path, mode="r")
     except Exception as error:  # of many types, for a damaged header
-        raise InputError(path, f"not a complete NPY file: {error}") from None
+        raise InputError(path, f"not a complete NPY file: {reason(error)}") from None
     check_pixels(path, *stored.shape, each_bytes=stored.itemsize)
-    return np.array(stored, stored.dtype.newbyteorder("="), order="C")
+    kind = stored.dtype.newbyteorder("=")
+    # Half precision ends at 65504.
+    return np.array(stored, np.float32 if kind == np.float16 else kind, order="C")
 
 
 def read_camera_raw(path: Path) -> NDArray:
@@ -516,7 +522,7 @@ class LiveCamera:
     def __init__(self, source: str) -> None:
         self.source = source
         self.frame_count = 0
-        with silent_opencv():
+        with silent_stderr():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
             self.capture.set(
                 cv2.CAP_PROP_BUFFERSIZE, 1
@@ -524,7 +530,7 @@ class LiveCamera:
 
     def frame(self) -> NDArray:
         """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
-        with silent_opencv():
+        with silent_stderr():
             ok, frame = self.capture.read()
         if not ok or frame is None:
             if self.frame_count:

@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError, Where, printable
+from skysim.core.errors import InputError, Where, shortened
 from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import read_limited
 
 MAX_BYTES = 200_000_000  # of a file: a million lines of 200 characters
+LARGEST = 1e15  # number of a table, in any unit; computations overflow far above
 MAX_EXCERPT = 40  # number of characters of a value in a message
 EPOCH = re.compile(
     r"(?:19|20|21)\d\d-(\d\d-\d\d|\d{3})[T ]\d\d:\d\d:\d\d(\.\d{0,15})?Z?", re.ASCII
@@ -36,33 +37,44 @@ def read_lines(path: Path) -> list[Line]:
 
 def excerpt(text: object) -> str:
     """A value for a message, on one line and truncated."""
-    shown = printable(text)
-    return repr(shown if len(shown) <= MAX_EXCERPT else f"{shown[:MAX_EXCERPT]}…")
+    return repr(shortened(text, MAX_EXCERPT))
 
 
-def to_numbers(
-    source: str | Path, places: Sequence[int], rows: Sequence[Sequence[str]], width: int
-) -> Floats:
+def to_numbers(source: str | Path, rows: Sequence[Words], width: int) -> Floats:
     """(N, width) numbers of the words of each line. Raises InputError for the first line without finite numbers."""
-    for line, words in zip(places, rows, strict=True):
+    for line, words in rows:
         if len(words) != width:
-            raise Where(source, line).error(f"{len(words)} numbers", width)
+            raise Where(source, line).error(f"{len(words)} values", width)
     try:
-        numbers = np.array(rows, dtype=np.float64).reshape(-1, width)
+        numbers = np.array([words for _, words in rows], dtype=np.float64).reshape(-1, width)
     except ValueError:
         numbers = np.full((1, width), np.nan)
-    if not np.isfinite(numbers).all():
-        for line, words in zip(places, rows, strict=True):
+    if not (np.abs(numbers) <= LARGEST).all():
+        for line, words in rows:
             check_numbers(Where(source, line), words)
     return numbers
 
 
+def column_numbers(
+    source: str | Path, rows: Sequence[Words], wanted: Sequence[str]
+) -> Floats:
+    """(N, K) numbers of the wanted columns that a table has; its first line names them. Raises InputError by line."""
+    names = rows[0][1]
+    for place, row in rows:
+        if len(row) != len(names):
+            raise Where(source, place).error(
+                f"{len(row)} values", f"{len(names)}, as the first line has"
+            )
+    used = [names.index(one) for one in wanted if one in names]
+    return to_numbers(source, [(n, [row[k] for k in used]) for n, row in rows[1:]], len(used))
+
+
 def check_numbers(where: Where, words: Sequence[str]) -> None:
-    """Raise InputError for the first word that is not a finite number."""
+    """Raise InputError for the first word that is not a finite number up to LARGEST."""
     for word in words:
-        kind = "finite number"
+        kind = f"finite number up to {LARGEST:g}"
         try:
-            if np.isfinite(float(word)):
+            if abs(float(word)) <= LARGEST:
                 continue
         except ValueError:
             kind = "number"
@@ -129,9 +141,9 @@ def seconds_since(
 
 
 def cells_of(lines: Iterable[Line]) -> list[Words]:
-    """The numbered lines of a CSV file, each split at its commas; # begins a comment."""
+    """The numbered lines of a table, each split at its commas, or else at its blanks; # begins a comment."""
     return [
-        (n, [cell.strip() for cell in line.split(",")])
+        (n, [cell.strip() for cell in line.split("," if "," in line else None)])
         for n, line in lines
         if not line.startswith("#")
     ]
@@ -168,20 +180,15 @@ def read_named_rows(
     columns = lines[0][1] if lines else []
     if len(lines) < 2 or len({*columns}) < len(columns) or not {name, *needed} <= {*columns}:
         raise refusal
-    for place, row in lines:
-        if len(row) != len(columns):
+    numbers = column_numbers(path, lines, (*needed, *also))
+    first: dict[str, int] = {}
+    for place, row in lines[1:]:
+        one = row[columns.index(name)]
+        if first.setdefault(one, place) != place:
             raise Where(path, place).error(
-                f"{len(row)} values", f"{len(columns)}, as the first line has"
+                f"{excerpt(one)} is in line {first[one]} too", "once"
             )
-    rows = [row for _, row in lines[1:]]
-    places = [n for n, _ in lines[1:]]
-    used = [columns.index(one) for one in (*needed, *also) if one in columns]
-    numbers = to_numbers(path, places, [[row[k] for k in used] for row in rows], len(used))
-    names = [row[columns.index(name)] for row in rows]
-    repeated = next((one for n, one in enumerate(names) if one in names[:n]), None)
-    if repeated is not None:
-        raise InputError(path, f"{excerpt(repeated)} occurs twice", "once")
-    return names, numbers
+    return list(first), numbers
 
 
 class TextSegment(NamedTuple):

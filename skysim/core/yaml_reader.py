@@ -24,7 +24,7 @@ from pydantic import AfterValidator, BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
-from skysim.core.errors import OVERRIDES, InputError, Where, printable, unknown_name
+from skysim.core.errors import OVERRIDES, InputError, Where, reason, shortened, unknown_name
 from skysim.core.paths import shipped_files
 
 Files = list[tuple[Path, str]]  # paths and texts
@@ -156,8 +156,7 @@ def find_file(name: str, folder: Path, what: str) -> Path:
 
 def excerpt(value: object) -> str:
     """A value for a message: on one line, truncated to MAX_EXCERPT characters."""
-    text = printable(value)
-    return text if len(text) <= MAX_EXCERPT else f"{text[:MAX_EXCERPT]}…"
+    return shortened(value, MAX_EXCERPT)
 
 
 def parse_overrides(
@@ -241,8 +240,10 @@ def as_tree(keys: Keys) -> tuple[Tree, str]:
 
 
 def check_bytes(path: Path, limit_bytes: int) -> None:
-    """Raise InputError for a file of more than limit_bytes."""
+    """Raise InputError for a file of more than limit_bytes, and for a pipe or a device, whose reading may not end."""
     size = path.stat().st_size
+    if not path.is_file():
+        raise InputError(path, "not a regular file")
     if size > limit_bytes:
         raise InputError(path, f"{size} bytes", f"up to {limit_bytes}")
 
@@ -253,9 +254,7 @@ def read_limited(path: Path, limit_bytes: int, encoding: str = "utf-8") -> str:
         check_bytes(path, limit_bytes)
         return path.read_text(encoding)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            path, f"cannot be read: {getattr(error, 'strerror', None) or error}"
-        ) from error
+        raise InputError(path, f"cannot be read: {reason(error)}") from error
 
 
 def read_yaml(path: Path) -> tuple[Tree, str]:

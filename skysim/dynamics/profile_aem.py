@@ -178,7 +178,7 @@ def segment_samples(
                 f"{len(words)} values", f"an epoch and {width} numbers"
             )
     lines = [n for n, _ in segment.data]
-    numbers = to_numbers(path, lines, [words[1:] for _, words in segment.data], width)
+    numbers = to_numbers(path, [(n, words[1:]) for n, words in segment.data], width)
     t_s = seconds_since(path, lines, [words[0] for _, words in segment.data], start, system)
     # 3. Conventions: scalar last and A to B, unless the keywords say otherwise.
     xyzw = quaternions(path, metadata, kind, numbers)

@@ -111,7 +111,7 @@ def to_samples(
         )
     # 2. Numbers; times count from the scene's start if the file has an epoch.
     places = [n for n, _ in rows]
-    values = to_numbers(path, places, [words for _, words in rows], width)
+    values = to_numbers(path, rows, width)
     t_s = values[:, 0]
     if "ScenarioEpoch" in keywords:
         t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()

@@ -66,7 +66,7 @@ def read_csv(
         date = names.index("utc")
         columns["utc"] = [cells.pop(date) for _, cells in body]
         names = names[:date] + names[date + 1 :]
-    numbers = to_numbers(path, places, [cells for _, cells in body], len(names))
+    numbers = to_numbers(path, body, len(names))
     columns |= dict(zip(names, numbers.T, strict=True))
     return to_samples(path, "line", places, columns, start, rotation)
 

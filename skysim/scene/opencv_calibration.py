@@ -9,9 +9,16 @@ import numpy as np
 import yaml
 
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, shortened
 from skysim.core.types import frozen
-from skysim.core.yaml_reader import StrictLoader, Tree, excerpt, parse_yaml
+from skysim.core.yaml_reader import (
+    StrictLoader,
+    Tree,
+    excerpt,
+    parse_yaml,
+    read_limited,
+    reject_duplicate_keys,
+)
 
 MAX_BYTES = 1 << 20  # enough for a calibration with the points of all its views
 # Allowed relative difference of fx and fy: a detector's pixels are square, so it is an error of the calibration.
@@ -151,20 +158,14 @@ def parse_file(path: Path) -> Tree:
 
     OpenCV before version 5 begins a file with %YAML:1.0, which is invalid YAML.
     """
+    text = read_limited(path, MAX_BYTES)
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(path, f"more than {MAX_BYTES >> 20} MiB", "a calibration of OpenCV")
-    try:
-        text = data.decode("utf-8")
         first, _, rest = text.partition("\n")
-        _, tree = parse_yaml(rest if first.startswith("%YAML") else text, Loader)
+        node, tree = parse_yaml(f"\n{rest}" if first.startswith("%YAML") else text, Loader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError, OverflowError) as error:
-        problem = " ".join(str(getattr(error, "problem", None) or error).split())[:120]
+        problem = shortened(getattr(error, "problem", None) or error, 120)
         raise InputError(path, f"not OpenCV's YAML: {problem}") from None
+    reject_duplicate_keys(node, path)
     if not isinstance(tree, dict):
         raise InputError(path, "", "a calibration of OpenCV, a mapping of keys to values")
     return tree

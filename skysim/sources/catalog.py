@@ -20,8 +20,9 @@ from skysim.core import files
 from skysim.core.constants import MAS_RAD
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import CATALOGS
+from skysim.core.text import LARGEST, cells_of, column_numbers, read_lines
 from skysim.core.types import Floats, Ints, Record, frozen
-from skysim.core.yaml_reader import excerpt, is_file, parse_yaml
+from skysim.core.yaml_reader import excerpt, is_file, parse_yaml, read_limited
 
 EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
 SCHEMA = "schema: astropy-2.0"
@@ -52,6 +53,8 @@ def star_columns(motion_format: str) -> tuple[CatalogColumn, ...]:
 
 NUMBERS = tuple(column.name for column in star_columns(""))
 SCATTER = CatalogColumn("scatter_mag", "mag", ".3g")  # optional
+
+MAX_BYTES = 1 << 30  # of a file: ten million stars
 
 
 @frozen
@@ -198,6 +201,10 @@ def read(name_or_path: str | Path) -> Catalog:
     """
     path = catalog_path(name_or_path)
     meta, lines = read_meta_and_lines(path)
+    # A truncated file has fewer rows than its header says.
+    rows = len(lines) - 1
+    if not 0 < rows == meta["rows"]:
+        raise catalog_error(path, f"damaged ({rows} stars of {meta['rows']})")
     header = lines[0].split(",")
     # The scatter is an optional column.
     names = [*NUMBERS, SCATTER.name] if SCATTER.name in header else NUMBERS
@@ -205,11 +212,11 @@ def read(name_or_path: str | Path) -> Catalog:
         table = np.loadtxt(
             lines[1:], delimiter=",", usecols=[header.index(name) for name in names], ndmin=2
         )
-    except ValueError as error:
-        raise catalog_error(path, f"damaged ({str(error).splitlines()[0]})") from error
-    # A truncated file has fewer rows than its header says.
-    if len(table) != meta["rows"]:
-        raise catalog_error(path, f"damaged ({len(table)} stars of {meta['rows']})")
+    except ValueError:
+        table = np.full((1, 1), np.nan)
+    if not (np.abs(table) <= LARGEST).all():
+        # Slower, but names the line.
+        table = column_numbers(path, cells_of(read_lines(path)), names)
     hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(
         table.T
     )
@@ -230,12 +237,7 @@ def read(name_or_path: str | Path) -> Catalog:
 
 def read_meta_and_lines(path: Path) -> tuple[Record, list[str]]:
     """The header's meta, and the lines below the header, the column names first. Raises InputError."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise catalog_error(path, "not found") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise catalog_error(path, f"unreadable ({error})") from error
+    lines = [line for line in read_limited(path, MAX_BYTES).splitlines() if line]
     # Comments end where the column names begin.
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     # The header must state what `read` needs.

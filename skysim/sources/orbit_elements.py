@@ -351,10 +351,10 @@ def segment_samples(
             path, "a segment without data", "lines of an epoch, a position and a velocity"
         )
     lines = [n for n, _ in segment.data]
-    rows = [words[1:] for _, words in segment.data]
+    rows = [(n, words[1:]) for n, words in segment.data]
     # Nine numbers with accelerations, else six.
-    width = 9 if len(rows[0]) == 9 else 6
-    numbers = 1e3 * to_numbers(path, lines, rows, width)
+    width = 9 if len(rows[0][1]) == 9 else 6
+    numbers = 1e3 * to_numbers(path, rows, width)
     for n in np.flatnonzero(np.abs(numbers[:, :3]).max(axis=1) < 1e6):
         raise Where(path, lines[n]).error(
             "a position in the Earth's core", "positions in km from its center"

@@ -27,6 +27,7 @@ from skysim.core.constants import (
 )
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
+from skysim.core.text import cells_of, column_numbers, read_lines, to_numbers
 from skysim.core.types import Floats
 from skysim.scene.sections.camera import (
     CameraConfig,
@@ -191,19 +192,12 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
 
     _changed_ns is the file's modification time: a changed file has another key in the cache. Raises InputError.
     """
-    try:
-        lines = [
-            line
-            for line in path.read_text(encoding="utf-8").splitlines()
-            if not line.startswith("#")
-        ]
-        if len(lines) < 3:
-            raise ValueError("fewer than two rows")
-        wavelength_nm, response = np.loadtxt(lines[1:], delimiter=",", ndmin=2).T
-    except (OSError, ValueError) as error:
+    rows = cells_of(read_lines(path))[1:]
+    if len(rows) < 2:
         raise InputError(
-            path, f"not a response curve ({error})", "two columns, wavelength_nm and response"
-        ) from None
+            path, "fewer than two rows", "two columns, wavelength_nm and response"
+        )
+    wavelength_nm, response = to_numbers(path, rows, 2).T
     # What every curve must satisfy; NaN fails each test.
     rising = (
         np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
@@ -229,9 +223,9 @@ class StellarSequence(NamedTuple):
 @lru_cache(maxsize=1)
 def stellar_sequence() -> StellarSequence:
     """Effective temperature against color of real stars (Pecaut & Mamajek 2013, ApJS 208, 9)."""
-    rows = (DATA / "bands" / "stellar_sequence.csv").read_text(encoding="utf-8").splitlines()
-    lines = [line for line in rows if not line.startswith("#")]
-    return StellarSequence(*np.loadtxt(lines[1:], delimiter=",", usecols=(0, 1, 2)).T)
+    path = DATA / "bands" / "stellar_sequence.csv"
+    rows = cells_of(read_lines(path))
+    return StellarSequence(*column_numbers(path, rows, rows[0][1][:3]).T)
 
 
 def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:

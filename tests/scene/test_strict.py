@@ -165,11 +165,11 @@ LISTED = {"kind": "listed", "cap_deg": 60}
     [
         (
             {"positions": [["0 m", "0 m", "1.2192 m"], ["0.2 um", "0 m", "1.2192 m"]]},
-            "light.layout.positions.1: at the place of 0; allowed: each LED once",
+            "light.layout.positions.1: at the place of light.layout.positions.0; allowed: each LED once",
         ),
         (
             {"directions_deg": [[10, 20], [50, 5], [10, 20]]},
-            "light.layout.directions_deg.2: at the place of 0; allowed: each LED once",
+            "light.layout.directions_deg.2: at the place of light.layout.directions_deg.0; allowed: each LED once",
         ),
     ],
 )

@@ -107,12 +107,11 @@ def main() -> None:
     except ImageError as error:
         code = print_error(str(error))
     except OSError as error:
-        code = print_error(
-            f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        )
+        place = f"{error.filename}: " if error.filename else ""
+        code = print_error(f"{place}{errors.reason(error)}")
     except (MemoryError, OverflowError) as error:
         code = print_error(
-            f"a value of the scene is too large for this machine: {' '.join(str(error).split())}"
+            f"a value of the scene is too large for this machine: {errors.reason(error)}"
         )
     except (typer.Abort, KeyboardInterrupt):
         code = 130

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from skysim.core.errors import printable
+from skysim.core.errors import printable, shortened
 from skysim.core.paths import shipped_files, title_of
 from skysim.results.report import (
     Cell,
@@ -249,7 +249,7 @@ def print_titles(folder: Path, json: bool) -> None:
 
 def print_error(message: str) -> int:
     """Print one line to stderr and return the exit code."""
-    print(f"skysim: {printable(message)}", file=sys.stderr)
+    print(f"skysim: {shortened(message)}", file=sys.stderr)
     return 2
 
 
@@ -315,10 +315,12 @@ def study_status(plan: Plan, store: Store) -> Record:
 
 def print_study_status(status: Record) -> None:
     seconds = status["seconds"]
-    speed = f"{seconds:.1f} s, {status['done'] / seconds:.2g} trials/s"
+    speed = "its first run has not ended"
+    if seconds:
+        speed = f"{seconds:.1f} s, {status['done'] / seconds:.2g} trials/s"
     print_wrapped(
         f"{status['title']}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
-        f" {status['wrong']} wrong attitudes; {speed if seconds else 'its first run has not ended'}"
+        f" {status['wrong']} wrong attitudes; {speed}"
     )
     print(f"store: {status['store']} (code {status['code']})")
 

@@ -46,6 +46,7 @@ from skysim.apps.plate_solver.solver import (
 )
 from skysim.core import files, images
 from skysim.core.errors import InputError, printable
+from skysim.core.text import cells_of, column_numbers, read_lines
 from skysim.core.types import Record
 
 ANNOTATED = ".annotated.png"
@@ -328,27 +329,20 @@ def read_lights(path: Path) -> Centroids:
     Columns are x_px, y_px and optionally flux; without it the first light is the brightest. Raises InputError for
     others.
     """
-    from astropy.table import Table
-
-    form = "ascii.ecsv" if path.suffix.lower() == ".ecsv" else "ascii.csv"
-    try:
-        table = Table.read(path, format=form)
-        values = [
-            np.asarray(table[name], float)
-            for name in ("x_px", "y_px", "flux")[: 2 + ("flux" in table.colnames)]
-        ]
-    except Exception as error:
-        # astropy's parsers raise many types of exception.
-        what = f"cannot be read: {' '.join(str(error).split())[:120]}"
+    lines = read_lines(path)
+    rows = cells_of(lines)
+    if path.suffix.lower() == ".ecsv":  # whose texts may have blanks
+        table = files.read_table(path)
+        words = (table.colnames, *([str(one) for one in row] for row in table.iterrows()))
+        rows = list(enumerate(words, len(lines) - len(rows) + 1))
+    if not rows or {"x_px", "y_px"} - {*rows[0][1]}:
         raise InputError(
-            path, what, "columns x_px, y_px and flux or none, all numbers"
-        ) from None
-    if not all(np.isfinite(column).all() for column in values):
-        raise InputError(path, "an empty or infinite number", "finite numbers")
-    flux = values[2] if len(values) == 3 else np.arange(len(table), 0.0, -1.0)
+            path, "no lights", "columns x_px, y_px and flux or none, all numbers"
+        )
+    values = column_numbers(path, rows, ("x_px", "y_px", "flux"))
+    flux = values[:, 2] if values.shape[1] == 3 else np.arange(len(values), 0.0, -1.0)
     order = np.argsort(-flux, kind="stable")
-    xy_px = np.column_stack(values[:2])[order]
-    return Centroids(xy_px, np.full(len(table), LIST_SIGMA_PX), flux[order])
+    return Centroids(values[order, :2], np.full(len(values), LIST_SIGMA_PX), flux[order])
 
 
 def load_picture(

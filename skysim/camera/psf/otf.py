@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from skysim.core.errors import InputError
+from skysim.core.text import cells_of, read_lines, to_numbers
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import is_file
 from skysim.scene.sections.camera import (
@@ -213,14 +214,13 @@ def read_cells(file: str) -> Floats:
         raise InputError("camera.psf.file", f"{path} not found")
     try:
         if path.suffix.lower() == ".csv":
-            cells = np.loadtxt(path, delimiter=",", ndmin=2)
+            rows = cells_of(read_lines(path))
+            cells = to_numbers(path, rows, len(rows))
         else:
             cells = monochrome(read_image(path)).astype(float)
     except InputError as error:
         named = error if error.key else error.under(path)
         raise named.within("camera.psf.file") from None
-    except (OSError, ValueError) as error:
-        raise InputError("camera.psf.file", f"{path}: {error}") from None
     if cells.ndim != 2 or cells.shape[0] != cells.shape[1] or not 3 <= len(cells) <= 1024:
         raise InputError(
             "camera.psf.file",

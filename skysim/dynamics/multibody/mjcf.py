@@ -22,7 +22,7 @@ from xml.etree import ElementTree
 
 import mujoco
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, reason
 from skysim.core.guarded import run_guarded
 from skysim.core.paths import SCENES
 from skysim.core.yaml_reader import excerpt, is_file
@@ -217,7 +217,7 @@ def is_moderate(word: str) -> bool:
 
 def unreadable(path: Path, error: Exception) -> InputError:
     """The error for a file that cannot be read, is not UTF-8 or is not XML."""
-    return InputError(path, f"not a MuJoCo model: {error}")
+    return InputError(path, f"not a MuJoCo model: {reason(error)}")
 
 
 def require(path: Path, condition: bool, allowed: str) -> None:

@@ -126,7 +126,9 @@ def plan_of(
         check(plan, to_run=programs is not None)
     except InputError as error:  # about a key of the study: add file and line
         if error.where in (None, OVERRIDES):
-            error = error.at(where_of(error.key.split("."), [(path, text)], {}))
+            within = [key for key in study.set if f"{error.key}.".startswith(f"{key}.")]
+            keys = ["set", *within] if within else error.key.split(".")
+            error = error.at(where_of(keys, [(path, text)], {}))
         raise error from None
     return plan
 

@@ -426,7 +426,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> Paths:
 
 def count_frames(film: Path) -> int:
     """Number of readable frames in a video file."""
-    with silent_stderr(), closing(images.LiveCamera(str(film))) as reader:
+    with closing(images.LiveCamera(str(film))) as reader, silent_stderr():
         return sum(1 for _ in iter(reader.capture.grab, False))
 
 

@@ -17,6 +17,7 @@ import scipy
 
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
+from skysim.core.text import cells_of, read_lines, to_numbers
 from skysim.core.types import Floats, around_z, frozen
 
 KEY = "light.surface.file"  # names the file of points
@@ -259,18 +260,10 @@ class SurfaceFit:
 def read(file: str, unit: str) -> Floats:
     """(N, 3) points, m, of a file: comments (#), a line of names, then lines of x, y, z. Raises InputError."""
     try:
-        lines = Path(file).read_text(encoding="utf-8").splitlines()
-        rows = [line for line in lines if line.strip() and not line.startswith("#")][1:]
-        if not rows:
-            raise ValueError("no points")
-        points = np.loadtxt(rows, delimiter=",", ndmin=2)
-        if points.shape[1] != 3 or not np.isfinite(points).all():
-            raise ValueError("not three finite numbers in each line")
-    except (OSError, ValueError) as error:
-        raise InputError(
-            KEY, f"{file}: not a point file ({error})", "a line of names, then lines of x,y,z"
-        ) from None
-    return points * UNIT_M[unit]
+        rows = cells_of(read_lines(Path(file)))[1:]
+        return to_numbers(file, rows, 3) * UNIT_M[unit]
+    except InputError as error:
+        raise error.within(KEY) from None
 
 
 def covered_rad(unit: Floats) -> tuple[float, float]:

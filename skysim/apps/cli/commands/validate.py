@@ -193,14 +193,10 @@ def check_scene(path: Path, programs: Mapping[str, str]) -> tuple[str, tuple[str
 
 def describe_table(path: Path) -> str:
     """Describe an ECSV table: a star catalog if its header has a column `hip`, else an LED map."""
+    from skysim.core.yaml_reader import read_limited
     from skysim.sources import catalog
     from skysim.tracking import dome_map_file
 
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            first = file.read(4000)
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}") from error
-    if "{name: hip," in first:
+    if "{name: hip," in read_limited(path, catalog.MAX_BYTES)[:4000]:
         return f"a catalog of {len(catalog.read(path).hip)} stars"
     return f"a map of {len(dome_map_file.read_dome_map(path).id)} LEDs"

@@ -143,7 +143,9 @@ def listed_boards(
     directions = directions_from_angles(
         [(board.azimuth_deg, board.tilt_deg) for board in listed]
     )
-    check_cap("light.layout.boards", directions, config.cap_deg)
+    check_cap(
+        [f"light.layout.boards.{n}" for n in range(len(listed))], directions, config.cap_deg
+    )
     center_m = project_from_bearing(surface, directions)
     close = cKDTree(center_m).query_pairs(3 * config.pitch_m * (1 - 1e-9))
     if close:

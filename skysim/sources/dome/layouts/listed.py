@@ -1,6 +1,6 @@
 """LEDs by list: places in the lab or directions from the bearing, from the scene or from a CSV file."""
 
-import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.random import Generator
 
 from skysim.core.errors import InputError, Where
+from skysim.core.text import cells_of, read_lines, to_numbers
 from skysim.core.types import Floats, normalized
-from skysim.core.yaml_reader import read_limited
 from skysim.scene.sections.layouts import MAX_LEDS, ListedConfig, relative_levels
 from skysim.sources.dome.layouts.placing import (
     Ints,
@@ -24,7 +24,6 @@ from skysim.sources.dome.point_cloud import UNIT_M
 from skysim.sources.dome.surface import Surface
 
 MAX_SURFACE_OFFSET_M = 0.05  # of a listed LED; a larger one is an error in a unit or an axis
-MAX_BYTES = 1 << 25  # of a file
 SAME_PLACE = 1e-4  # distance of two LEDs of a file that are one, in m or rad
 PLACES = {tuple(f"{axis}_{unit}" for axis in "xyz"): scale for unit, scale in UNIT_M.items()}
 ANGLES = ("azimuth_deg", "tilt_deg")
@@ -46,11 +45,14 @@ class LedFile(NamedTuple):
         (N, 3) places, or (N, 2) azimuths and tilts
     level, id
         (N,) each, None if the file has no such column
+    places
+        File and line of each
     """
 
     coordinates: Floats
     level: Floats | None
     id: Ints | None
+    places: list[str]
 
 
 def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLeds:
@@ -65,12 +67,12 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     """
     level: Floats | None = np.array(config.levels or relative_levels(config.magnitudes or ()))
     number: Ints | None = None
-    key = "light.layout.positions" if config.positions_m else "light.layout.directions_deg"
     if config.file:
-        key = config.file
-        coordinates, level, number = read_csv(Path(config.file))
+        coordinates, level, number, keys = read_csv(Path(config.file))
     else:
+        name = "positions" if config.positions_m else "directions_deg"
         coordinates = np.array(config.positions_m or config.directions_deg)
+        keys = [f"light.layout.{name}.{n}" for n in range(len(coordinates))]
     # Places are used as they are; directions are projected from the bearing.
     are_places = coordinates.shape[1] == 3
     directions = coordinates if are_places else directions_from_angles(coordinates)
@@ -79,17 +81,17 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     if len(apart) < len(directions):
         second = np.setdiff1d(np.arange(len(directions)), apart)[0]
         first = np.linalg.norm(directions[:second] - directions[second], axis=1).argmin()
-        raise InputError(f"{key}.{second}", f"at the place of {first}", "each LED once")
-    check_cap(key, directions, config.cap_deg)
+        raise InputError(keys[second], f"at the place of {keys[first]}", "each LED once")
+    check_cap(keys, directions, config.cap_deg)
     place_m = coordinates if are_places else project_from_bearing(surface, directions)
-    check_on_surface(key, surface, place_m)
+    check_on_surface(keys, surface, place_m)
     # Without levels every LED is at full brightness.
     level = level if level is not None and len(level) else np.ones(len(place_m))
     placed = on_surface(surface, place_m, level)._replace(types=config.types or ())
     return placed if number is None else placed._replace(id=number)
 
 
-def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
+def check_on_surface(keys: Sequence[str], surface: Surface, place_m: Floats) -> None:
     """Raise InputError for the first LED that is too far from the surface, along the ray from the bearing."""
     # Written so that NaN is too far.
     directions = normalized(place_m)
@@ -97,7 +99,7 @@ def check_on_surface(key: str, surface: Surface, place_m: Floats) -> None:
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
     if len(far):
         raise InputError(
-            f"{key}.{far[0]}",
+            keys[far[0]],
             f"{offset_m[far[0]]:.3g} m from the surface",
             f"{MAX_SURFACE_OFFSET_M:g} m; columns x_mm, y_mm, z_mm of a file are in millimeters",
         )
@@ -115,20 +117,18 @@ def read_csv(path: Path) -> LedFile:
     InputError
         With one line, and with the number of the wrong line.
     """
-    text = read_limited(path, MAX_BYTES).splitlines()
-    lines = [
-        (n, line)
-        for n, line in enumerate(text, 1)
-        if line.strip() and not line.startswith("#")
-    ]
-    names = split_row(lines[0][1]) if lines else []
+    try:
+        rows = cells_of(read_lines(path))
+    except InputError as error:
+        raise error.within("light.layout.file") from None
+    names = rows[0][1] if rows else []
     allowed = {**PLACES, ANGLES: 1.0}
     chosen = next((columns for columns in allowed if {*columns} <= {*names}), None)
     brightness = [name for name in names if name in BRIGHTNESS]
     known = {*BRIGHTNESS, *FURTHER, *ANGLES, *(chosen or ())}
     # Every column must be known and there once; one kind of place, and one of brightness at most.
     repeated = len(brightness) > 1 or len({*names}) < len(names)
-    if chosen is None or repeated or {*names} - known or len(lines) < 2:
+    if chosen is None or repeated or {*names} - known or len(rows) < 2:
         raise InputError(
             path,
             "not a list of LEDs",
@@ -136,30 +136,25 @@ def read_csv(path: Path) -> LedFile:
             f" {', '.join(FURTHER)}; one LED per line",
         )
     # One line is the header.
-    if len(lines) > MAX_LEDS + 1:
-        raise InputError(path, f"{len(lines) - 1} LEDs", f"up to {MAX_LEDS}")
-    # Each row is checked with its number in the file.
-    rows = [parse_row(path, n, line, names) for n, line in lines[1:]]
-    column = dict(zip(names, np.array(rows).T, strict=True))
+    if len(rows) > MAX_LEDS + 1:
+        raise InputError(path, f"{len(rows) - 1} LEDs", f"up to {MAX_LEDS}")
+    column = dict(zip(names, to_numbers(path, rows[1:], len(names)).T, strict=True))
+    places = [str(Where(path, n)) for n, _ in rows[1:]]
     level = column.get("level")
     if "magnitude" in column:
         level = np.array(relative_levels(column["magnitude"].tolist()))
+    elif level is not None and len(bad := np.flatnonzero((level <= 0) | (level > 1))):
+        raise InputError(places[bad[0]], f"level {level[bad[0]]:g}", "above 0 and at most 1")
     return LedFile(
         allowed[chosen] * np.column_stack([column[name] for name in chosen]),
         level,
-        led_numbers(path, column.get("id")),
+        led_numbers(places, column["id"]) if "id" in column else None,
+        places,
     )
 
 
-def split_row(line: str) -> list[str]:
-    """The cells of a line, separated by commas, or by blanks in a line without commas."""
-    return [cell.strip() for cell in line.split(",")] if "," in line else line.split()
-
-
-def led_numbers(path: Path, column: Floats | None) -> Ints | None:
-    """The LED numbers in a file's column `id`; None without it. Raises InputError for other numbers."""
-    if column is None:
-        return None
+def led_numbers(places: Sequence[str], column: Floats) -> Ints:
+    """The LED numbers in a file's column `id`. Raises InputError with the place of the first other number."""
     # NaN and fractions differ from their whole number.
     with np.errstate(invalid="ignore"):
         number = column.astype(np.int64)
@@ -169,19 +164,7 @@ def led_numbers(path: Path, column: Floats | None) -> Ints | None:
     repeated[np.unique(number, return_index=True)[1]] = False
     found = np.flatnonzero(wrong | repeated)
     if len(found):
-        raise InputError(path, f"id {column[found[0]]:g}", "whole numbers from 0, each once")
-    return number
-
-
-def parse_row(path: Path, number: int, line: str, names: list[str]) -> list[float]:
-    """The numbers of one line of an LED file. Raises InputError."""
-    try:
-        row = [float(cell) for cell in split_row(line)]
-    except ValueError:
-        row = []
-    level = dict(zip(names, row, strict=False)).get("level", 1.0)
-    if len(row) != len(names) or not all(map(math.isfinite, row)) or not 0 < level <= 1:
-        raise Where(path, number).error(
-            f"{line!r} is not an LED", f"{len(names)} numbers, a level above 0 and at most 1"
+        raise InputError(
+            places[found[0]], f"id {column[found[0]]:g}", "whole numbers from 0, each once"
         )
-    return row
+    return number

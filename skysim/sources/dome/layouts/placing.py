@@ -155,7 +155,7 @@ def tilts_rad(place: Floats) -> Floats:
     return np.arctan2(np.hypot(*place.T[:2]), place[:, 2])
 
 
-def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
+def check_cap(keys: Sequence[str], directions: Floats, cap_deg: float) -> None:
     """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
     # Written so that NaN is outside.
     length = np.linalg.norm(directions, axis=1)
@@ -163,7 +163,7 @@ def check_cap(key: str, directions: Floats, cap_deg: float) -> None:
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
     if len(beyond):
         raise InputError(
-            f"{key}.{beyond[0]}",
+            keys[beyond[0]],
             f"{tilt_deg[beyond[0]]:.4g} deg from the zenith, seen from the bearing's center",
             f"light.layout.cap_deg, {cap_deg:g}",
         )
