@@ -32,9 +32,10 @@ def places(kind: str, count: int) -> tuple[Floats, float]:
     """(N, 3) places of a layout's LEDs in m, and the CPU seconds that they took."""
     layout = f"{{kind: {kind}, count: {count}, cap_deg: {CAP_DEG}}}"
     scene = loader.load("afit_simsat", {"light.layout": layout})
+    assert scene.dome is not None
     band = Band.from_camera(scene.camera)
     begin_s = time.process_time()
-    leds = dome.sources(scene.light, band)
+    leds = dome.sources(scene.dome, band)
     return leds.place[:, :3], time.process_time() - begin_s
 
 
