@@ -187,7 +187,7 @@ def interrupt(_: int, frame: FrameType | None) -> None:
     sys.settrace(lambda *_: None)
 
 
-def handle_signals(handler: Callable[..., None] = interrupt) -> None:
+def handle_signals(handler: Callable = interrupt) -> None:
     """Let a handler take SIGTERM, and Ctrl-C unless it is ignored or handled: `interrupt`, or during imports `stop`."""
     signal.signal(signal.SIGTERM, handler)
     if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, stop):

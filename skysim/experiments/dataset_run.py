@@ -463,7 +463,9 @@ def run(
     ]
     left = sum(len(plan.frames_of(shard)) for shard in missing)
     progress = Progress(plan.frames, plan.frames - left)
-    for results in engine.run(DatasetJob(plan, url), ShardQueue(missing)) if missing else ():
+    # Workers of a cluster run in folders of their own.
+    job = DatasetJob(plan, storage.root if storage.is_local else url)
+    for results in engine.run(job, ShardQueue(missing)) if missing else ():
         for result in results:
             progress.done += result.frames
             progress.now += result.frames

@@ -133,7 +133,7 @@ def state(folder: Path) -> State:
         ):
             if path.suffix == ".sqlite":
                 found |= rows_of(path, name)
-            elif not re.search(r"\.(lock|sqlite-(wal|shm))$", name):
+            elif not re.search(r"\.(lock|(lock|sqlite)-(wal|shm|journal))$", name):
                 found[name] = content(path)
     return found
 

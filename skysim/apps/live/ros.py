@@ -28,7 +28,6 @@ from skysim.core.errors import InputError, printable
 from skysim.core.paths import DATA
 from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard_dome
 
-CHUNKS = "its whole chunks are kept"  # of a file of MCAP on a full disk
 BODY = "body"
 CAMERA = "camera_optical_frame"
 MOST_WAITING = 64  # messages for a slow client of Foxglove, each of which may be a frame
@@ -242,7 +241,7 @@ class McapSink(Sink):
 
     def record(self, packet: Packet) -> None:
         """Add a packet. Raises OSError."""
-        with files.name_in_errors(self.path, left=CHUNKS):
+        with files.name_in_errors(self.path, left="its whole chunks are kept"):
             for topic, stamp_ns, data in self.encoder.encode(packet, self.numbers):
                 self.writer.add_message(self.numbers[topic], stamp_ns, data, stamp_ns)
             if self.file.tell() > self.whole_bytes:
@@ -258,10 +257,9 @@ class McapSink(Sink):
         self.thread.join()
         try:
             if not self.fault:
-                with files.name_in_errors(self.path, left=CHUNKS):
-                    self.flush()
-                    self.writer.finish()
-                    self.file.close()
+                self.flush()
+                self.writer.finish()
+                self.file.close()
         except OSError as error:
             self.fault = f"{self.path}: {error.strerror}"
         if self.fault:

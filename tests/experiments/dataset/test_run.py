@@ -457,3 +457,22 @@ def test_a_shard_that_kills_its_workers_is_reported_and_left_out() -> None:
     failed = dataset_run.DatasetJob(made, "x").failed(chunk, engines.DIED)
     assert (failed.shard, failed.frames, failed.error) == (2, 0, engines.DIED)
     assert dataset_run.FORMATS
+
+
+def test_workers_in_another_folder_write_to_that_of_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of a Dask cluster; a folder of --out may be relative."""
+
+    class Elsewhere(engines.Serial):
+        def run(self, job: Any, chunks: Any) -> Any:
+            (tmp_path / "elsewhere").mkdir()
+            monkeypatch.chdir(tmp_path / "elsewhere")
+            yield from super().run(job, chunks)
+            monkeypatch.chdir(tmp_path)
+
+    monkeypatch.chdir(tmp_path)
+    made = small(frames=2, formats=("coco",))
+    assert dataset_run.run(made, "out", Elsewhere()).done == 2
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+    assert (tmp_path / "out" / dataset_run.MANIFEST).is_file()

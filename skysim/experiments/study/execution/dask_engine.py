@@ -51,8 +51,9 @@ def connect(scheduler: str) -> Client:
             raise ValueError("port above 65535")
     except ValueError as error:
         raise InputError("scheduler", f"{scheduler!r}: {error}", ADDRESS) from None
-    # Silence the long logs of distributed; errors are reported here in one line.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # Silence the long logs of distributed, whose client has a level of its own; errors are reported here in one line.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(scheduler, timeout=WAIT_S, set_as_default=False, name="skysim")
     except (OSError, ImportError, RuntimeError):
