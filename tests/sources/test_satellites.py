@@ -476,6 +476,7 @@ def test_lights_without_a_star_are_named_by_their_numbers() -> None:
         (2 * mirrored + 17, "reflection of 17"),
         (satellites.ID_BASE, str(satellites.ID_BASE)),
         (satellites.GHOST - 1, str(satellites.GHOST - 1)),
+        (satellites.GHOST, "ghost of 0"),
         (satellites.GHOST + 32349, "ghost of 32349"),
         (3 * satellites.GHOST + mirrored + 5, "ghost of reflection of 5"),
     ):
