@@ -570,6 +570,10 @@ def test_a_flight_ends_a_degree_before_the_stop_and_begins_with_the_wheels_speed
     read = found.record.wheel_momentum_nms / [1.0, 2.0, 3.0]
     assert read.mean() == pytest.approx(100, abs=0.01)
     assert read.std() == pytest.approx(2 * np.pi / 60, rel=0.05)
+    # Errors of their own, not those of the assumptions.
+    others = random_stream(scene_of("simsat_slew").seed, balance_flight.BALANCE, 0)
+    same = others.standard_normal(read.shape)
+    assert abs(np.corrcoef(read.ravel(), same.ravel())[0, 1]) < 0.05
     free = flown_with(monkeypatch, np.zeros(21), speeds)
     assert (len(free.record.t_s), free.after_contact) == (20, 0)
     with pytest.raises(InputError, match="19 attitudes were solved; allowed: 20 or more"):
