@@ -430,12 +430,24 @@ def test_an_error_of_the_time_tag_is_one_of_the_rate() -> None:
     )
 
 
-@pytest.mark.parametrize(("tilt_deg", "longer"), [(8.0, 1.0), (3.0, 2.5)])
+@pytest.mark.parametrize(
+    ("tilt_deg", "longer", "limits", "by"),
+    [
+        (8.0, 1.0, {}, "torque"),
+        (3.0, 2.5, {"vehicle__wheels__torque_limit": "100 N m"}, "most"),
+        (
+            3.0,
+            2.5,
+            {"vehicle__wheels__speed_limit_rpm": "30", "vehicle__wheels__start_rpm": "[]"},
+            "momentum",
+        ),
+    ],
+)
 def test_a_maneuver_tilts_for_whole_periods_about_three_axes(
-    tilt_deg: float, longer: float
+    tilt_deg: float, longer: float, limits: dict[str, str], by: str
 ) -> None:
     """At a rate that 0.3 of the wheels' torque or momentum allows, and not above 0.1 Hz; slews as fast as these."""
-    scene = scene_of("simsat_slew")
+    scene = scene_of("simsat_slew", **limits)
     vehicle = multibody.build(scene.vehicle)
     wheels = scene.vehicle.wheels
     assert wheels is not None
@@ -445,7 +457,9 @@ def test_a_maneuver_tilts_for_whole_periods_about_three_axes(
     by_torque = np.sqrt(0.3 * wheels.torque_limit_nm / (inertia * tilt_rad)) / (2 * np.pi)
     most_nms = vehicle.wheels.inertia_kg_m2.min() * wheels.speed_limit_rpm * 2 * np.pi / 60
     by_momentum = 0.3 * most_nms / (inertia * tilt_rad) / (2 * np.pi)
-    rate_hz = min(0.1, by_torque, by_momentum)
+    rates = {"most": 0.1, "torque": by_torque, "momentum": by_momentum}
+    assert min(rates, key=lambda one: rates[one]) == by, rates
+    rate_hz = rates[by]
     motion = balance_flight.excited_by_wheels(scene, vehicle, tilt_deg, longer).motion
     assert motion is not None
     legs = motion.maneuver
@@ -555,6 +569,10 @@ def test_a_flight_ends_a_degree_before_the_stop_and_begins_with_the_wheels_speed
     read = found.record.wheel_momentum_nms / [1.0, 2.0, 3.0]
     assert read.mean() == pytest.approx(100, abs=0.01)
     assert read.std() == pytest.approx(2 * np.pi / 60, rel=0.05)
+    # Errors of their own, not those of the assumptions.
+    others = random_stream(scene_of("simsat_slew").seed, balance_flight.BALANCE, 0)
+    same = others.standard_normal(read.shape)
+    assert abs(np.corrcoef(read.ravel(), same.ravel())[0, 1]) < 0.05
     free = flown_with(monkeypatch, np.zeros(21), speeds)
     assert (len(free.record.t_s), free.after_contact) == (20, 0)
     with pytest.raises(InputError, match="19 attitudes were solved; allowed: 20 or more"):

@@ -580,3 +580,15 @@ def test_lights_of_no_catalog_have_the_row_of_the_sun() -> None:
 def test_light_fades_by_its_magnitudes_of_extinction() -> None:
     found = starlight.transmission(np.array([0.0, 1.0, 2.5]), 2.0)
     np.testing.assert_allclose(found, [1.0, 10**-0.8, 0.01])
+
+
+def test_altitudes_are_above_and_below_the_horizon() -> None:
+    """And of a vector that is longer than one by rounding that of the zenith."""
+    sky = air_at(SITES[0]).at(datetime.datetime(2012, 6, 24, 23))
+    altitude = np.radians([-90.0, -30.0, 0.0, 20.0, 90.0])
+    directions = np.outer(np.sin(altitude), sky.zenith) + np.outer(
+        np.cos(altitude), sky.axes[0]
+    )
+    np.testing.assert_allclose(
+        sky.altitude_rad(directions * (1 + 1e-15)), altitude, rtol=0, atol=1e-7
+    )

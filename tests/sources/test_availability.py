@@ -111,3 +111,14 @@ def test_positions_between_nodes_match_the_ephemeris(name: str) -> None:
             ephemeris.barycentric_km(name, jd) - ephemeris.position_km("earth", jd)
         )
         assert np.linalg.norm(spline(t_s) - exact) < 5e-8 * np.linalg.norm(exact)
+
+
+def test_stars_are_counted_to_the_edge_of_the_field(sphere: CircularOrbit) -> None:
+    """By their angles from an inertial boresight, of which the Earth hides nothing at this time."""
+    axis = np.array([1.0, 0.0, 0.0])
+    angle = np.array([0.0, 0.05, 0.2999, 0.3001, 0.5])
+    stars = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+    found = sample(
+        sphere, START, np.array([0.0, 1.0]), Pointing("inertial", axis), stars, 0.3
+    )
+    assert found.stars.tolist() == [3, 3]

@@ -371,6 +371,8 @@ def test_segments_share_the_sample_at_their_seam(tmp_path: Path) -> None:
             continue
         with pytest.raises(InputError, match="the epochs of 4 samples"):
             orbit_elements.read_oem(str(path), START)
+    path.write_text(head + segment_of(np.array([0.0, 0.5])), encoding="utf-8")
+    assert orbit_elements.read_oem(str(path), START).t_s.tolist() == [0, 0.5]
     for bad, count in (
         (segment_of(np.array([60.0, 0.0])), 2),
         (segment_of(np.array([60.0])), 1),

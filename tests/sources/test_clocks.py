@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -246,3 +248,22 @@ class Recorder:
 def solution(covariance_rad2: np.ndarray) -> Attitude:
     """An attitude of that covariance in camera axes."""
     return Attitude("solved", Rotation.identity(), covariance_rad2)
+
+
+def test_filtered_light_is_the_mean_over_an_exposure_about_its_middle() -> None:
+    """Half of the exposure before and after it; without filters the pulses themselves."""
+    leds = pulsed_sources(12)
+    clocks = Clocks(np.array([10.0, 20.003, 1234.5]), np.zeros(3), np.zeros(3))
+    filter_s = 2e-4
+    middle_s = 3.00017
+    pulses = clocks.pulses_at(leds, middle_s)
+    for exposure_s in (3e-4, 2.3e-3):
+        found = replace(clocks, filter_s=filter_s).lights_at(leds, middle_s, exposure_s)
+        share = filtered_share(
+            pulses, filter_s, middle_s - exposure_s / 2, middle_s + exposure_s / 2
+        )
+        np.testing.assert_allclose(found.strength, share * leds.strength)
+        np.testing.assert_array_equal(found.on_s, found.period_s)
+        np.testing.assert_array_equal(
+            clocks.lights_at(leds, middle_s, exposure_s).on_s, pulses.on_s
+        )

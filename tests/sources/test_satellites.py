@@ -412,7 +412,7 @@ def test_a_satellite_s_truth_is_that_of_its_geometry(monkeypatch: pytest.MonkeyP
     assert truth.rate_deg_s == pytest.approx(np.degrees(0.02))
     assert seen_of(monkeypatch, at_angles(angle), np.zeros((1, 3)), sunlit=0.0) == []
     assert seen_of(monkeypatch, at_angles(angle), np.zeros((1, 3)), failed=1) == []
-    for range_m, count in ((9.0, 0), (11.0, 1)):
+    for range_m, count in ((9.9, 0), (10.1, 1)):
         near = at_angles(angle, range_m)
         assert len(seen_of(monkeypatch, near, np.zeros((1, 3)))) == count
 
@@ -476,6 +476,7 @@ def test_lights_without_a_star_are_named_by_their_numbers() -> None:
         (2 * mirrored + 17, "reflection of 17"),
         (satellites.ID_BASE, str(satellites.ID_BASE)),
         (satellites.GHOST - 1, str(satellites.GHOST - 1)),
+        (satellites.GHOST, "ghost of 0"),
         (satellites.GHOST + 32349, "ghost of 32349"),
         (3 * satellites.GHOST + mirrored + 5, "ghost of reflection of 5"),
     ):

@@ -651,3 +651,12 @@ def test_a_misfit_falls_with_the_assumed_noise_where_attitudes_tell_little() -> 
     ]
     # Of nearly the same residuals
     assert misfits[0] > 3 * misfits[1] > 9 * misfits[2]
+
+
+def test_steps_of_difference_quotients_are_small_beside_values_and_deviations() -> None:
+    """At most a thousandth of a deviation, and 1e-5 of the larger of value and deviation; 1e-5 rad and of momentum."""
+    values = np.array([1.0, 1.0, 0.0, -50.0])
+    sigma = np.array([1e-6, 1.0, 0.1, 0.2])
+    state, step = mass_dynamics.difference_steps(values, sigma, 0.3, 2e-6)
+    np.testing.assert_allclose(step, [1e-9, 1e-5, 1e-6, 2e-4])
+    np.testing.assert_allclose(state, np.repeat([1e-5, 3e-6, 2e-6], 3))

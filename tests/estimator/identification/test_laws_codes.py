@@ -245,6 +245,12 @@ def test_words_are_likely_within_forty_of_the_best_s_misfit() -> None:
         c = brentq(lambda c, e=excess: 50 * (1 - c) ** 2 / (1 + c**2) - e, 0.0, 1.0)
         found = led_codes.likely(np.array([3.0, 3.0]), np.array([[1.0, 1.0], [1.0, c]]))
         assert (1 in found) == kept
+    # Fractions count: 194.95 of the light less 114.5 of a word are 80.45, half of which is above 40.
+    light = np.array([10.0, np.sqrt(94.95)])
+    c = brentq(
+        lambda c: (10 * (10 + c * light[1])) ** 2 / 100 / (1 + c**2) - 114.5, -1.0, 0.9
+    )
+    assert led_codes.likely(light, np.array([light, [1.0, c]])).tolist() == [0]
 
 
 def test_a_misfit_weighs_frames_by_noise_and_by_the_unknown_phase() -> None:

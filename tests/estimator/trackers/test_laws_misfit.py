@@ -19,7 +19,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.identification import star_evidence, star_search
-from estimator.identification.star_detections import changed
+from estimator.identification.star_detections import changed, gates_of
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -286,6 +286,22 @@ def test_unmatched_detections_near_a_star_are_counted_within_their_gates(
             )
             == 1
         )
+
+
+def test_the_widest_gates_are_those_of_the_largest_errors_that_are_tried(
+    tracker: StarTracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beyond them no factor changes the matches; 32 times the errors, with the margin of each factor's own gates."""
+    _, centroids = field(tracker, 5, CAMERA)
+    detections = tracker.detections(centroids, tracker.sigma_px(centroids))
+    found = star_search.lost_in_space(detections, tracker.sky, 80, 100_000)
+    asked: list[Floats] = []
+    monkeypatch.setattr(misfit, "count_near", lambda *those: asked.append(those[-1]) or 0)
+    R_cam_from_ref = Rotation.from_quat(found.cam_from_ref_xyzw).as_matrix()
+    misfit.widened.py_func(found, R_cam_from_ref, detections, tracker.sky)
+    wide = changed(detections, float(misfit.TRIED[-1]), detections.focal_uncertainty)
+    np.testing.assert_allclose(asked[0], gates_of(wide, 1.5), rtol=1e-9)
+    np.testing.assert_allclose(wide.sigma, 32 * detections.sigma, rtol=1e-9)
 
 
 @pytest.mark.parametrize("count", [1, 4, 25])

@@ -19,6 +19,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.identification.refusals import NO_LIGHTS, NO_STARS
 from estimator.trackers import rolling_shutter
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
@@ -237,6 +238,28 @@ def test_the_prior_of_a_rate_is_what_the_frame_does_not_tell() -> None:
     assert_allclose(
         guesses[0][0].covariance_rad2_s2, last.covariance_rad2_s2, rtol=1e-12, atol=0
     )
+
+
+@pytest.mark.parametrize("row_time_s", [0.0, 8e-5])
+def test_too_few_lights_are_no_field_and_none_are_no_lights(
+    tracker: StarTracker, row_time_s: float
+) -> None:
+    """Three lights are never asked to be a field; four are."""
+    asked: list[int] = []
+
+    def refuse(centroids: Centroids) -> Attitude:
+        asked.append(len(centroids))
+        return Attitude("asked")
+
+    camera = replace(WIDE, row_time_s=row_time_s)
+    lights = rolling_shutter.Lights(tracker.stars.vectors, np.zeros(3), lambda some, _: some)
+    for count in range(5):
+        some = Centroids(np.full((count, 2), 300.0), np.full(count, 0.1), np.ones(count))
+        found = rolling_shutter.solve_lights(camera, lights, some, refuse, None, None)
+        few = count < rolling_shutter.MIN_EVIDENCE_MATCHES
+        expected = "asked" if not few else NO_STARS if count else NO_LIGHTS
+        assert found.status == expected
+    assert set(asked) == set(range(rolling_shutter.MIN_EVIDENCE_MATCHES, 5))
 
 
 @pytest.mark.parametrize("ratio", [1.0019, 1.0021, 0.9981, 0.9979])

@@ -72,7 +72,7 @@ def sheet() -> MeasuredFrames:
 
 def stated(sheet: MeasuredFrames) -> Statement:
     with pytest.MonkeyPatch.context() as patch:
-        times_s = np.linspace(0.01, 0.03, 41)
+        times_s = np.linspace(0.00994, 0.02994, 41)
         patch.setattr(performance, "solution_times_s", lambda _: times_s)
         return statement.state(sheet)
 
@@ -344,8 +344,8 @@ def test_shares_claims_and_times_are_those_of_the_counts(whole: Statement) -> No
     for kind in ("right", "refused", "false"):
         share = 100 * getattr(counts, kind) / counts.frames
         assert f"{kind} {share:.4g} (" in text
-    # 41 times from 10 to 30 ms in equal steps
-    assert "median 20 ms, 95 % within 29 ms (41 frames" in text
+    # 41 times from 9.94 to 29.94 ms in equal steps: 19.94 and 28.94
+    assert "median 19.9 ms, 95 % within 28.9 ms (41 frames" in text
     assert "Sky coverage" in text
     assert [row[0] for row in section.rows] == ["95 %", "99 %", "99.7 %"]
     for row, level in zip(section.rows, (0.95, 0.99, 0.997), strict=True):
