@@ -18,7 +18,7 @@ from skysim.scene.loader import load
 from skysim.scene.sections.surroundings import AirGlowConfig, SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.atmosphere import AirEffects, AirGlow
+from skysim.simulation.lights.effects import AirEffects, AirGlow
 from skysim.simulation.lights.light import find_light
 from skysim.sources.air import Sky
 

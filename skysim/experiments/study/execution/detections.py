@@ -24,8 +24,8 @@ from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
 from skysim.simulation.lab import Lab, StarCamera
-from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.dome import LedDome
+from skysim.simulation.lights.effects import AirEffects
+from skysim.simulation.lights.emitters import LedDome
 from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
 from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
