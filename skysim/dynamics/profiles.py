@@ -1,6 +1,6 @@
 """Attitude profiles of a scene.
 
-1. `read_profile` reads the samples of a file or table (profile_aem.py, profile_stk.py, profile_table.py).
+1. `read_profile` reads the samples of a file or table (profile_aem.py, profile_stk.py, profile_samples.py).
 2. `to_body` converts them to lab_from_body.
 3. `profile_samples.check_samples` checks their number, times and steps.
 4. `two_axis.on_gimbals` turns them to those that a two-axis mount takes.
@@ -17,7 +17,7 @@ from skysim.core.files import read_table
 from skysim.core.text import read_lines
 from skysim.core.time import in_utc
 from skysim.core.types import Mount
-from skysim.dynamics import profile_aem, profile_stk, profile_table
+from skysim.dynamics import profile_aem, profile_samples, profile_stk
 from skysim.dynamics.profile_samples import Samples, check_samples
 from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.dynamics.two_axis import on_gimbals
@@ -77,7 +77,7 @@ def read_profile(
         Name of the rotation of columns q_x, q_y, q_z, q_w; None for other columns
     """
     if not isinstance(source, Path):
-        return profile_table.from_table(source, TABLE, start, rotation)
+        return profile_samples.from_table(source, TABLE, start, rotation)
     # AEM and STK files name their format and frames; other files are tables.
     lines = read_lines(source)
     first = next((line for _, line in lines if not line.startswith("COMMENT")), "")
@@ -95,10 +95,10 @@ def read_profile(
     if is_stk:
         return profile_stk.read_stk(source, lines, start)
     if first.startswith("# %ECSV"):
-        return profile_table.from_table(read_table(source), source, start, rotation)
+        return profile_samples.from_table(read_table(source), source, start, rotation)
     if is_xml:
         raise InputError(source, "XML", "CSV, ECSV, CCSDS AEM, or STK (.a)")
-    return profile_table.read_csv(source, lines, start, rotation)
+    return profile_samples.read_csv(source, lines, start, rotation)
 
 
 def to_body(samples: Samples, scene: Scene, mount: Mount) -> Samples:
