@@ -43,6 +43,8 @@ from skysim.dynamics.multibody.actuator_kind import (
 from skysim.dynamics.multibody.cmgs import CMGS, GIMBAL, ROTOR
 from skysim.dynamics.multibody.mass import (
     CAMERA,
+    TRIM,
+    TRIMS,
     MassProperties,
     Trims,
     declare_mass,
@@ -52,7 +54,6 @@ from skysim.dynamics.multibody.mass import (
 )
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_errors, mujoco_warnings
 from skysim.dynamics.multibody.thrusters import FAN, FANS, THRUSTER, THRUSTERS, Fans
-from skysim.dynamics.multibody.trims import TRIM, TRIMS
 from skysim.dynamics.multibody.wheels import WHEEL, WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
 
