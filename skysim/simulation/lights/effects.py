@@ -11,8 +11,11 @@ from functools import partial
 import numpy as np
 
 from skysim.camera.discs import centers_of
-from skysim.camera.glow.air_glow import air_glow
-from skysim.camera.glow.earth_glow import stray_around_e_s_m2, stray_of_bodies_e_s_m2
+from skysim.camera.glow.earth_glow import (
+    air_glow,
+    stray_around_e_s_m2,
+    stray_of_bodies_e_s_m2,
+)
 from skysim.camera.glow.stray import GRID, MARGIN, chip_grid, ghost_optics, wall_glow
 from skysim.camera.projection import in_view
 from skysim.core.random_streams import SCINTILLATION, random_stream
