@@ -1,11 +1,12 @@
-"""Attitude samples from a CCSDS Attitude Ephemeris Message (AEM), versions 1.0 and 2.0, as keyword = value or as XML.
+"""Attitude samples from two kinds of files: CCSDS Attitude Ephemeris Messages, and STK attitude files (`.a`).
 
-CCSDS 504.0-B-1 and 504.0-B-2. The quaternion "from A to B" turns the axes of A into those of B (annex F2 of 504.0-B-2),
-which is the quaternion of the rotation a_from_b of coordinates. Version 1.0 also names the direction (ATTITUDE_DIR: A2B
-or B2A) and whether the scalar is FIRST or LAST (QUATERNION_TYPE). In version 2.0 the direction is A to B and the scalar
-is last, but these keywords are obeyed if a file has them. Euler angles likewise turn A into B, each about an axis that
-the ones before it have turned, in the order of EULER_ROT_SEQ (312 or ZXY). A spinning vehicle has its spin axis, z of
-B, at right ascension alpha and declination delta of A, and the spin angle about it from the axis z x z_B to x of B:
+An Attitude Ephemeris Message (AEM) of version 1.0 or 2.0 is keyword = value or XML, by CCSDS 504.0-B-1 and 504.0-B-2.
+The quaternion "from A to B" turns the axes of A into those of B (annex F2 of 504.0-B-2), which is the quaternion of the
+rotation a_from_b of coordinates. Version 1.0 also names the direction (ATTITUDE_DIR: A2B or B2A) and whether the scalar
+is FIRST or LAST (QUATERNION_TYPE). In version 2.0 the direction is A to B and the scalar is last, but these keywords
+are obeyed if a file has them. Euler angles likewise turn A into B, each about an axis that the ones before it have
+turned, in the order of EULER_ROT_SEQ (312 or ZXY). A spinning vehicle has its spin axis, z of B, at right ascension
+alpha and declination delta of A, and the spin angle about it from the axis z x z_B to x of B:
 
     a_from_b = Rz(90 deg + alpha) Rx(90 deg - delta) Rz(spin angle)
 
@@ -16,9 +17,15 @@ recommends.
 2. `split_segments` reads the lines into segments of metadata and data.
 3. `segment_samples` converts each segment to checked samples within its useable span.
 4. `join` appends them to each other.
+
+STK's help describes its format (AttitudeTimeQuaternions, also scalar-first) in "Attitude File Format (*.a)". A
+quaternion is that of the rotation that turns the axes of CoordinateAxes into those of the body. It converts coordinates
+from body to reference: ref_from_body. Times are seconds from ScenarioEpoch (UTC). The interpolation that the file names
+is not used.
 """
 
 import datetime
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -28,11 +35,12 @@ from xml.etree.ElementTree import ParseError, XMLPullParser
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, Where
+from skysim.core.errors import InputError, Where, unknown_name
 from skysim.core.text import (
     Line,
     Metadata,
     TextSegment,
+    Words,
     excerpt,
     one_of,
     seconds_since,
@@ -293,3 +301,136 @@ def join(first: Samples, second: Samples) -> Samples:
         t_s=np.concatenate([first.t_s, second.t_s]),
         a_from_b=Rotation.concatenate([first.a_from_b, second.a_from_b]),
     )
+
+
+# STK attitude files.
+
+# By section: count of numbers in a data line, including its time, and the columns of x, y, z, w.
+SECTIONS = {
+    "AttitudeTimeQuaternions": (5, [1, 2, 3, 4]),
+    "AttitudeTimeQuatScalarFirst": (5, [2, 3, 4, 1]),
+    "AttitudeTimeQuatAngVels": (8, [1, 2, 3, 4]),
+}
+UNUSED = (
+    "MessageLevel",
+    "InterpolationMethod",
+    "InterpolationOrder",
+    "BlockingFactor",
+    "AttitudeDeviations",
+)
+KEYWORDS = (
+    "NumberOfAttitudePoints",
+    "ScenarioEpoch",
+    "CentralBody",
+    "CoordinateAxes",
+    "TimeFormat",
+    *UNUSED,
+)
+MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+
+
+def read_stk(path: Path, lines: list[Line], start: datetime.datetime) -> Samples:
+    """The samples of an attitude file. Raises InputError for data other than quaternions in ICRF, J2000 or LAB.
+
+    After the version a file has BEGIN Attitude, lines of keyword and value, the name of the data section, rows of
+    numbers, and END Attitude.
+    """
+    keywords: Metadata = {}
+    section = ""
+    rows = []
+    inside = False
+    for n, line in lines[1:]:  # the first has the version
+        # Keywords and section names are not case-sensitive.
+        words = line.split()
+        lower = line.lower()
+        if line.startswith("#"):
+            continue
+        if lower.split() == ["end", "attitude"]:
+            break
+        if not inside:
+            if lower.split() != ["begin", "attitude"]:
+                raise Where(path, n).error(excerpt(line), "BEGIN Attitude")
+            inside = True
+        elif section:
+            rows.append((n, words))
+        elif lower.startswith("attitudetime"):
+            section = spelled("data", " ".join(words), SECTIONS, Where(path, n))
+        else:
+            name = spelled("keyword", words[0], KEYWORDS, Where(path, n))
+            keywords[name] = (n, " ".join(words[1:]))
+    if not section:
+        raise InputError(path, "no attitudes", ", ".join(SECTIONS))
+    return to_samples(path, keywords, section, rows, start)
+
+
+def spelled(what: str, name: str, known: Iterable[str], where: Where) -> str:
+    """A name in the standard's spelling, whatever its case. Raises InputError for an unknown one."""
+    for one in known:
+        if one.lower() == name.lower():
+            return one
+    raise where.error(*unknown_name(what, name, known))
+
+
+def to_samples(
+    path: Path,
+    keywords: Metadata,
+    section: str,
+    rows: list[Words],
+    start: datetime.datetime,
+) -> Samples:
+    """The samples of the data rows. Raises InputError for values or keywords that are not supported."""
+    # 1. Keywords.
+    width, columns = SECTIONS[section]
+    line, text = keywords.get("NumberOfAttitudePoints", (0, str(len(rows))))
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {excerpt(text)}", "a whole number"
+        )
+    if int(text) > len(rows):
+        raise Where(path, line).error(
+            f"NumberOfAttitudePoints {text}, but there are {len(rows)}: the file is cut off"
+        )
+    rows = rows[: int(text)]
+    for key, allowed in (("CentralBody", "Earth"), ("TimeFormat", "EpSec")):
+        line, value = keywords.get(key, (0, allowed))
+        if value.lower() != allowed.lower():
+            raise Where(path, line).error(f"{key} {excerpt(value)}", allowed)
+    line, axes = keywords.get("CoordinateAxes", (0, ""))
+    if axes.upper() not in REFERENCES:
+        raise Where(path, line or None).error(
+            f"CoordinateAxes {excerpt(axes)}", ", ".join(REFERENCES)
+        )
+    # 2. Numbers; times count from the scene's start if the file has an epoch.
+    places = [n for n, _ in rows]
+    values = to_numbers(path, places, [words for _, words in rows], width)
+    t_s = values[:, 0]
+    if "ScenarioEpoch" in keywords:
+        t_s = t_s + (scenario_epoch(path, *keywords["ScenarioEpoch"]) - start).total_seconds()
+    # 3. Quaternions, with the frame bias of J2000.
+    frames = (REFERENCES[axes.upper()], "body")
+    samples = from_quaternions(
+        path,
+        "line",
+        places,
+        t_s,
+        frames,
+        values[:, columns],
+        absolute="ScenarioEpoch" in keywords,
+    )
+    return replace(samples, a_from_b=icrs_from(axes) * samples.a_from_b)
+
+
+def scenario_epoch(path: Path, line: int, text: str) -> datetime.datetime:
+    """The epoch "1 Jul 2005 12:00:00.00" in UTC. Raises InputError."""
+    try:
+        day, month, year, clock = text.split()
+        whole, _, fraction = clock.partition(".")
+        number = MONTHS.index(month[:3].lower()) + 1
+        date = datetime.datetime.strptime(
+            f"{year} {number} {day} {whole}", "%Y %m %d %H:%M:%S"
+        )
+        return date + datetime.timedelta(seconds=int(fraction or 0) / 10 ** len(fraction))
+    except ValueError:
+        raise Where(path, line).error(
+            f"ScenarioEpoch {excerpt(text)}", "1 Jul 2005 12:00:00.00"
+        ) from None

@@ -1,6 +1,6 @@
 """Attitude profiles of a scene.
 
-1. `read_profile` reads the samples of a file or table (profile_aem.py, profile_stk.py, profile_samples.py).
+1. `read_profile` reads the samples of a file or table (profile_files.py, profile_samples.py).
 2. `to_body` converts them to lab_from_body.
 3. `profile_samples.check_samples` checks their number, times and steps.
 4. `two_axis.on_gimbals` turns them to those that a two-axis mount takes.
@@ -17,7 +17,7 @@ from skysim.core.files import read_table
 from skysim.core.text import read_lines
 from skysim.core.time import in_utc
 from skysim.core.types import Mount
-from skysim.dynamics import profile_aem, profile_samples, profile_stk
+from skysim.dynamics import profile_files, profile_samples
 from skysim.dynamics.profile_samples import Samples, check_samples
 from skysim.dynamics.reference_curves import AttitudeSpline
 from skysim.dynamics.two_axis import on_gimbals
@@ -91,9 +91,9 @@ def read_profile(
             source, "the file names its frames", "no key rotation in the maneuver"
         )
     if is_aem:
-        return profile_aem.read_aem(source, lines, start)
+        return profile_files.read_aem(source, lines, start)
     if is_stk:
-        return profile_stk.read_stk(source, lines, start)
+        return profile_files.read_stk(source, lines, start)
     if first.startswith("# %ECSV"):
         return profile_samples.from_table(read_table(source), source, start, rotation)
     if is_xml:
