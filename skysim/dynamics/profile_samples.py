@@ -1,6 +1,6 @@
 """Attitude samples as read from a file or a table, and their checks. An error message names the line of the fault.
 
-They come from files of other formats (profile_files.py), or from named columns: a CSV or ECSV file, or an astropy
+They come from files of other formats (profiles.py), or from named columns: a CSV or ECSV file, or an astropy
 Table or pandas DataFrame, read here. The names of the columns define their content, so nothing is guessed:
 
 time     : `t_s`, or `utc` (ISO 8601)
