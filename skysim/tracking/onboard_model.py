@@ -32,7 +32,7 @@ from skysim.sources.camera_orbit import CameraOrbit, build_orbit, state_at
 from skysim.sources.catalog import require_catalog
 from skysim.sources.dome import display, surface, survey_errors
 from skysim.sources.dome.codebooks import codebook, light_levels
-from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.layouts import led_list, registry
 from skysim.sources.dome.led import Emitter, irradiance_e_s_m2
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 from skysim.tracking import dome_map_file
@@ -65,7 +65,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     """
     if scene.tracker.brightness_sigma is None:
         return leds
-    nominal = registry.design_leds(
+    nominal = led_list.design_leds(
         light, surface.build_surface(light.surface), Band.from_camera(scene.camera)
     )
     nominal = nominal.take(rows_of(leds.id, nominal.id))

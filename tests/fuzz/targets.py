@@ -47,7 +47,7 @@ from skysim.simulation.flight import open_flight
 from skysim.sources import catalog as star_catalog
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
-from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.layouts import listed
 from skysim.sources.orbit_elements import gcrs_states, read_elements, read_oem
 from skysim.tracking import dome_map_file, tracker_interface
 
@@ -143,7 +143,7 @@ def tables(data: bytes) -> None:
     path = write_file(data, "table.csv")
     rejects(lambda: survey_procedure.read_attitudes(path), InputError)
     rejects(lambda: read_settings(path), InputError)
-    rejects(lambda: registry.read_csv(path), InputError)
+    rejects(lambda: listed.read_csv(path), InputError)
     rejects(
         lambda: point_cloud.fit(point_cloud.read(str(path), "m"), 2, str(path)), InputError
     )

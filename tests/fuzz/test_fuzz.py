@@ -26,7 +26,7 @@ from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.sources import photometry
 from skysim.sources.dome import point_cloud
-from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.layouts import listed
 from tests.fuzz.__main__ import NAMES, TOKENS, mutate, seeds
 from tests.fuzz.targets import TARGETS, rejects
 from tests.helpers.hostile_files import promise
@@ -178,8 +178,8 @@ def test_any_override_is_taken_or_refused(overrides: dict[str, str]) -> None:
 
 TABLES: dict[str, Callable[[Path], object]] = {
     "a, b, c": lambda path: point_cloud.read(str(path), "m"),
-    "x_m,y_m,z_m,magnitude": registry.read_csv,
-    "azimuth_deg,tilt_deg,level": registry.read_csv,
+    "x_m,y_m,z_m,magnitude": listed.read_csv,
+    "azimuth_deg,tilt_deg,level": listed.read_csv,
     "wavelength_nm,response": photometry._read_curve,
     "1,2,3": lambda path: read_cells(str(path)),
 }

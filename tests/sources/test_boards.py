@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from skysim.sources.dome.layouts.spreads import Boards, tilt_boards
+from skysim.sources.dome.layouts.boards import Boards, tilt_boards
 
 
 def test_glue_tilts_are_uniform_over_a_cap_without_rotation_about_the_normal() -> None:

@@ -14,7 +14,7 @@ from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources import dome
 from skysim.sources.dome import surface
-from skysim.sources.dome.layouts.registry import led_list
+from skysim.sources.dome.layouts.led_list import led_list
 from skysim.sources.photometry import Band
 
 APEX_M = 1.2

@@ -23,8 +23,9 @@ from skysim.scene.sections.light import DomeConfig
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import surface
-from skysim.sources.dome.layouts import placing, registry, spreads
-from skysim.sources.dome.layouts.registry import board_of, led_list
+from skysim.sources.dome.layouts import boards, listed, placing, spreads
+from skysim.sources.dome.layouts.led_list import led_list
+from skysim.sources.dome.layouts.registry import board_of
 from skysim.sources.dome.led import lit_moments_s
 from skysim.sources.photometry import Band, led_strength_e_s_sr
 from skysim.tracking.dome_map_file import DomeMap, write_dome_map
@@ -236,7 +237,7 @@ def listed_boards(*boards: dict[str, Any], **more: Any) -> Sources:
 
 def test_boards_on_a_grid_have_equal_areas_and_straight_rows() -> None:
     """On a sphere about the bearing: as many as spacings squared go into the cap, and a row's middles in one plane."""
-    made = spreads.grid(0.04, np.radians(40))
+    made = boards.grid(0.04, np.radians(40))
     area_sr = 2 * np.pi * (1 - np.cos(np.radians(40)))
     # Gauss's circle: the count is wrong by its boundary's lattice points at the most, 2 sqrt(2) pi (radius + 1).
     radius = 2 * np.sin(np.radians(20)) / 0.04
@@ -964,13 +965,13 @@ def test_a_file_of_too_many_leds_is_refused_before_its_rows_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "leds.csv"
-    monkeypatch.setattr(registry, "parse_row", None)
+    monkeypatch.setattr(listed, "parse_row", None)
     path.write_text("azimuth_deg,tilt_deg\n" + "0,1\n" * 100_001)
     with pytest.raises(InputError, match=r"leds\.csv: 100001 LEDs; allowed: up to 100000$"):
-        registry.read_csv(path)
-    monkeypatch.setattr(registry, "MAX_BYTES", 1000)
+        listed.read_csv(path)
+    monkeypatch.setattr(listed, "MAX_BYTES", 1000)
     with pytest.raises(InputError, match=r"leds\.csv: 400025 bytes; allowed: up to 1000$"):
-        registry.read_csv(path)
+        listed.read_csv(path)
 
 
 def test_leds_that_all_are_in_one_place_are_refused_in_linear_time(tmp_path: Path) -> None:

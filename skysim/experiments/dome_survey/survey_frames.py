@@ -29,7 +29,7 @@ from skysim.scene.sections.tracker import SurveyErrorsConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab
 from skysim.sources.dome import surface
-from skysim.sources.dome.layouts import registry
+from skysim.sources.dome.layouts import led_list, registry
 from skysim.tracking import factory, onboard_model
 
 # The model that is assumed before a survey of the dome, and its uncertainty.
@@ -202,7 +202,7 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
 def design_of(lab: Lab) -> Sources:
     """The LEDs of the dome as designed."""
     light = require_dome(lab.scene)
-    return registry.design_leds(light, surface.build_surface(light.surface), lab.camera.band)
+    return led_list.design_leds(light, surface.build_surface(light.surface), lab.camera.band)
 
 
 def require_dome(scene: Scene) -> DomeConfig:

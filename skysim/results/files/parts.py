@@ -24,8 +24,8 @@ from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
 from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
 from skysim.scene.sections.leds import PwmConfig, SequentialConfig
+from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import tilts_rad
-from skysim.sources.dome.layouts.registry import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.string import mean_meridian, wind
 from skysim.sources.dome.surface import build_surface, cap_area_m2
 from skysim.sources.photometry import Band

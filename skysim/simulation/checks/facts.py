@@ -20,7 +20,7 @@ from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.vehicle_facts import Fact, short
-from skysim.sources.dome.layouts.registry import max_tilt_deg
+from skysim.sources.dome.layouts.led_list import max_tilt_deg
 from skysim.sources.dome.room import fit
 from skysim.sources.dome.surface import Radial
 from skysim.sources.dome.wall import wall_size

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimator import ImageError, LedMap
-from skysim.sources.dome.layouts.registry import read_csv
+from skysim.sources.dome.layouts.listed import read_csv
 
 PLACES_M = np.array([[0.1, 0.0, 1.0], [0.0, -0.2, 0.9], [-0.3, 0.1, 0.8]])
 

@@ -68,7 +68,7 @@ def scenes_export(
     from skysim.core import files
     from skysim.results.files import fmu, parts, templates
     from skysim.simulation.lab import build_lab
-    from skysim.sources.dome.layouts.registry import led_list
+    from skysim.sources.dome.layouts.led_list import led_list
 
     loaded = load(scene, set_, seed)
     path = out or Path("out") / f"{loaded.name}.xml"
