@@ -24,9 +24,8 @@ from skysim.core.types import Trajectory
 from skysim.results import metrics
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
-from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.lights.dome import LedDome
-from skysim.simulation.timing import MARGIN_S, exposure_window
+from skysim.simulation.lab import MARGIN_S, Lab, build_lab, build_tracker, exposure_window
+from skysim.simulation.lights.emitters import LedDome
 from skysim.sources.dome.led import irradiance_e_s_m2
 from skysim.tracking import factory
 

@@ -26,9 +26,8 @@ from skysim.core.types import Floats
 from skysim.scene import loader
 from skysim.scene.sections.light import DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.dome import LedDome
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import Lab, build_lab, exposure_window
+from skysim.simulation.lights.emitters import LedDome
 from skysim.sources.dome.codes import LedCodes
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking.factory import assumed_settings

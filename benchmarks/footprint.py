@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.timing import figure
 from estimator import Camera, Centroids, StarTracker, TrackingMode
-from estimator.trackers.warm_up import draw
+from estimator.trackers.pipeline import draw
 
 REPEATS = 100
 

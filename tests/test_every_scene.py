@@ -23,8 +23,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig, StarsConfig
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
-from skysim.simulation.lab import build_lab, build_tracker
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import build_lab, build_tracker, exposure_window
 from skysim.tracking import onboard_model
 
 # `afit_laboratory` is what AFIT's tests have in common, and no test of its own.

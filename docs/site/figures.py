@@ -23,13 +23,13 @@ from skysim.scene.sections.surroundings import ExclusionConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.flight import simulate_motion
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.effects import stray_e_s
 from skysim.simulation.lights.light import Exposure, beam_of
 from skysim.sources import air as air_physics
 from skysim.sources import stars as star_sources
+from skysim.sources.camera_orbit import Pointing, sample
 from skysim.sources.catalog import read
 from skysim.sources.dome import surface
-from skysim.sources.orbit_availability import Pointing, sample
 from skysim.sources.photometry import (
     Band,
     black_body_v0,

@@ -15,7 +15,7 @@ residuals (p_measured - p) / sigma by Levenberg-Marquardt:
 5. Accept the step and reduce the damping if the loss falls; otherwise increase the damping.
 6. Stop when the Newton decrement, the squared step in standard deviations, is negligible.
 
-Afterwards `bundle_covariance` computes the covariance.
+Afterwards `survey_subset.covariance` computes the covariance.
 
 Measured on AFIT's dome (892 lights, 600 frames): 14 such steps converge to a cost of 1.1e4. scipy's least_squares
 with the same sparse Jacobian and lsmr, whose steps are inexact, had only reduced the cost from 5.4e8 to 4.1e8 after

@@ -36,10 +36,14 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
-from estimator.calibration.bundle_covariance import Covariances
-from estimator.calibration.survey_subset import Subset, connected_subset
+from estimator.calibration.survey_subset import (
+    Covariances,
+    Subset,
+    common_errors,
+    connected_subset,
+    covariance,
+)
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
@@ -253,14 +257,14 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             fitted, status = ba.adjust(subset.bundle, scaled, np.inf)
             subset = replace(subset, bundle=fitted, sightings=scaled)
             # 4. Covariances, misfit, and noise
-            covariances = bundle_covariance.covariance(subset.terms, fitted)
+            covariances = covariance(subset.terms, fitted)
             if fit_noise:
                 check_redundancy(subset, covariances)
             misfit = _misfit(subset, covariances)
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
-        common = bundle_covariance.common_errors(subset.terms, subset.bundle)
+        common = common_errors(subset.terms, subset.bundle)
     except LinAlgError:
         # A singular matrix raises the same ValueError as a nearly singular one
         covariances = None

@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude import wahba as kernel
 from estimator.attitude.solvers import rotation
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance
+from estimator.calibration import survey_subset
 from estimator.calibration.bundle_adjustment import Bundle, NormalEquations, Sightings
 from estimator.calibration.dome_survey import CAUCHY, GATE
 from estimator.calibration.zero_point import MagnitudeZero, magnitude_zero
@@ -407,7 +407,7 @@ def _report(
     terms = bundle.equations(sightings, np.ones(len(sightings.frame)))
     R = bundle.R_body_from_lab
     # No rotation is among the unknowns that are not eliminated.
-    covariance = bundle_covariance.covariance(terms, replace(bundle, R_body_from_lab=R[:0]))
+    covariance = survey_subset.covariance(terms, replace(bundle, R_body_from_lab=R[:0]))
     attitude_covariance = covariance.by_led
     attitude_covariance[~tied] = np.nan
     # Residuals

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, check_lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance
+from estimator.calibration import survey_subset
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
@@ -129,7 +129,7 @@ def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyA
     bundle, sightings = _bundle(model, body_from_lab, seen)
     subset = connected_subset(bundle, sightings)
     try:
-        covariance = bundle_covariance.covariance(subset.terms, subset.bundle)
+        covariance = survey_subset.covariance(subset.terms, subset.bundle)
     except LinAlgError:
         raise ValueError(
             "survey: the attitudes do not determine the unknowns; take more of them"

@@ -45,7 +45,6 @@ from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.led_index import build_dome_index, inner_field
 from estimator.identification.refusals import NO_MATCH, advice
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
-from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
     FrameTracker,
@@ -53,6 +52,7 @@ from estimator.trackers.pipeline import (
     brightest,
     check_algorithms,
     direction_sigma_rad,
+    run_all_stages,
 )
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 
@@ -225,7 +225,7 @@ class DomeTracker(FrameTracker):
             xy_px = project(body_from_lab, position_m, self.lever, self.camera)
             fields.append(xy_px[self.camera.contains(xy_px, 2.0)])
         xy_px = max(fields, key=len)
-        warm_up.run(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
+        run_all_stages(self.camera, xy_px, np.ones(len(xy_px)), dtype, self.solve)
         self.solve_centroids(Centroids(xy_px, np.full(len(xy_px), 0.1), np.ones(len(xy_px))))
 
     def solve_centroids(

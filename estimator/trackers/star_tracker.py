@@ -51,7 +51,7 @@ from estimator.identification.star_detections import (
     lights_of,
 )
 from estimator.identification.star_evidence import Solution
-from estimator.trackers import misfit, warm_up
+from estimator.trackers import misfit
 from estimator.trackers.misfit import Refit
 from estimator.trackers.pipeline import (
     Clock,
@@ -59,6 +59,7 @@ from estimator.trackers.pipeline import (
     Settings,
     brightest,
     check_algorithms,
+    run_all_stages,
 )
 from estimator.trackers.refinement import SHEARED, FieldMatcher
 from estimator.trackers.rivals import with_rivals
@@ -240,7 +241,7 @@ class StarTracker(FrameTracker):
             Type of the frames' pixels
         """
         cam_from_ref, xy_px, light = self.rich_field()
-        warm_up.run(self.camera, xy_px, light, dtype, self.solve)
+        run_all_stages(self.camera, xy_px, light, dtype, self.solve)
         # Every error model of the search
         sigma_px = np.full(len(xy_px), 0.1)
         clean = Centroids(xy_px, sigma_px, light)

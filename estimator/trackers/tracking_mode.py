@@ -30,13 +30,13 @@ from estimator.detection.windows import in_windows
 from estimator.identification import star_evidence
 from estimator.identification.chance import ACCEPT_DEX, MIN_EVIDENCE_MATCHES
 from estimator.identification.star_evidence import Hypothesis, Solution
-from estimator.trackers import warm_up
 from estimator.trackers.pipeline import (
     Clock,
     Report,
     detect_and_centroid,
     inflate_uncertainty,
     monochrome,
+    run_all_stages,
 )
 from estimator.trackers.rolling_shutter import with_streak_rate
 from estimator.trackers.star_tracker import StarTracker
@@ -220,7 +220,7 @@ class TrackingMode:
             follower.last = LastSolution(0.0, cam_from_ref, np.zeros(3))
             follower.solve(image, 0.0, None, streak_px)
 
-        warm_up.run(self.tracker.camera, xy_px, light, dtype, look)
+        run_all_stages(self.tracker.camera, xy_px, light, dtype, look)
 
     def _predict(self, t_s: float, now_from_then: Rotation | None) -> Rotation | None:
         """Return the predicted cam_from_ref, or None without a recent attitude, and with a rolling shutter."""

@@ -24,8 +24,8 @@ from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_l
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import VehicleModel
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
-from skysim.dynamics.multibody.actuators import build_actuators
-from skysim.dynamics.multibody.fans import MomentumDump
+from skysim.dynamics.multibody.model import build_actuators
+from skysim.dynamics.multibody.thrusters import MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import BUILT_IN_LAWS

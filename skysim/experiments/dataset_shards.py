@@ -39,7 +39,7 @@ from skysim.experiments.study.execution import trials
 from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import StarsConfig
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import exposure_window
 from skysim.tracking.factory import assumed_settings
 from skysim.tracking.onboard_model import assumed_camera
 

@@ -30,11 +30,10 @@ from skysim.results.plots import annotate_truth
 from skysim.results.report import Report
 from skysim.results.scoring import Score, image_tag
 from skysim.scene.scene import Scene, check_scene
-from skysim.simulation import timing
 from skysim.simulation.checks import Check, check
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight, Progress, Shot, open_flight
-from skysim.simulation.lab import Lab, StarCamera, build_lab
+from skysim.simulation.lab import MARGIN_S, Lab, StarCamera, build_lab, window_from
 from skysim.tracking.computer_time import on_computer
 from skysim.tracking.factory import NO_PROGRAMS
 
@@ -402,11 +401,9 @@ def render_at(
             "camera", f"{camera} is none of the lab's", f"0 to {len(lab.cameras) - 1}"
         )
     own = lab.cameras[camera]
-    window = timing.window_from(own.scene, 0.0)
+    window = window_from(own.scene, 0.0)
     window = window._replace(open_s=t_s - window.middle_s)
-    times_s = np.linspace(
-        window.open_s - timing.MARGIN_S, window.close_s + timing.MARGIN_S, KNOTS
-    )
+    times_s = np.linspace(window.open_s - MARGIN_S, window.close_s + MARGIN_S, KNOTS)
     rate = np.asarray(rate_body_rad_s, dtype=np.float64)
     return render_frame(
         own, Trajectory.at_rate(lab_from_body, rate, t_s, times_s), index, None, window

@@ -26,8 +26,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Frame
 from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
-from skysim.simulation.lab import StarCamera, build_lab, build_tracker
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import StarCamera, build_lab, build_tracker, exposure_window
 from skysim.tracking import factory
 from skysim.tracking.onboard_model import assumed_camera
 

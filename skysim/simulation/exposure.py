@@ -42,15 +42,16 @@ from skysim.core.types import (
     Truth,
     joined,
 )
-from skysim.simulation.lab import ColorChannel, StarCamera
-from skysim.simulation.lights.light import Beam, Exposure, Seeds, any_of, beam_of
-from skysim.simulation.timing import (
+from skysim.simulation.lab import (
     MARGIN_S,
+    ColorChannel,
+    StarCamera,
     exposure_window,
     frame_end_s,
     time_tag_error_s,
     window_from,
 )
+from skysim.simulation.lights.light import Beam, Exposure, Seeds, any_of, beam_of
 
 KNOTS = 5  # attitude samples of an exposure at a constant rate
 

@@ -23,7 +23,6 @@ from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth, froze
 from skysim.dynamics import imu
 from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
 from skysim.scene.scene import Scene
-from skysim.simulation import timing
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.lab import (
     NO_PARTS,
@@ -32,6 +31,9 @@ from skysim.simulation.lab import (
     UserParts,
     build_lab,
     build_tracker,
+    exposure_window,
+    time_tag_error_s,
+    window_from,
     with_parts,
 )
 from skysim.simulation.motion import Motion
@@ -170,7 +172,7 @@ class Schedule:
 
     def window_from(self, open_s: float) -> Window:
         """Window of an exposure that opens at this time."""
-        return timing.window_from(self.scene, open_s, self.exposure_control.exposure_s)
+        return window_from(self.scene, open_s, self.exposure_control.exposure_s)
 
     def window_to(self, close_s: float) -> Window:
         """Window of an exposure whose last row ends at this time."""
@@ -183,13 +185,13 @@ class Schedule:
         if self.triggers_s is not None:
             return self.window_from(self.triggers_s[self.index])
         number = self.index + self.skipped
-        return timing.exposure_window(self.scene, number, self.exposure_control.exposure_s)
+        return exposure_window(self.scene, number, self.exposure_control.exposure_s)
 
     @property
     def due_s(self) -> float:
         """Time at which the next frame is due: it is exposed, its solution is ready, and its time tag has passed."""
         window = self.window
-        tagged_s = window.middle_s + timing.time_tag_error_s(self.scene, self.index)
+        tagged_s = window.middle_s + time_tag_error_s(self.scene, self.index)
         return max(window.close_s + self.latency_s, tagged_s)
 
 
@@ -609,7 +611,7 @@ class Flight:
                 f"frame {index} has no exposure time yet",
                 "after it came from shots",
             )
-        window = timing.exposure_window(scene, index, exposure_s)
+        window = exposure_window(scene, index, exposure_s)
         if not (0 <= index < schedule.frames and window.close_s <= self.now_s):
             raise InputError(
                 "render", f"frame {index} is not exposed at {self.now_s:g} s", "one that is"

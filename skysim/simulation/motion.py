@@ -32,8 +32,8 @@ from skysim.dynamics.flight_computer import NO_COMMANDS, Commands, FlightCompute
 from skysim.dynamics.guidance import Reference
 from skysim.dynamics.multibody import Simulation
 from skysim.dynamics.multibody.actuator_kind import ControlInput
-from skysim.dynamics.multibody.actuators import build_actuators, build_drives
 from skysim.dynamics.multibody.cmgs import CmgActuator
+from skysim.dynamics.multibody.model import build_actuators, build_drives
 from skysim.dynamics.multibody.thrusters import propellant_kg
 from skysim.scene.sections.motion import BUILT_IN_LAWS
 from skysim.scene.sections.vehicle import VehicleConfig

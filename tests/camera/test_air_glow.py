@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.glow.air_glow import airglow_nl, seen_place, sunlight_nl
 from skysim.camera.glow.background import (
     NANOLAMBERT_V0,
     PointedCamera,
     diffuse_air_mass,
     glow_map,
 )
+from skysim.camera.glow.earth_glow import airglow_nl, seen_place, sunlight_nl
 from skysim.core.types import Floats
 from skysim.scene.loader import load
 from skysim.scene.sections.surroundings import AirGlowConfig, SkyGlowConfig
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.atmosphere import AirEffects, AirGlow
+from skysim.simulation.lights.effects import AirEffects, AirGlow
 from skysim.simulation.lights.light import find_light
 from skysim.sources.air import Sky
 

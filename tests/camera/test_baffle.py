@@ -19,7 +19,7 @@ from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import EarthConfig
 from skysim.simulation.exposure import expected_exposure, render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.lens import stray_e_s
+from skysim.simulation.lights.effects import stray_e_s
 from skysim.simulation.lights.light import beam_of
 from skysim.sources.photometry import SUN, Band, star_flux_e_s_m2
 

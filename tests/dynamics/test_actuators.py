@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.dynamics.multibody.actuator_kind import Actuators, ControlInput
 from skysim.dynamics.multibody.cmgs import STEERING, CmgActuator
-from skysim.dynamics.multibody.fans import FanSet, MomentumDump
+from skysim.dynamics.multibody.thrusters import FanSet, MomentumDump
 from skysim.dynamics.multibody.wheels import WheelActuator
 from skysim.scene.sections.motion import DesaturationConfig
 from skysim.scene.sections.vehicle import CmgsConfig, WheelsConfig

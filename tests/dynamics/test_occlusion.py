@@ -20,7 +20,7 @@ from skysim.scene import loader
 from skysim.scene.sections import light
 from skysim.simulation.exposure import expected_exposure, render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.lab_room import DomeWall, Vehicle, behind_wall
+from skysim.simulation.lights.effects import DomeWall, Vehicle, behind_wall
 from skysim.simulation.lights.light import Obstacle, find_light
 from skysim.sources.dome import surface
 from skysim.sources.dome.surface import Surface

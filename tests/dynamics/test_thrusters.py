@@ -13,7 +13,7 @@ from skysim.core.types import Floats
 from skysim.dynamics import multibody
 from skysim.dynamics.flight_computer import authority_nm, usage
 from skysim.dynamics.multibody.actuator_kind import ControlInput
-from skysim.dynamics.multibody.actuators import build_actuators, build_drives
+from skysim.dynamics.multibody.model import build_actuators, build_drives
 from skysim.dynamics.multibody.thrusters import ThrusterActuator, ValveDrive
 from skysim.results.telemetry_report import summary
 from skysim.scene import loader

@@ -15,8 +15,8 @@ from skysim.core.paths import SCENES
 from skysim.dynamics import multibody
 from skysim.dynamics.flight_computer import authority_nm
 from skysim.dynamics.multibody.actuator_kind import ControlInput
-from skysim.dynamics.multibody.actuators import build_actuators, build_drives
 from skysim.dynamics.multibody.mass import tree_mass
+from skysim.dynamics.multibody.model import build_actuators, build_drives
 from skysim.scene import loader
 from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import simulate_motion

@@ -29,7 +29,7 @@ WORK = """
 import numpy as np
 
 from estimator import Camera, Centroids, DomeTracker, ImageError, StarCatalog, StarTracker, TrackingMode
-from estimator.trackers.warm_up import draw
+from estimator.trackers.pipeline import draw
 from scipy.spatial.transform import Rotation
 
 rng = np.random.default_rng(1)

@@ -26,7 +26,7 @@ from estimator.catalog import catalog
 from estimator.core.types import FramePriors
 from estimator.detection.detect import DETECTORS
 from estimator.trackers import exposure_control
-from estimator.trackers.warm_up import draw
+from estimator.trackers.pipeline import draw
 
 CAMERA = Camera.from_fov(640, 480, fov_deg=15)
 TRACKER = StarTracker.for_sky(CAMERA)

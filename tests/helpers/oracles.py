@@ -37,8 +37,7 @@ from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
-from skysim.tracking import external_tracker, onboard_model
-from skysim.tracking import factory as tracker_settings
+from skysim.tracking import factory, onboard_model
 from skysim.tracking import tetra3rs as tetra3rs_tracker
 from skysim.tracking.tracker_interface import Stars
 
@@ -358,10 +357,10 @@ def tetra3rs(name: str) -> Solve | None:
         return None
     scene = load(name, "tetra3rs", 1)
     camera = onboard_model.assumed_camera(scene)
-    settings = tracker_settings.assumed_settings(scene)
+    settings = factory.assumed_settings(scene)
     nothing = np.zeros(0)
     tracker = tetra3rs_tracker.Tetra3rs(
-        external_tracker.build_setup(
+        factory.build_setup(
             scene, camera, settings, Stars(nothing.astype(int), nothing, nothing)
         )
     )

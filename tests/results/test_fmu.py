@@ -16,7 +16,7 @@ import yaml
 import skysim
 from skysim.core.errors import InputError
 from skysim.core.types import Record
-from skysim.dynamics.multibody import actuators
+from skysim.dynamics.multibody import model
 from skysim.results.files import fmu
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import build_lab
@@ -397,5 +397,5 @@ def test_a_host_in_c_runs_the_unit(bump: Path, tmp_path: Path):
 def test_every_kind_of_actuators_has_its_texts() -> None:
     """A kind that is added without them would end the export of each scene that has it."""
     texts = yaml.safe_load((fmu.SOURCES / "variables.yaml").read_text(encoding="utf-8"))
-    assert {"ideal", *(kind.key for kind in actuators.KINDS)} <= set(texts["variables"])
+    assert {"ideal", *(kind.key for kind in model.KINDS)} <= set(texts["variables"])
     assert {unit for unit, _ in texts["variables"].values() if unit} <= set(texts["units"])

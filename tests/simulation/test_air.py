@@ -11,7 +11,7 @@ from skysim.core.types import Frame, Truth
 from skysim.scene.loader import load
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab, build_tracker
-from skysim.simulation.lights.atmosphere import AirEffects, Skyline
+from skysim.simulation.lights.effects import AirEffects, Skyline
 from skysim.simulation.lights.light import find_light
 from skysim.sources import air
 from skysim.tracking.factory import solve_frame

@@ -43,9 +43,8 @@ from skysim.simulation.checks.expected_error import (
 from skysim.simulation.checks.views import VISIBLE, View, image_gradient, peak_share, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import Lab, build_lab, build_tracker
+from skysim.simulation.lab import Lab, build_lab, build_tracker, exposure_window
 from skysim.simulation.lights.light import Exposure, Lit, beam_of
-from skysim.simulation.timing import exposure_window
 from skysim.sources.dome.led import lit_moments_s
 from skysim.tracking import factory
 from tests.helpers.splatting import add_kernel

@@ -16,8 +16,7 @@ from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import Flight, Shot, open_flight, simulate_motion
-from skysim.simulation.lab import build_lab, build_tracker
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import build_lab, build_tracker, exposure_window
 from skysim.tracking import onboard_model
 from skysim.tracking.factory import solve_frame
 

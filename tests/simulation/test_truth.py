@@ -13,8 +13,7 @@ from skysim.results.scoring import Score
 from skysim.scene import loader
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import Lab, build_lab, exposure_window
 
 EXPOSURE_S = 0.02
 ABOUT_CAM = np.array([0.0, 1.0, 0.0])

@@ -11,9 +11,8 @@ from skysim.core.constants import EARTH_RADIUS_M
 from skysim.core.time import tt_jd
 from skysim.scene.sections.surroundings import CircularOrbitConfig, ExclusionConfig
 from skysim.sources import camera_orbit
-from skysim.sources.camera_orbit import CircularOrbit
+from skysim.sources.camera_orbit import CircularOrbit, Pointing, place_spline, sample
 from skysim.sources.ephemeris import load_ephemeris
-from skysim.sources.orbit_availability import Pointing, place_spline, sample
 
 START = datetime.datetime(2024, 3, 20, 3)
 POLE = np.array([[0.0, 0.0, 1.0]])

@@ -16,8 +16,7 @@ from skysim.scene import loader
 from skysim.scene.sections.leds import ClockConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.flight import open_flight
-from skysim.simulation.lab import build_lab
-from skysim.simulation.timing import exposure_window, time_tag_error_s
+from skysim.simulation.lab import build_lab, exposure_window, time_tag_error_s
 from skysim.sources.dome.codes import Clocks, filtered_share
 from skysim.sources.dome.led import lit_moments_s
 

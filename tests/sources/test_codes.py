@@ -10,7 +10,7 @@ from skysim.scene import loader
 from skysim.scene.sections.leds import CyclicCodeConfig, PlainCodeConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
-from skysim.simulation.lights.dome import LedDome
+from skysim.simulation.lights.emitters import LedDome
 from skysim.sources.dome.codebooks import codebook, light_levels
 from skysim.sources.dome.codes import Clocks, LedCodes
 

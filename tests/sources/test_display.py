@@ -17,9 +17,8 @@ from skysim.scene import loader
 from skysim.scene.sections import layouts
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.dome import LedDome
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import Lab, build_lab, exposure_window
+from skysim.simulation.lights.emitters import LedDome
 from skysim.sources import catalog, dome
 from skysim.sources import stars as star_sources
 from skysim.sources.dome import display, surface

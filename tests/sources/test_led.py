@@ -22,8 +22,7 @@ from skysim.scene.sections.leds import (
     WarmUpConfig,
 )
 from skysim.simulation.exposure import render_at_rest
-from skysim.simulation.lab import build_lab
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import build_lab, exposure_window
 from skysim.sources.dome import sources
 from skysim.sources.dome.led import (
     FALLOFF,

@@ -10,7 +10,7 @@ import pytest
 from skysim.core.errors import InputError
 from skysim.scene.loader import load
 from skysim.simulation.flight import open_flight, simulate_motion
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import exposure_window
 from skysim.tracking.navigation import latest, rate_of_frame, sigma_rad_s
 
 FLIGHT = {

@@ -29,7 +29,7 @@ from skysim.core.plugins import finite_array
 from skysim.core.types import Floats
 from skysim.dynamics.flight_computer import Commands
 from skysim.simulation.flight import Flight
-from skysim.simulation.timing import longest_live_s
+from skysim.simulation.lab import longest_live_s
 
 MOST_WAITING = 1000  # commands that wait for the next control period
 MOST_TRIGGERS = 100  # triggered exposures that wait

@@ -36,7 +36,7 @@ from skysim.camera.detector import saturation_dn
 from skysim.core.types import Frame
 from skysim.results.files.recording import fits_image
 from skysim.scene.scene import Scene
-from skysim.simulation.timing import longest_live_s
+from skysim.simulation.lab import longest_live_s
 
 DEVICE = "skysim"
 GROUP = "Main"

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.multibody.actuators import set_start
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
-from skysim.dynamics.multibody.model import VehicleModel
+from skysim.dynamics.multibody.model import VehicleModel, set_start
 from skysim.dynamics.multibody.wheels import Stiction
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -18,14 +18,15 @@ from skysim.core import quaternion
 from skysim.core.jit import jit
 from skysim.core.paths import SCENES
 from skysim.core.types import Bools, Floats, Mount
-from skysim.dynamics.multibody.actuators import lock_unused, set_start
 from skysim.dynamics.multibody.mass import CAMERA
 from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
 from skysim.dynamics.multibody.model import (
     VehicleModel,
     camera_mount,
+    lock_unused,
     place_camera,
     put_at_origin,
+    set_start,
 )
 
 # Groups of geoms: those that block light, and the camera's own housing. Rays are tested against the first only.

@@ -34,7 +34,7 @@ from skysim.core.yaml_reader import (
     set_key,
     value_at,
 )
-from skysim.dynamics import profile_table
+from skysim.dynamics import profile_samples
 from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.engines import Engine, Pool, Serial
@@ -206,7 +206,7 @@ def with_part(
 ) -> None:
     """Put a controller, tracker or profile into a study's keys; several become levels of a factor of its name."""
     many = isinstance(given, list | tuple) or (
-        isinstance(given, Mapping) and not set(profile_table.TIMES) & set(given)
+        isinstance(given, Mapping) and not set(profile_samples.TIMES) & set(given)
     )
     names = given if many and isinstance(given, Mapping) else {}
     named = names or {
@@ -255,7 +255,7 @@ def table_file(given: Any, folder: Path) -> Path:
     if not hasattr(given, "keys"):
         raise InputError("profile", type(given).__name__, "a file, or a table")
     columns = {
-        str(name): profile_table.to_epochs(given[name]) if name == "utc" else given[name]
+        str(name): profile_samples.to_epochs(given[name]) if name == "utc" else given[name]
         for name in given.keys()  # noqa: SIM118 - a table yields its rows
     }
     content = repr({name: np.asarray(column).tolist() for name, column in columns.items()})

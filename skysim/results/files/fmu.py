@@ -31,8 +31,7 @@ from skysim.core.types import ROUNDING, Record
 from skysim.scene.loader import keys_of
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Shot
-from skysim.simulation.lab import StarCamera, build_lab
-from skysim.simulation.timing import longest_live_s
+from skysim.simulation.lab import StarCamera, build_lab, longest_live_s
 
 SOURCES = DATA / "fmu"
 SLAVE = "laboratory_slave.py"

@@ -24,7 +24,7 @@ from skysim.core.files import (
 )
 from skysim.core.images import TOP_DOWN_CARD, read_image
 from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
-from skysim.dynamics.profile_table import BODY_ANGLES, CAMERA_ANGLES
+from skysim.dynamics.profile_samples import BODY_ANGLES, CAMERA_ANGLES
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 

@@ -18,7 +18,7 @@ from skysim.simulation.checks.expected_error import believed_sigma_px
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.lab import Lab
-from skysim.simulation.lights.lab_room import IMAGES, Mirror
+from skysim.simulation.lights.effects import IMAGES, Mirror
 from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import surface
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity

@@ -60,7 +60,7 @@ from skysim.core.types import Floats, normalized
 from skysim.scene.unused import differs
 from skysim.simulation.checks.detection import Context, centroid_variance, misshapen_px
 from skysim.simulation.checks.views import View
-from skysim.simulation.lights.atmosphere import AirEffects
+from skysim.simulation.lights.effects import AirEffects
 from skysim.simulation.lights.light import find_light
 from skysim.sources.dome import survey_errors
 

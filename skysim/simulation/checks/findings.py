@@ -27,7 +27,7 @@ from skysim.simulation.checks.expected_error import (
 )
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short, uneven_px
 from skysim.simulation.checks.sampling import Plan
-from skysim.simulation.lights.starlight import BACKGROUND
+from skysim.simulation.lights.emitters import BACKGROUND
 from skysim.sources.dome.layouts.placing import largest_cap_deg
 
 MAX_SATURATED = 0.25  # fraction of saturated lights that gives no warning

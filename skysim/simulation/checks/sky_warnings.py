@@ -28,8 +28,7 @@ from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.findings import few_lights
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.views import peak_share
-from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.lens import STRAY_LIGHT, stray_e_s
+from skysim.simulation.lights.effects import STRAY_LIGHT, AirEffects, stray_e_s
 from skysim.simulation.lights.light import find_light
 from skysim.sources.bodies import NAMES, BodyLight
 from skysim.sources.camera_orbit import limb_elevation_rad

@@ -10,7 +10,7 @@ import numpy as np
 from skysim.core.constants import RPM_RAD_S
 from skysim.core.types import Floats, Record
 from skysim.core.units import significant
-from skysim.dynamics.multibody.actuators import PREFIXES
+from skysim.dynamics.multibody.model import PREFIXES
 from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.motion import TorqueForecast
 

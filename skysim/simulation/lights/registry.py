@@ -13,13 +13,26 @@ from typing import Any, get_args
 
 from skysim.dynamics import multibody
 from skysim.scene.sections.light import CONFIGS, LightConfig
-from skysim.simulation.lights.atmosphere import AirEffects, AirGlow, Skyline
-from skysim.simulation.lights.dome import known_light
-from skysim.simulation.lights.lab_room import DomeWall, Mirror, Vehicle, WallGlow
-from skysim.simulation.lights.lens import Baffle, Ghosts, Glare
+from skysim.simulation.lights.effects import (
+    AirEffects,
+    AirGlow,
+    Baffle,
+    DomeWall,
+    Ghosts,
+    Glare,
+    Mirror,
+    Skyline,
+    Vehicle,
+    WallGlow,
+)
+from skysim.simulation.lights.emitters import (
+    BackgroundLight,
+    Earth,
+    Satellites,
+    SolarSystem,
+    known_light,
+)
 from skysim.simulation.lights.light import Light, LightPlan
-from skysim.simulation.lights.sky_bodies import Earth, Satellites, SolarSystem
-from skysim.simulation.lights.starlight import BackgroundLight
 from skysim.sources.air import Air
 from skysim.sources.dome.interreflection import reflecting_dome
 from skysim.sources.dome.surface import build_surface

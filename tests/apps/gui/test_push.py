@@ -16,8 +16,7 @@ pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 from skysim.apps.gui.worker.geometry import PULL_RAD_S, Grip, Push, pull_torque_nm
 from skysim.core.errors import InputError
 from skysim.scene import loader
-from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import Lab, build_lab, exposure_window
 
 pytest_plugins = ["tests.helpers.labpage"]
 INERTIA = np.array([6.0, 6.5, 9.0])

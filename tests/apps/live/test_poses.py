@@ -18,7 +18,7 @@ from skysim.apps.live.wire import MOST_LINE_BYTES
 from skysim.core.types import Trajectory
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight, simulate_motion
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import exposure_window
 
 ORBIT = {
     "exposure.frames": "2",

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import bundle_adjustment as ba
-from estimator.calibration import bundle_covariance, dome_survey, star_field
+from estimator.calibration import dome_survey, star_field, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey, survey
 from estimator.calibration.star_field import LensPrior, StarFrame
@@ -256,7 +256,7 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     )
     part = Subset(known, seen, np.arange(LIGHTS), np.arange(FRAMES), np.arange(rows))
     terms = part.terms
-    covariances = bundle_covariance.covariance(terms, known)
+    covariances = survey_subset.covariance(terms, known)
     spare = 2 * rows - np.trace(np.linalg.solve(whole_matrix(terms), pixels))
     assert dome_survey.redundancy(part, covariances) == pytest.approx(spare, abs=1e-3)
     assert (
@@ -265,8 +265,8 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
 
 
 @law(
-    bundle_covariance.covariance,
-    bundle_covariance.common_errors,
+    survey_subset.covariance,
+    survey_subset.common_errors,
     Camera.with_lens,
     Camera.lens,
     ba.free_lens,
@@ -288,7 +288,7 @@ def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_sh
     whole = whole_matrix(terms)
     scale = np.sqrt(np.diag(whole))
     inverse = np.linalg.inv(whole / np.outer(scale, scale)) / np.outer(scale, scale)
-    position_m, camera = bundle_covariance.common_errors(terms, known)
+    position_m, camera = survey_subset.common_errors(terms, known)
     light_m = position_m.reshape(len(position_m), -1)
     first = 3 * (LIGHTS + FRAMES)
     sigma = np.sqrt(np.diag(inverse))
@@ -300,7 +300,7 @@ def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_sh
         np.testing.assert_allclose(found / size, inverse[block] / size, rtol=0, atol=1e-4)
     own = inverse[: 3 * LIGHTS, : 3 * LIGHTS] - light_m.T @ light_m
     assert np.linalg.eigvalsh(own).min() > -1e-6 * np.trace(own)
-    blocks = bundle_covariance.covariance(terms, known)
+    blocks = survey_subset.covariance(terms, known)
     by_three = inverse[:first, :first].reshape(-1, 3, first // 3, 3)
     diagonal = np.einsum("iajb->iab", by_three * np.eye(first // 3)[:, None, :, None])
     for found, block in (
@@ -311,7 +311,7 @@ def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_sh
         np.testing.assert_allclose(found / size, block / size, rtol=0, atol=1e-4)
 
 
-@law(ba.adjust, ba.fit_attitudes, bundle_covariance.covariance)
+@law(ba.adjust, ba.fit_attitudes, survey_subset.covariance)
 @given(rng=SEEDS, by=some.floats(0, 3e-3))
 def test_an_adjustment_converges_to_the_observed_pixels(
     rng: np.random.Generator, by: float
@@ -325,7 +325,7 @@ def test_an_adjustment_converges_to_the_observed_pixels(
     assert status == "converged"
     assert np.abs(ba.residuals(found, seen)).max() < 1e-5
     terms = found.equations(seen, np.ones(len(seen.led)))
-    by_led, by_rotation, shared = bundle_covariance.covariance(terms, found)
+    by_led, by_rotation, shared = survey_subset.covariance(terms, found)
     for matrix in (*by_led, *by_rotation, shared):
         assert_covariance(matrix)
 

@@ -13,7 +13,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from estimator.calibration import (
-    bundle_covariance,
     survey_faults,
     survey_plan,
     survey_subset,
@@ -31,7 +30,7 @@ from tests.helpers.surveyed_dome import attitudes, model, pixels
         survey_plan.measurable,
         SurveyAccuracy.led_rms_m,
         SurveyModel.visible,
-        bundle_covariance.covariance,
+        survey_subset.covariance,
         survey_subset.connected_subset,
     ),
     slow=True,

@@ -19,7 +19,7 @@ from skysim.scene import loader
 from skysim.scene.sections.surroundings import UniformGlowConfig
 from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import Lab, build_lab
-from skysim.simulation.lights.starlight import BackgroundLight
+from skysim.simulation.lights.emitters import BackgroundLight
 from tests.helpers.changed_light import with_light, with_sources
 
 CONTROL = Control(mean_dn=100.0)

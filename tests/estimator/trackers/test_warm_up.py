@@ -16,7 +16,7 @@ from numba.core.dispatcher import Dispatcher
 from scipy.spatial.transform import Rotation
 import estimator
 from estimator import *
-from estimator.trackers import warm_up
+from estimator.trackers import pipeline
 
 def compiled():
     modules = [module for name, module in list(sys.modules.items()) if name.startswith("estimator")]
@@ -44,7 +44,7 @@ for n, cam_from_ref in enumerate(Rotation.random(12, np.random.default_rng(5))):
     for streak_px in ((0.0, 0.0), (6.0, 3.0)):
         places = np.concatenate([xy_px, false_px])
         peaks = np.concatenate([3e3 * light / light.max(), np.full(n, 900.0)])
-        for seen in disguises(warm_up.draw(camera, places, peaks, np.dtype("u2"), streak_px)):
+        for seen in disguises(pipeline.draw(camera, places, peaks, np.dtype("u2"), streak_px)):
             try:
                 solved += tracker.solve(seen).attitude.solved
                 report = follower.solve(seen, n / 10)

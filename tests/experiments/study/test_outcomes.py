@@ -18,7 +18,7 @@ from skysim.experiments.study.execution.outcomes import SAME_LIGHT_PX, Outcome, 
 from skysim.experiments.study.execution.trials import TrialSetup
 from skysim.experiments.study.plan import TrialSpec
 from skysim.simulation.flight import Flight
-from skysim.simulation.timing import exposure_window
+from skysim.simulation.lab import exposure_window
 
 SKY = TrialSpec("shefex2", ".", 1, {"light.limit_mag": 6.0}, {"kind": "centroids"}, True)
 DOME = TrialSpec("afit_simsat", ".", 1, {}, {"kind": "centroids"}, True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from skysim.core.types import Bools
     from skysim.scene.scene import Scene
     from skysim.scene.sections.surroundings import ExclusionConfig
-    from skysim.sources.orbit_availability import Pointing, SkySamples
+    from skysim.sources.camera_orbit import Pointing, SkySamples
 
 SPANS_S = {"orbit": None, "day": DAY_S, "year": JULIAN_YEAR_DAY * DAY_S}
 
@@ -105,7 +105,7 @@ def pointing_of(scene: Scene, law: str, off_deg: float, around_deg: float) -> Po
     import numpy as np
 
     from skysim.scene.sections.motion import PointingConfig
-    from skysim.sources.orbit_availability import Pointing
+    from skysim.sources.camera_orbit import Pointing
     from skysim.sources.stars import directions
 
     start = scene.motion.start
@@ -124,7 +124,7 @@ def computed(
     """The angles over the span; without one, over one revolution."""
     import numpy as np
 
-    from skysim.sources import camera_orbit, catalog, orbit_availability, stars
+    from skysim.sources import camera_orbit, catalog, stars
 
     orbit = camera_orbit.build_orbit(scene.orbit, scene.start_time)
     assert orbit is not None
@@ -143,7 +143,7 @@ def computed(
     camera = scene.camera
     area_px = camera.width_px * camera.height_px
     field_rad = math.atan(math.sqrt(area_px / math.pi) / camera.focal_px)
-    return orbit_availability.sample(
+    return camera_orbit.sample(
         orbit,
         scene.start_time,
         t_s,

@@ -17,8 +17,7 @@ from skysim.results import scoring
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.scene.sections.motion import AttitudeConfig
-from skysim.simulation.lab import Lab
-from skysim.simulation.timing import MARGIN_S, exposure_window
+from skysim.simulation.lab import MARGIN_S, Lab, exposure_window
 from skysim.sources import stars
 from skysim.sources.dome import surface
 from skysim.tracking.onboard_model import calibration

@@ -35,8 +35,7 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import PRESCRIBED
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
-from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker
-from skysim.simulation.timing import frame_end_s
+from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker, frame_end_s
 from skysim.tracking import factory, onboard_model
 
 MAX_WINDOWS = 200

@@ -23,11 +23,10 @@ from skysim.core.types import Floats, Ints, Trajectory, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
-from skysim.simulation.lab import Lab, StarCamera
-from skysim.simulation.lights.atmosphere import AirEffects
-from skysim.simulation.lights.dome import LedDome
+from skysim.simulation.lab import MARGIN_S, Lab, StarCamera, exposure_window
+from skysim.simulation.lights.effects import AirEffects
+from skysim.simulation.lights.emitters import LedDome
 from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
-from skysim.simulation.timing import MARGIN_S, exposure_window
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3

@@ -62,8 +62,15 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.light import PLUGINS
 from skysim.simulation.exposure import render_frame
 from skysim.simulation.flight import Flight
-from skysim.simulation.lab import Lab, StarCamera, UserParts, build_lab, build_tracker
-from skysim.simulation.timing import MARGIN_S, exposure_window
+from skysim.simulation.lab import (
+    MARGIN_S,
+    Lab,
+    StarCamera,
+    UserParts,
+    build_lab,
+    build_tracker,
+    exposure_window,
+)
 from skysim.sources.air import topocentric_axes
 from skysim.sources.ephemeris import observe_from, place
 from skysim.tracking import factory
