@@ -21,12 +21,12 @@ import numpy as np
 from skysim.apps.live.commands import CommandState, Inbox
 from skysim.apps.live.packets import (
     PERIODIC,
+    Output,
     Packet,
     frame_packet,
     plain,
     solution_packet,
 )
-from skysim.apps.live.sinks import Output
 from skysim.simulation.flight import Flight, Shot
 
 
