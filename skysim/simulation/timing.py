@@ -7,7 +7,7 @@ import numpy as np
 
 from skysim.camera.render import Window
 from skysim.core.random_streams import CAMERA_TIMING, random_stream
-from skysim.core.tolerance import scaled_errors
+from skysim.core.units import scaled_errors
 from skysim.scene.scene import Scene
 
 MARGIN_S = 2e-3  # time that is simulated after the last exposure
