@@ -42,7 +42,7 @@ SAME_ANGLE_RAD = 0.1  # greatest difference between the directions of parallel t
 TRAILS = "trails of {:.0f} px: a shorter exposure, a steadier camera, or a mount that tracks"
 MIRRORED = "perhaps mirrored: it solves when flipped left to right; flip it, and solve that"
 FEW_LIGHTS = 10
-EFFORTS = 3  # number of searches of the mirrored picture, so that diagnosis is faster than the searches before it
+MIRROR_EFFORTS = 3  # number of searches of the mirrored picture, so that diagnosis is faster than the searches before it
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def mirrored(refusal: Refusal) -> str:
         return ""
     flipped = reversed_columns(refusal.centroids, refusal.size_px[0])
     for solver in refusal.solvers:
-        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, Clock(), EFFORTS)
+        attitude, _ = solve_centroids(flipped, solver, refusal.size_px, Clock(), MIRROR_EFFORTS)
         if attitude.solved:
             return MIRRORED
     return ""

@@ -17,20 +17,18 @@ from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import diagnosis, retries
-from skysim.apps.plate_solver.dome_pictures import (
+from skysim.apps.plate_solver.plate_solution import (
     DomeReading,
     DomeSolution,
     DomeSolver,
-    dome_fields,
-    make_dome_solver,
-    solve_dome,
-)
-from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
     camera_notes,
+    dome_fields,
+    make_dome_solver,
     picture_fields,
     solution_fields,
+    solve_dome,
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
