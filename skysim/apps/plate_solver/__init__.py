@@ -1,7 +1,7 @@
 """Plate solver of `skysim solve`, `skysim.solve` and the browser's photo panel.
 
 A file is loaded as a picture in the orientation of viewing (`picture.py`) and solved without a prior attitude
-(`solver.py`). After a refusal other centroids are tried (`retries.py`), and the likely cause is found (`diagnosis.py`).
+(`solver.py`). After a refusal other centroids are tried, and the likely cause is found (`diagnosis.py`).
 Pictures of a dome's LEDs are solved by the tracker of a scene (`plate_solution.py`).
 """
 
