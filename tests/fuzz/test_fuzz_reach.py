@@ -43,8 +43,8 @@ SOURCES = "reads bytes for their digest alone"
 OUT_OF_REACH = {
     "estimator.catalog.catalog.StarCatalog.read": "hands the file on to the module's `read`",
     "estimator.catalog.index_file.read": "a file of ours with a checksum, whose law reads damaged ones",
-    "skysim.apps.cli.commands.camera.CameraGroup.parse_args": "words of the command line",
-    "skysim.apps.cli.commands.camera.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
+    "skysim.apps.cli.commands.measure.CameraGroup.parse_args": "words of the command line",
+    "skysim.apps.cli.commands.measure.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
     "skysim.apps.live.http.Handler.do_GET": SHIPPED,
     "skysim.camera.glow.background.zodiacal_table": SHIPPED,

@@ -9,9 +9,6 @@ import typer
 
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import (
-    availability,
-    camera,
-    dataset,
     datasheet,
     measure,
     reproduce,
@@ -19,7 +16,6 @@ from skysim.apps.cli.commands import (
     run,
     serve,
     solve,
-    star_catalogs,
     study,
     survey,
     validate,
@@ -38,7 +34,7 @@ JOBS = {
         validate.check,
         validate.validate,
         datasheet.datasheet,
-        availability.availability,
+        datasheet.availability,
     ),
     "Measure": (
         solve.solve,
@@ -49,7 +45,7 @@ JOBS = {
     ),
     "Exchange": (
         resources.export,
-        dataset.dataset,
+        study.dataset,
         run.compare,
         run.trackers,
         reproduce.reproduce,
@@ -60,8 +56,8 @@ for job, commands in JOBS.items():
         app.command(rich_help_panel=job)(command)
 app.add_typer(resources.scenes_app, name="scenes", rich_help_panel="Simulate")
 app.add_typer(study.app, name="study", rich_help_panel="Plan")
-app.add_typer(camera.app, name="camera", rich_help_panel="Measure")
-app.add_typer(star_catalogs.app, name="catalog", rich_help_panel="Exchange")
+app.add_typer(measure.camera_app, name="camera", rich_help_panel="Measure")
+app.add_typer(resources.catalog_app, name="catalog", rich_help_panel="Exchange")
 add_help(app)
 
 
