@@ -7,7 +7,7 @@ from nicegui import ui
 from skysim.apps.gui.messages import SceneInfo
 from skysim.apps.gui.views import context, forms, live, widgets
 from skysim.apps.gui.views.state import PageView
-from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.worker import photo
 from skysim.core.paths import SCENES, shipped_files
 
 
@@ -46,7 +46,7 @@ class Head:
             )
             page.identifying = ui.switch("identify", value=True).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
-                for name in image_export.FILE_BY_ITEM:
+                for name in photo.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")
 
@@ -116,11 +116,9 @@ class Head:
         files = await self.page.run_task("export")
         if not files:
             return
-        name = image_export.FILE_BY_ITEM[item]
+        name = photo.FILE_BY_ITEM[item]
         if not name:
-            ui.download(
-                image_export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip"
-            )
+            ui.download(photo.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip")
         elif name in files:
             ui.download(files[name], name)
         else:

@@ -35,7 +35,7 @@ from skysim.apps.gui.views import (
     widgets,
 )
 from skysim.apps.gui.views.state import PageView
-from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.worker import photo
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
 from skysim.core.errors import InputError
@@ -222,7 +222,7 @@ class Tab(context.PageContext):
             *(Command(f"panel: {name}", partial(self.show_panel, name)) for name in PANELS),
             *(
                 Command(f"export: {name}", partial(self.head.export, name))
-                for name in image_export.FILE_BY_ITEM
+                for name in photo.FILE_BY_ITEM
             ),
         ]
 
