@@ -69,7 +69,7 @@ OUT_OF_REACH = {
     "skysim.apps.gui.worker.photo.frame_files": "copies a run's files",
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.study_file": OURS,
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.load_study": OURS,
-    "skysim.apps.gui.page.history.History.read": "the page's address, which `View.from_query` checks",
+    "skysim.apps.gui.page.tab.History.read": "the page's address, which `View.from_query` checks",
     "skysim.apps.gui.worker.playback.Survey.map_file": "the map that it has just written",
     "skysim.apps.gui.worker.study_process.monte_carlo": "values of the page's form, checked by `loader.load`",
     "skysim.core.fits_tiles.decode": GUARDED,

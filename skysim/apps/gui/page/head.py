@@ -5,8 +5,8 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import context, forms, live, widgets
-from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.views import context, forms, widgets
+from skysim.apps.gui.views.context import PageView
 from skysim.apps.gui.worker import photo
 from skysim.core.paths import SCENES, shipped_files
 
@@ -26,7 +26,7 @@ class Head:
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
             self.banner = (
-                live.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
+                widgets.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
             )
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
@@ -38,7 +38,7 @@ class Head:
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
             page.latency = (
-                live.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
+                widgets.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
             )
             page.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
