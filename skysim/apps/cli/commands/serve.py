@@ -96,9 +96,8 @@ def live(
     options = locals()
     from skysim.apps.access import LOOPBACK
     from skysim.apps.live.commands import CommandState
-    from skysim.apps.live.pacing import Live, Pace
+    from skysim.apps.live.pacing import Live, Pace, PosedLive
     from skysim.apps.live.packets import READER_GONE
-    from skysim.apps.live.poses import PosedLive
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
