@@ -11,13 +11,11 @@ from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import (
     datasheet,
     measure,
-    reproduce,
     resources,
     run,
     serve,
     solve,
     study,
-    survey,
     validate,
 )
 from skysim.apps.cli.examples import add_help
@@ -38,7 +36,7 @@ JOBS = {
     ),
     "Measure": (
         solve.solve,
-        survey.survey,
+        solve.survey,
         measure.characterize,
         measure.calibrate,
         measure.balance,
@@ -48,7 +46,7 @@ JOBS = {
         study.dataset,
         run.compare,
         run.trackers,
-        reproduce.reproduce,
+        resources.reproduce,
     ),
 }
 for job, commands in JOBS.items():

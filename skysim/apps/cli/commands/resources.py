@@ -1,4 +1,4 @@
-"""Commands `skysim scenes`, `new` and `export`, and `skysim catalog`.
+"""Commands `skysim scenes`, `new`, `export`, `catalog` and `reproduce`.
 
 `catalog` builds and inspects star catalogs, and prepares those of a tracker as its papers did.
 """
@@ -15,6 +15,7 @@ from typer import Argument, Option
 
 from skysim.apps.cli.options import (
     Json,
+    OpenReport,
     Overrides,
     SceneArg,
     Seed,
@@ -22,10 +23,17 @@ from skysim.apps.cli.options import (
     load,
     write_file,
 )
-from skysim.apps.cli.terminal import print_catalog, print_json, print_titles, progress
+from skysim.apps.cli.terminal import (
+    print_catalog,
+    print_json,
+    print_list,
+    print_titles,
+    progress,
+    progress_callback,
+)
 from skysim.core.errors import InputError, check_name
 from skysim.core.paths import DATA, SCENES
-from skysim.results.report import Column, Table, print_table
+from skysim.results.report import Column, Table, page_path, print_blocks, print_table
 
 if TYPE_CHECKING:
     from estimator.catalog.published_catalogs import OnBoard
@@ -423,3 +431,73 @@ def print_cat(stars: OnBoard, path: Path, json: bool) -> None:
         print_json(facts)
     else:
         print(*(f"{name}: {value}" for name, value in facts.items()), sep=", ")
+
+
+def reproduce(
+    ids: Annotated[list[str] | None, Argument()] = None,
+    quick: bool = False,
+    seed: int = 1,
+    report: bool = False,
+    out: Path = Path("out/reproduce"),
+    markdown: Path | None = None,
+    open_: OpenReport = False,
+    json: Json = False,
+) -> None:
+    """Repeat the experiments of papers and compare the published numbers with ours.
+
+    Parameters
+    ----------
+    ids : ID|all
+        Experiments, or all; default: list them.
+    quick
+        Run fewer trials; the intervals are wider.
+    seed
+        Seed of all random streams.
+    report
+        Also write an HTML page with the papers' figures.
+    out
+        Folder for the report.
+    markdown
+        Also write a Markdown page with its images beside it.
+    """
+    if open_ and not report:
+        raise InputError("--open", "has no effect without --report", "--report --open")
+    if not ids:
+        list_experiments(json)
+        return
+    page = out / "report.html"
+    paths = [page_path(path) for path in (page if report else None, markdown) if path]
+    from skysim.experiments.papers import reproduction
+
+    reproductions = []
+    for id in reproduction.check_ids(ids):
+        with progress_callback(id) as watch:
+            done = reproduction.reproduce(id, reproduction.Options(quick, seed, watch))
+        reproductions.append(done)
+        if not json:
+            print_blocks([reproduction.section(done)])
+    if paths:
+        made = reproduction.papers_report(reproductions, ids, quick, seed)
+        for path in paths:
+            made.save(path)
+    if open_:
+        typer.launch(str(page))
+    if json:
+        print_json(
+            [line.as_dict() for result in reproductions for line in result.comparisons]
+        )
+        return
+    print_blocks([reproduction.headline(reproductions)])
+    for path in paths:
+        print(path)
+
+
+def list_experiments(json: bool) -> None:
+    """Print the experiments that can be repeated."""
+    from skysim.experiments.papers.published import experiments
+
+    listed = [
+        {"id": id, "title": published.title, "source": published.source}
+        for id, published in experiments().items()
+    ]
+    print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
