@@ -133,23 +133,23 @@ def test_a_frame_is_sent_when_due_and_dropped_one_period_later(
 
 def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
     """With time for every second frame, received frames equal the run's; the header counts dropped ones."""
-    packets: list[Packet] = []
+    received: list[Packet] = []
 
     class Slow(Pace):
         def is_on_time(self, index: int, t_s: float) -> bool:
             return index % 2 == 0
 
-    sink = packets.Sink("folder", packets.append)
+    sink = packets.Sink("folder", received.append)
     flight = streamed_flight()
     stats = Live(flight, Slow(0.0, 10.0), [sink], CommandState(flight, 0.5, False))
     stats.run()
     sink.close()
-    assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
-    assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
+    assert [one.header["index"] for one in received] == list(range(0, FRAMES, 2))
+    assert [one.header["dropped"] for one in received] == list(range(FRAMES // 2))
     # With the last, after which none came.
     counted = stats.statistics()
     assert (counted["made"], counted["dropped"]) == (FRAMES // 2, FRAMES - FRAMES // 2)
-    for one in packets:
+    for one in received:
         np.testing.assert_array_equal(one.pixels, frames[one.header["index"]])
 
 
