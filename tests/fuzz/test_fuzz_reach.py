@@ -58,7 +58,7 @@ OUT_OF_REACH = {
     "skysim.scene.loader.load_scene": "the same",
     "skysim.core.yaml_reader.as_tree": "values of Python, not of a file",
     "estimator.attitude.dome_map._read_leds": "its lists are those of skysim's reader; a test reads them with both",
-    "skysim.apps.cli.commands.datasheet.parse_rates": "numbers of an option, not of a file",
+    "skysim.apps.cli.commands.validate.parse_rates": "numbers of an option, not of a file",
     "skysim.experiments.datasheet.datasheet_report.standard_section": SHIPPED,
     "skysim.experiments.study.execution.store.Store.overrides": "a row of a store, which `open_store` reads",
     "skysim.experiments.study.own_code.digest_of": "the text of the user's own code, which Python has read",

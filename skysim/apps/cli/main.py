@@ -9,7 +9,6 @@ import typer
 
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import (
-    datasheet,
     measure,
     resources,
     run,
@@ -31,8 +30,8 @@ JOBS = {
     "Plan": (
         validate.check,
         validate.validate,
-        datasheet.datasheet,
-        datasheet.availability,
+        validate.datasheet,
+        validate.availability,
     ),
     "Measure": (
         solve.solve,
