@@ -24,8 +24,7 @@ from estimator.detection.detect import DETECTORS
 from estimator.identification.registry import IDENTIFIERS as STAR_IDENTIFIERS
 from estimator.trackers.dome_tracker import IDENTIFIERS as DOME_IDENTIFIERS
 from skysim.apps.gui.views.forms import yaml_line
-from skysim.core.tolerance import ErrorSchema
-from skysim.core.units import ConfigModel, si_unit
+from skysim.core.units import ConfigModel, ErrorSchema, si_unit
 from skysim.experiments.study.plan import Study
 from skysim.scene.provenance import plain
 from skysim.scene.scene import NAME_ALIAS, Scene

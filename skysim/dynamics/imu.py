@@ -27,8 +27,8 @@ from skysim.core.constants import (
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Bools, Floats, frozen
+from skysim.core.units import scaled_errors
 from skysim.scene.sections.vehicle import (
     AccelerometerConfig,
     GyroConfig,

@@ -17,7 +17,6 @@ from skysim.core.constants import DAY_S
 from skysim.core.errors import InputError
 from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import Moment
-from skysim.core.tolerance import TimeError
 from skysim.core.units import (
     BY_KIND,
     ConfigModel,
@@ -28,6 +27,7 @@ from skysim.core.units import (
     Seed,
     Spins,
     Time,
+    TimeError,
 )
 from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig

@@ -29,8 +29,8 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import CAMERA_TIMING, JITTER, random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Mount, Sources, frozen
+from skysim.core.units import scaled_errors
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.controllers import CONTROLLERS

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 import skysim
 from skysim.apps import plate_solver
 from skysim.apps.cli import main
-from skysim.apps.plate_solver.dome_pictures import dome_fields, solve_dome
+from skysim.apps.plate_solver.plate_solution import dome_fields, solve_dome
 from skysim.core.errors import InputError
 from skysim.core.images import ViewedImage
 from skysim.experiments.dome_survey import survey_frames

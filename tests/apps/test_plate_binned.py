@@ -14,8 +14,8 @@ from estimator.catalog import catalog
 from estimator.core.types import Attitude, Centroids
 from estimator.trackers.pipeline import Report, Settings
 from skysim.apps import plate_solver
+from skysim.apps.plate_solver import diagnosis
 from skysim.apps.plate_solver import picture as plate_picture
-from skysim.apps.plate_solver import retries
 from skysim.core import images
 from skysim.core.paths import CATALOGS
 from tests.helpers import photographs
@@ -63,7 +63,7 @@ def test_centroids_of_a_binned_image_are_in_its_full_resolution_pixels() -> None
     for x, y in places:
         cv2.circle(image, (int(x), int(y)), 20, 60, -1)
     noisy = np.clip(image + rng.normal(60, 4, image.shape), 0, 255).astype(np.uint8)
-    tried = dict(retries.large_lights(noisy, Settings()))
+    tried = dict(diagnosis.large_lights(noisy, Settings()))
     assert list(tried) == [8, 4, 2]
     for factor, centroids in tried.items():
         off_px = np.linalg.norm(centroids.xy_px[:, None] - places, axis=2).min(axis=1)
@@ -79,15 +79,15 @@ def test_sharp_pictures_and_small_ones_are_not_binned(blurred: NDArray) -> None:
         1000, 30_000, 60
     )
     sharp = 300 + 20 * rng.standard_normal(light.shape) + cv2.GaussianBlur(light, (0, 0), 1.2)
-    assert list(retries.large_lights(sharp.astype(np.uint16), Settings())) == []
+    assert list(diagnosis.large_lights(sharp.astype(np.uint16), Settings())) == []
     assert [
-        factor for factor, _ in retries.large_lights(blurred[:850, :850], Settings())
+        factor for factor, _ in diagnosis.large_lights(blurred[:850, :850], Settings())
     ] == [
         4,
         2,
     ]
-    assert list(retries.large_lights(blurred[:390, :390], Settings())) == []
-    assert list(retries.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
+    assert list(diagnosis.large_lights(blurred[:390, :390], Settings())) == []
+    assert list(diagnosis.large_lights(np.full((900, 900), 7, np.uint8), Settings())) == []
 
 
 def test_a_binned_image_needs_more_evidence(
@@ -118,7 +118,7 @@ def test_a_binned_image_needs_more_evidence(
 def test_a_binned_pixel_is_the_mean_of_its_block() -> None:
     image = np.random.default_rng(3).integers(0, 256, (33, 47)).astype(np.uint8)
     means = image[:32, :44].reshape(8, 4, 11, 4).mean(axis=(1, 3))
-    small = retries.bin_pixels(image, 4).astype(float)
+    small = diagnosis.bin_pixels(image, 4).astype(float)
     scale = (means.max() - means.min()) / 65535
     np.testing.assert_allclose(small * scale + means.min(), means, atol=scale)
     assert math.isclose(small.max(), 65535)

@@ -13,7 +13,7 @@ from estimator.catalog import catalog
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Settings
 from skysim.apps import plate_solver
-from skysim.apps.plate_solver import retries
+from skysim.apps.plate_solver import diagnosis
 from skysim.core import images
 from skysim.core.paths import CATALOGS
 from tests.helpers import photographs
@@ -65,9 +65,9 @@ def test_removing_clouds_keeps_the_stars() -> None:
         len(plate_solver.solve_array(one, plate_solver.make_solver(22.0, None))[0].centroids)
         for one in (image, plain)
     ]
-    found = retries.without_clouds(image, Settings())
+    found = diagnosis.without_clouds(image, Settings())
     assert len(found) > 1.5 * seen[0]
-    assert len(retries.without_clouds(plain, Settings())) == 0
+    assert len(diagnosis.without_clouds(plain, Settings())) == 0
 
 
 def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
@@ -86,7 +86,7 @@ def test_edges_of_trees_are_not_taken_for_the_stars_streak() -> None:
     bright = (seen[:, 2] > 0.9) & (stars.v_mag < SHOT.limit_mag - 1.5)
     xy_px = SHOT.camera.pixels(seen[bright])
     xy_px = xy_px[np.all((xy_px > 20) & (xy_px < [1260, 460]), axis=1)]
-    found = retries.without_clouds(image, Settings())
+    found = diagnosis.without_clouds(image, Settings())
     near = np.linalg.norm(xy_px[:, None] - found.xy_px, axis=2).min(axis=1)
     assert len(xy_px) >= 5
     assert np.mean(near < 1.0) >= 0.8
@@ -114,7 +114,7 @@ def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number:
     report, _ = plate_solver.solve_array(image, solver)
     assert not report.attitude.solved
     first = right(report.centroids)
-    most = max(map(right, retries.trails(image, Settings())))
+    most = max(map(right, diagnosis.trails(image, Settings())))
     assert most > 2 * first
     outcome = plate_solver.solve_picture(images.ViewedImage(image), solver)
     assert photographs.is_same(outcome.report.attitude.cam_from_ref, truth)
@@ -122,7 +122,7 @@ def test_faint_trails_are_detected_along_a_streak_found_in_binned_pixels(number:
 
 def test_round_stars_are_not_taken_for_trails() -> None:
     image, _ = drawn(SHOT, 4)
-    assert not list(retries.trails(image, Settings()))
+    assert not list(diagnosis.trails(image, Settings()))
 
 
 def test_an_upper_half_is_solved_in_its_own_field() -> None:
@@ -145,15 +145,15 @@ def test_halves_cover_the_image_and_are_not_tried_with_few_lights() -> None:
         [rng.uniform([0, 0], [99, 49], (30, 2)), rng.uniform([0, 51], [99, 99], (9, 2))]
     )
     lights = Centroids(xy_px, np.full(39, 0.1), np.ones(39))
-    found = list(retries.halves(np.zeros((100, 100)), lights, ""))
+    found = list(diagnosis.halves(np.zeros((100, 100)), lights, ""))
     parts = {one.note: (one.efforts, one.centroids) for one in found}
-    assert [one.note for one in found if one.upper_half] == [retries.HALF.format("upper")]
-    assert set(parts) == {retries.HALF.format(side) for side in ("upper", "left", "right")}
-    efforts, upper = parts[retries.HALF.format("upper")]
-    assert (efforts, len(upper)) == (retries.MORE_EFFORTS, 30)
+    assert [one.note for one in found if one.upper_half] == [diagnosis.HALF.format("upper")]
+    assert set(parts) == {diagnosis.HALF.format(side) for side in ("upper", "left", "right")}
+    efforts, upper = parts[diagnosis.HALF.format("upper")]
+    assert (efforts, len(upper)) == (diagnosis.MORE_EFFORTS, 30)
     assert (
-        len(parts[retries.HALF.format("left")][1])
-        + len(parts[retries.HALF.format("right")][1])
+        len(parts[diagnosis.HALF.format("left")][1])
+        + len(parts[diagnosis.HALF.format("right")][1])
         == 39
     )
 

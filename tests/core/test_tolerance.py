@@ -12,8 +12,7 @@ from pydantic import ValidationError
 from scipy import stats
 
 from skysim.core.errors import InputError
-from skysim.core.tolerance import LengthError, NumberError, Tolerance, scaled_errors
-from skysim.core.units import ConfigModel
+from skysim.core.units import ConfigModel, LengthError, NumberError, Tolerance, scaled_errors
 from skysim.dynamics import imu
 from skysim.scene import loader
 from skysim.scene.sections import vehicle

@@ -22,9 +22,8 @@ from skysim.apps.cli.commands import validate
 from skysim.apps.live import gige
 from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.gige import GigeCamera
-from skysim.apps.live.pacing import Live, Pace
+from skysim.apps.live.pacing import Live, Pace, pose_samples
 from skysim.apps.live.packets import unpack
-from skysim.apps.live.poses import pose_samples
 from skysim.apps.plate_solver import picture
 from skysim.camera.psf import otf
 from skysim.core import images, units, yaml_reader

@@ -17,8 +17,7 @@ from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.tolerance import ErrorSchema, ToleranceConfig
-from skysim.core.units import SI_SUFFIX, ConfigModel
+from skysim.core.units import SI_SUFFIX, ConfigModel, ErrorSchema, ToleranceConfig
 from skysim.dynamics.guidance import LEGS
 from skysim.dynamics.jitter import SPECTRA
 from skysim.dynamics.multibody.cmgs import STEERING

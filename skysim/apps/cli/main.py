@@ -9,19 +9,12 @@ import typer
 
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import (
-    availability,
-    camera,
-    dataset,
-    datasheet,
     measure,
-    reproduce,
     resources,
     run,
     serve,
     solve,
-    star_catalogs,
     study,
-    survey,
     validate,
 )
 from skysim.apps.cli.examples import add_help
@@ -37,22 +30,22 @@ JOBS = {
     "Plan": (
         validate.check,
         validate.validate,
-        datasheet.datasheet,
-        availability.availability,
+        validate.datasheet,
+        validate.availability,
     ),
     "Measure": (
         solve.solve,
-        survey.survey,
+        solve.survey,
         measure.characterize,
         measure.calibrate,
         measure.balance,
     ),
     "Exchange": (
         resources.export,
-        dataset.dataset,
+        study.dataset,
         run.compare,
         run.trackers,
-        reproduce.reproduce,
+        resources.reproduce,
     ),
 }
 for job, commands in JOBS.items():
@@ -60,8 +53,8 @@ for job, commands in JOBS.items():
         app.command(rich_help_panel=job)(command)
 app.add_typer(resources.scenes_app, name="scenes", rich_help_panel="Simulate")
 app.add_typer(study.app, name="study", rich_help_panel="Plan")
-app.add_typer(camera.app, name="camera", rich_help_panel="Measure")
-app.add_typer(star_catalogs.app, name="catalog", rich_help_panel="Exchange")
+app.add_typer(measure.camera_app, name="camera", rich_help_panel="Measure")
+app.add_typer(resources.catalog_app, name="catalog", rich_help_panel="Exchange")
 add_help(app)
 
 

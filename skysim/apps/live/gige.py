@@ -30,8 +30,7 @@ from enum import IntEnum
 from typing import Any
 
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import Packet
-from skysim.apps.live.sinks import Sink
+from skysim.apps.live.packets import Packet, Sink
 from skysim.core import __version__
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA

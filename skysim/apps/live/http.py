@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from skysim.apps.access import names_address, same_site, token_matches
-from skysim.apps.live.packets import Packet
-from skysim.apps.live.sinks import encode_png
+from skysim.apps.live.packets import Packet, encode_png
 from skysim.core import files
 from skysim.core.paths import DATA
 from skysim.results.plots import jpeg, to_8bit

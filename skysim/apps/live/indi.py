@@ -29,8 +29,7 @@ from indipyserver import IPyServer
 
 from skysim.apps.access import HOST, listen
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import Packet
-from skysim.apps.live.sinks import CLOSE_TIMEOUT_S, Sink
+from skysim.apps.live.packets import CLOSE_TIMEOUT_S, Packet, Sink
 from skysim.apps.plate_solver.plate_solution import wcs_header
 from skysim.camera.detector import saturation_dn
 from skysim.core.types import Frame

@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.apps.access import HOST
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import Packet
-from skysim.apps.live.sinks import Sink
+from skysim.apps.live.packets import Packet, Sink
 from skysim.core import files
 from skysim.core.errors import InputError, printable
 from skysim.core.paths import DATA

@@ -18,8 +18,7 @@ from typing import Any
 from skysim.apps.access import listen, token_matches
 from skysim.apps.live.commands import parse
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import CHANNELS, Packet
-from skysim.apps.live.sinks import Sink
+from skysim.apps.live.packets import CHANNELS, Packet, Sink
 from skysim.core.errors import InputError
 
 SOCKET_TIMEOUT_S = 10.0  # time for a first line, and for a client to read what was sent

@@ -1,11 +1,10 @@
 """Plate solver of `skysim solve`, `skysim.solve` and the browser's photo panel.
 
 A file is loaded as a picture in the orientation of viewing (`picture.py`) and solved without a prior attitude
-(`solver.py`). After a refusal other centroids are tried (`retries.py`), and the likely cause is found (`diagnosis.py`).
-Pictures of a dome's LEDs are solved by the tracker of a scene (`dome_pictures.py`).
+(`solver.py`). After a refusal other centroids are tried, and the likely cause is found (`diagnosis.py`).
+Pictures of a dome's LEDs are solved by the tracker of a scene (`plate_solution.py`).
 """
 
-from skysim.apps.plate_solver.dome_pictures import DomeSolution, DomeSolver, make_dome_solver
 from skysim.apps.plate_solver.picture import (
     Outputs,
     annotated_paths,
@@ -17,8 +16,11 @@ from skysim.apps.plate_solver.picture import (
     solve_picture,
 )
 from skysim.apps.plate_solver.plate_solution import (
+    DomeSolution,
+    DomeSolver,
     PlateSolution,
     add_rates,
+    make_dome_solver,
     sequence_summary,
     solution_fields,
     wcs_header,

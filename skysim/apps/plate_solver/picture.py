@@ -16,21 +16,19 @@ from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
-from skysim.apps.plate_solver import diagnosis, retries
-from skysim.apps.plate_solver.dome_pictures import (
+from skysim.apps.plate_solver import diagnosis
+from skysim.apps.plate_solver.plate_solution import (
     DomeReading,
     DomeSolution,
     DomeSolver,
-    dome_fields,
-    make_dome_solver,
-    solve_dome,
-)
-from skysim.apps.plate_solver.plate_solution import (
     PlateSolution,
     attitude_fields,
     camera_notes,
+    dome_fields,
+    make_dome_solver,
     picture_fields,
     solution_fields,
+    solve_dome,
     wcs_header,
 )
 from skysim.apps.plate_solver.solver import (
@@ -416,9 +414,9 @@ def solve_again(refused: list[SolvedReading]) -> SolvedReading | None:
         readings = [one for one in refused if one.hypothesis.flipped == flipped]
         pixels = readings[0].pixels
         settings = readings[0].hypothesis.solver.settings
-        for retry in retries.retries(pixels, readings[0].report.centroids, settings):
+        for retry in diagnosis.retries(pixels, readings[0].report.centroids, settings):
             for one in (one.hypothesis for one in readings):
-                tries = one.solver.hypotheses * retries.EXTRA_TRIES
+                tries = one.solver.hypotheses * diagnosis.EXTRA_TRIES
                 solver = replace(one.solver, hypotheses=tries, upper_half=retry.upper_half)
                 report, tracker = solve_array(pixels, solver, retry.centroids, retry.efforts)
                 if report.attitude.solved:

@@ -8,7 +8,6 @@ from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.time import J2000, Moment
-from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
     BY_KIND,
     AxisAngle,
@@ -16,9 +15,11 @@ from skysim.core.units import (
     Declination,
     Fractions,
     Length,
+    LengthError,
     Magnitude,
     NotEmpty,
     Number,
+    NumberError,
     Position,
     Positive,
     PositiveFraction,

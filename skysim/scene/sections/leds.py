@@ -12,7 +12,6 @@ from pydantic import (
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
-from skysim.core.tolerance import LengthError, NumberError, Tolerance
 from skysim.core.units import (
     BY_KIND,
     AboveZero,
@@ -22,8 +21,10 @@ from skysim.core.units import (
     InnerFraction,
     Intensity,
     Length,
+    LengthError,
     NotNegative,
     Number,
+    NumberError,
     Positive,
     PositiveFraction,
     PositiveInt,
@@ -31,6 +32,7 @@ from skysim.core.units import (
     Several,
     TableConfig,
     Time,
+    Tolerance,
     with_unit,
 )
 

@@ -21,7 +21,6 @@ from pydantic import (
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
-from skysim.core.tolerance import LengthError
 from skysim.core.units import (
     BY_KIND,
     ConfigModel,
@@ -29,6 +28,7 @@ from skysim.core.units import (
     Distance,
     Fraction,
     Length,
+    LengthError,
     Magnitude,
     Number,
     Position,

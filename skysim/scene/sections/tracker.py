@@ -5,15 +5,16 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.tolerance import LengthError, NumberError
 from skysim.core.units import (
     ConfigModel,
     Delay,
     Duration,
     InnerFraction,
+    LengthError,
     Magnitude,
     NotNegative,
     Number,
+    NumberError,
     Options,
     Position,
     Positive,

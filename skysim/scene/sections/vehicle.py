@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from skysim.core.errors import InputError
-from skysim.core.tolerance import NumberError
 from skysim.core.units import (
     AboveZero,
     ConfigModel,
@@ -20,6 +19,7 @@ from skysim.core.units import (
     Mass,
     NotNegative,
     Number,
+    NumberError,
     Position,
     Positive,
     PositiveLength,

@@ -13,8 +13,8 @@ import numpy as np
 
 from skysim.core.constants import HOUR_S, PPM
 from skysim.core.random_streams import LED_CLOCKS, LED_CODE, LED_CODE_CLOCK, random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Sources, frozen
+from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.scene.sections.leds import ClockConfig, Code, DirectConfig, PwmConfig
 from skysim.scene.sections.light import DomeConfig

@@ -14,8 +14,8 @@ from numpy.random import Generator
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.tolerance import Tolerance, scaled_errors
 from skysim.core.types import Floats, Ints, frozen
+from skysim.core.units import Tolerance, scaled_errors
 from skysim.scene.sections.leds import (
     AgingConfig,
     CosineLobeConfig,

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, normalized
+from skysim.core.units import scaled_errors
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.sources.dome.surface import Surface
 

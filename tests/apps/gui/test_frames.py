@@ -31,7 +31,6 @@ from astropy.io import fits
 from skysim.apps.gui.messages import ALL_PIXELS, LIGHT, LIMITS, Display, Pixels
 from skysim.apps.gui.server import Guard
 from skysim.apps.gui.views import overlay as served_module
-from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.overlay import (
     FRAMES,
     KEPT_FRAMES,
@@ -39,6 +38,7 @@ from skysim.apps.gui.views.overlay import (
     TabFrames,
     display_of,
 )
+from skysim.apps.gui.views.widgets import Contents
 from skysim.apps.gui.worker.pixels import (
     BINS,
     SATURATED,

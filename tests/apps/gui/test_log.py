@@ -23,9 +23,9 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.page import log_panel
+from skysim.apps.gui.page import readouts
 from skysim.apps.gui.views import forms
-from skysim.apps.gui.views.live import csv_table
+from skysim.apps.gui.views.widgets import csv_table
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core.errors import InputError
 from skysim.scene import loader
@@ -38,10 +38,10 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     worker = Worker()
     info, view = worker.open("shefex2", {}, True, (40.0, 10.0, 5.0))
     assert view.result is not None
-    line, row = log_panel.identification(view, info)
+    line, row = readouts.identification(view, info)
     assert "identify with noise: solved" in line
     assert f"error {view.result.row.cross_arcsec:.2f}″ across" in line
-    one = dict(zip(log_panel.COLUMNS, row, strict=True))
+    one = dict(zip(readouts.COLUMNS, row, strict=True))
     np.testing.assert_allclose(
         [float(one[f"true_{n}_deg"]) for n in (1, 2, 3)], (40, 10, 5), rtol=0, atol=1e-6
     )
@@ -49,7 +49,7 @@ def test_the_log_has_attitude_and_error_and_the_noise_keeps_the_attitude() -> No
     info, view = worker.open("shefex2", {"camera.detector.noise": "false"}, True)
     np.testing.assert_allclose(view.angles_deg, (40, 10, 5), rtol=0, atol=1e-9)
     assert not info.noise
-    assert "without noise" in log_panel.identification(view, info)[0]
+    assert "without noise" in readouts.identification(view, info)[0]
     assert worker.workbench.frame is not None
     first = worker.workbench.frame.image_dn
     worker.render(False)

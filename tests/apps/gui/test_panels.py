@@ -35,7 +35,6 @@ from skysim.apps.gui.views.overlay import FRAMES, NAMES, TabFrames
 from skysim.apps.gui.views.sensor import SensorView
 from skysim.apps.gui.worker import (
     geometry,
-    image_export,
     photo,
     pixels,
     playback,
@@ -780,9 +779,7 @@ def test_a_session_answers_refuses_bad_input_and_ends_with_its_tab() -> None:
             there = await session.run("point", (10.0, 45.0, 0.0), False)
             np.testing.assert_allclose(there.angles_deg[:2], (10.0, 45.0), rtol=0, atol=1e-9)
             files = await session.run("export")
-            assert set(image_export.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(
-                files
-            )
+            assert set(photo.FILE_BY_ITEM.values()) - {"", "solution.json"} == set(files)
             with pytest.raises(InputError, match=r"x\.exe: allowed"):
                 await session.run("solve_file", "x.exe", b"MZ", None)
             with pytest.raises(InputError, match="no camera found"):
@@ -894,7 +891,7 @@ def test_a_histogram_counts_every_trial_once() -> None:
 
 
 def test_a_saved_scene_names_its_base_first() -> None:
-    text = image_export.scene_yaml(
+    text = photo.scene_yaml(
         "shefex2", {"camera.f_number": "2", "tracker.limit_mag": "5"}, "T"
     )
     assert re.match(

@@ -21,7 +21,7 @@ from skysim.apps.gui.page.plan_panel import (
     survey_lines,
 )
 from skysim.apps.gui.views.style import color_scale
-from skysim.apps.gui.worker import survey_flight as survey
+from skysim.apps.gui.worker import playback as survey
 from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.core import quaternion

@@ -28,7 +28,7 @@ from skysim.apps.cli.options import OPTIONS
 from skysim.apps.gui.page.actions import Command, matching
 from skysim.apps.gui.page.tab import PANELS
 from skysim.apps.gui.views import overlay, style
-from skysim.apps.gui.views.live import LABELS, for_page
+from skysim.apps.gui.views.widgets import LABELS, for_page
 from skysim.apps.gui.worker.study_process import MAX_STUDIES, StudyProcess
 from skysim.apps.gui.worker.workbench import Workbench
 from skysim.core.errors import OVERRIDES, InputError, Where

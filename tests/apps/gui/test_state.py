@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skysim.apps.gui.page import history
-from skysim.apps.gui.views.state import PageView
+from skysim.apps.gui.page import tab
+from skysim.apps.gui.views.context import PageView
 from skysim.core.errors import InputError
 from tests.helpers.labpage import (
     CHROMIUM,
@@ -86,9 +86,9 @@ def test_steps_are_distinguished_from_continuous_changes() -> None:
 def test_a_movement_is_one_undo_step_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """This holds directly after opening a page or an edit."""
     sent: list[str] = []
-    monkeypatch.setattr(history.ui, "run_javascript", sent.append)
+    monkeypatch.setattr(tab.ui, "run_javascript", sent.append)
     shown = SimpleNamespace(state=VIEWS[0])
-    written = history.History.__new__(history.History)
+    written = tab.History.__new__(tab.History)
     written.page = shown
     written.home = "shefex2"
     written.written = None

@@ -25,7 +25,7 @@ import pytest
 from typer.testing import CliRunner
 
 from skysim.apps.cli import main
-from skysim.apps.live import http, sinks
+from skysim.apps.live import http, packets
 from skysim.apps.live.commands import CommandState
 from skysim.apps.live.pacing import Live, Pace
 from skysim.apps.live.packets import Packet, unpack
@@ -133,23 +133,23 @@ def test_a_frame_is_sent_when_due_and_dropped_one_period_later(
 
 def test_late_frames_are_dropped_and_counted(frames: list[np.ndarray]) -> None:
     """With time for every second frame, received frames equal the run's; the header counts dropped ones."""
-    packets: list[Packet] = []
+    received: list[Packet] = []
 
     class Slow(Pace):
         def is_on_time(self, index: int, t_s: float) -> bool:
             return index % 2 == 0
 
-    sink = sinks.Sink("folder", packets.append)
+    sink = packets.Sink("folder", received.append)
     flight = streamed_flight()
     stats = Live(flight, Slow(0.0, 10.0), [sink], CommandState(flight, 0.5, False))
     stats.run()
     sink.close()
-    assert [one.header["index"] for one in packets] == list(range(0, FRAMES, 2))
-    assert [one.header["dropped"] for one in packets] == list(range(FRAMES // 2))
+    assert [one.header["index"] for one in received] == list(range(0, FRAMES, 2))
+    assert [one.header["dropped"] for one in received] == list(range(FRAMES // 2))
     # With the last, after which none came.
     counted = stats.statistics()
     assert (counted["made"], counted["dropped"]) == (FRAMES // 2, FRAMES - FRAMES // 2)
-    for one in packets:
+    for one in received:
         np.testing.assert_array_equal(one.pixels, frames[one.header["index"]])
 
 
@@ -161,7 +161,7 @@ def test_a_slow_sink_delays_nothing_and_its_drops_are_counted() -> None:
         released.wait(10)
         received.append(one.header["dropped"])
 
-    sink = sinks.Sink("slow", take)
+    sink = packets.Sink("slow", take)
     for index in range(20):
         sink.offer(packet(index), patient=False)
     released.set()
@@ -169,7 +169,7 @@ def test_a_slow_sink_delays_nothing_and_its_drops_are_counted() -> None:
     assert sink.sent["frame"] == len(received)
     assert sink.sent["frame"] + sink.dropped["frame"] == 20
     assert sink.dropped["frame"] >= 16  # one at hand, two waiting, one that came between
-    sink = sinks.Sink("gone", lambda _: (_ for _ in ()).throw(BrokenPipeError))
+    sink = packets.Sink("gone", lambda _: (_ for _ in ()).throw(BrokenPipeError))
     sink.offer(packet(0), patient=True)
     sink.close()
     assert (sink.sent, sink.dropped) == ({}, {"frame": 1})
@@ -180,13 +180,13 @@ def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """For example a pipe without a reader."""
-    monkeypatch.setattr(sinks, "CLOSE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(packets, "CLOSE_TIMEOUT_S", 0.3)
     released = threading.Event()
 
     def take(_: Packet) -> None:
         released.wait(30)
 
-    sink = sinks.Sink("stuck", take)
+    sink = packets.Sink("stuck", take)
     for index in range(10):
         sink.offer(packet(index), patient=False)
     sink.close()
@@ -195,7 +195,7 @@ def test_the_packet_of_a_blocked_sink_is_counted_as_dropped(
 
 
 def test_a_failing_sink_reports_its_fault_and_is_not_waited_for() -> None:
-    sink = sinks.Sink("odd", lambda _: (_ for _ in ()).throw(ValueError("no such\nthing")))
+    sink = packets.Sink("odd", lambda _: (_ for _ in ()).throw(ValueError("no such\nthing")))
 
     def send() -> None:
         for index in range(5):
@@ -241,9 +241,9 @@ def test_a_folder_receives_every_frame_with_its_truth(
         )
         assert len(result["truth"]["ids"]) == len(result["truth"]["x_px"]) > 5
     with pytest.raises(InputError, match="holds frames of an earlier flight"):
-        sinks.folder_writer(tmp_path)
+        packets.folder_writer(tmp_path)
     with pytest.raises(InputError, match="not a named pipe"):
-        sinks.pipe_writer(str(tmp_path / "none"))
+        packets.pipe_writer(str(tmp_path / "none"))
 
 
 @pytest.fixture

@@ -11,9 +11,8 @@ from typer.testing import CliRunner
 
 from skysim.apps.cli import main
 from skysim.apps.live.commands import CommandState
-from skysim.apps.live.pacing import Pace
+from skysim.apps.live.pacing import MOST_SAMPLES, PLACE, Pace, PosedLive
 from skysim.apps.live.packets import Packet
-from skysim.apps.live.poses import MOST_SAMPLES, PLACE, PosedLive
 from skysim.apps.live.wire import MOST_LINE_BYTES
 from skysim.core.types import Trajectory
 from skysim.scene import loader

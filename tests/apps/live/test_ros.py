@@ -26,9 +26,8 @@ from rosbags.highlevel import AnyReader
 
 from skysim.apps.cli import main
 from skysim.apps.live.commands import CommandState
-from skysim.apps.live.pacing import Live, Pace
+from skysim.apps.live.pacing import Live, Pace, PosedLive
 from skysim.apps.live.packets import Packet
-from skysim.apps.live.poses import PosedLive
 from skysim.apps.live.ros import TOPICS, TRUE_TOPICS, FoxgloveSink, McapSink, RosEncoder
 from skysim.core.errors import InputError
 from skysim.scene import loader

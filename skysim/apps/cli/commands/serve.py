@@ -18,7 +18,7 @@ from skysim.core.errors import InputError
 if TYPE_CHECKING:
     from skysim.apps.live.display_pattern import DisplayPicture
     from skysim.apps.live.pacing import Live
-    from skysim.apps.live.sinks import Output
+    from skysim.apps.live.packets import Output
 
 
 PORTS = {"min": 0, "max": 65535}
@@ -96,9 +96,8 @@ def live(
     options = locals()
     from skysim.apps.access import LOOPBACK
     from skysim.apps.live.commands import CommandState
-    from skysim.apps.live.pacing import Live, Pace
-    from skysim.apps.live.poses import PosedLive
-    from skysim.apps.live.sinks import READER_GONE
+    from skysim.apps.live.pacing import Live, Pace, PosedLive
+    from skysim.apps.live.packets import READER_GONE
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
@@ -185,13 +184,13 @@ class Opening(NamedTuple):
 
 
 def open_folder(opening: Opening, path: Path) -> Output:
-    from skysim.apps.live.sinks import Sink, folder_writer
+    from skysim.apps.live.packets import Sink, folder_writer
 
     return Sink("folder", folder_writer(path))
 
 
 def open_pipe(opening: Opening, path: str) -> Output:
-    from skysim.apps.live.sinks import Sink, pipe_writer
+    from skysim.apps.live.packets import Sink, pipe_writer
 
     return Sink("pipe", pipe_writer(path))
 

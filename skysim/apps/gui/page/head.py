@@ -5,9 +5,9 @@ from pathlib import Path
 from nicegui import ui
 
 from skysim.apps.gui.messages import SceneInfo
-from skysim.apps.gui.views import context, forms, live, widgets
-from skysim.apps.gui.views.state import PageView
-from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.views import context, forms, widgets
+from skysim.apps.gui.views.context import PageView
+from skysim.apps.gui.worker import photo
 from skysim.core.paths import SCENES, shipped_files
 
 
@@ -26,7 +26,7 @@ class Head:
             )
             self.picker.props('aria-label="Scene"').classes("w-44").mark("scene")
             self.banner = (
-                live.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
+                widgets.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
             )
             self.live_button = widgets.button("Live", self.go_live, "live")
             self.live_button.set_visibility(False)
@@ -38,7 +38,7 @@ class Head:
                 ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
             )
             page.latency = (
-                live.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
+                widgets.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
             )
             page.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
@@ -46,7 +46,7 @@ class Head:
             )
             page.identifying = ui.switch("identify", value=True).props("dense size=xs")
             with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
-                for name in image_export.FILE_BY_ITEM:
+                for name in photo.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")
 
@@ -116,11 +116,9 @@ class Head:
         files = await self.page.run_task("export")
         if not files:
             return
-        name = image_export.FILE_BY_ITEM[item]
+        name = photo.FILE_BY_ITEM[item]
         if not name:
-            ui.download(
-                image_export.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip"
-            )
+            ui.download(photo.zip_archive(files), f"{Path(self.page.state.scene).stem}.zip")
         elif name in files:
             ui.download(files[name], name)
         else:

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from nicegui import run, ui
 from pydantic import ValidationError
 
-from skysim.apps.gui.views import context, forms, keys, live, style, widgets
+from skysim.apps.gui.views import context, forms, keys, style, widgets
 from skysim.apps.gui.worker.study_process import (
     NO_RESULTS,
     PAGE_STUDY,
@@ -322,7 +322,7 @@ class MonteCarloPanel:
     def show(self, results: StudyResults) -> None:
         self.bar.set_value(results.done / max(self.process.total, 1))
         self.chart.options["xAxis"]["data"] = [
-            live.format_number(center) for center in results.bins
+            widgets.format_number(center) for center in results.bins
         ]
         self.chart.options["series"][0]["data"] = list(results.counts)
         empty = "no trial solved" if results.done else "no trials yet"

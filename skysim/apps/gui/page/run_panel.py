@@ -14,7 +14,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
-from skysim.apps.gui.views import context, forms, live, widgets
+from skysim.apps.gui.views import context, forms, widgets
 from skysim.results import scoring
 from skysim.scene.scene import Scene
 
@@ -98,14 +98,14 @@ class RunPanel:
             "instant-feedback"
         )
         with widgets.row(3):
-            self.seek = live.LiveInput(self.page.contents, "range").props(
+            self.seek = widgets.LiveInput(self.page.contents, "range").props(
                 'min=0 step=1 aria-label="Frame of the flight"'
             )
             self.seek.classes("lab-seek").on(
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
             self.clock = (
-                live.LiveText(self.page.contents).classes("mono flex-none").mark("clock")
+                widgets.LiveText(self.page.contents).classes("mono flex-none").mark("clock")
             )
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
@@ -379,7 +379,7 @@ class RunPanel:
         assert self.page.scene_info
         table = flight_table(self.rows, self.page.scene_info.scene)
         ui.download(
-            live.csv_table(table.colnames, table),
+            widgets.csv_table(table.colnames, table),
             f"{Path(self.page.state.scene).stem}_flight.csv",
         )
 

@@ -6,7 +6,7 @@ from functools import partial
 
 from nicegui import run, ui
 
-from skysim.apps.gui.views import context, forms, keys, live, widgets
+from skysim.apps.gui.views import context, forms, keys, widgets
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 
@@ -192,7 +192,7 @@ class KeyForm:
                 forms.with_value, self.page.state.scene, before, key, value
             )
         except InputError as error:
-            self.show_error(key, error.fault if error.key == key else live.for_page(error))
+            self.show_error(key, error.fault if error.key == key else widgets.for_page(error))
             return
         changed = {one: text for one, text in after.items() if before.get(one) != text}
         await self.page.apply_overrides(changed, before.keys() - after.keys())

@@ -9,8 +9,8 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
-from skysim.apps.gui.views.live import Contents
 from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
+from skysim.apps.gui.views.widgets import Contents
 from skysim.core.types import Record, frozen
 
 BAND_COLOR = "#8b95a5"

@@ -1,8 +1,14 @@
-"""The page of a browser tab: builds its parts, opens scenes, and shows frames in all views."""
+"""The page of a browser tab: builds its parts, opens scenes, and shows frames in all views.
+
+Its view is in the browser's address, history and storage (`History`). The browser's history serves for undo and redo:
+Ctrl-Z goes back, Ctrl-Shift-Z forward. So a reload, the back button, a shared link and undo all read a view from the
+address in the same way.
+"""
 
 import asyncio
+import json
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,8 +19,6 @@ from nicegui import app, run, ui
 from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
 from skysim.apps.gui.page import (
     head,
-    history,
-    log_panel,
     monte_carlo_panel,
     photo_panel,
     plan_panel,
@@ -27,15 +31,14 @@ from skysim.apps.gui.views import (
     context,
     forms,
     keys,
-    live,
     overlay,
     sensor,
     space,
     style,
     widgets,
 )
-from skysim.apps.gui.views.state import PageView
-from skysim.apps.gui.worker import image_export
+from skysim.apps.gui.views.context import PageView
+from skysim.apps.gui.worker import photo
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
 from skysim.core.errors import InputError
@@ -69,7 +72,7 @@ class Tab(context.PageContext):
         self.out = out
         self.cameras = cameras
         self.state = PageView(scene)
-        self.contents = live.Contents()
+        self.contents = widgets.Contents()
         self.editing = asyncio.Lock()
         self.filling = asyncio.Lock()
 
@@ -131,7 +134,7 @@ class Tab(context.PageContext):
                             sanitize=False,
                         )
         await asyncio.sleep(PAUSE_S)
-        self.history = history.History(self, self.show_query, self.is_settling)
+        self.history = History(self, self.show_query, self.is_settling)
         self.end_step = self.history.end_step
         self.arrangement = head.Arrangement(
             [self.run_panel.strips.chart, self.study_panel.chart]
@@ -176,7 +179,7 @@ class Tab(context.PageContext):
                 with ui.tab_panel("Image"):
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
-                    self.log_panel = log_panel.LogPanel(self)
+                    self.log_panel = readouts.LogPanel(self)
                     self.log = self.log_panel.add
         self.forms = {"Scene": scene_panel, "Tracker": self.tracker_panel}
         self.tabs.on_value_change(self.fill_form)
@@ -222,7 +225,7 @@ class Tab(context.PageContext):
             *(Command(f"panel: {name}", partial(self.show_panel, name)) for name in PANELS),
             *(
                 Command(f"export: {name}", partial(self.head.export, name))
-                for name in image_export.FILE_BY_ITEM
+                for name in photo.FILE_BY_ITEM
             ),
         ]
 
@@ -269,7 +272,7 @@ class Tab(context.PageContext):
             if wanted:
                 await asyncio.to_thread(forms.validated_scene, *wanted.opened)
         except InputError as error:
-            self.show_message(live.for_page(error))
+            self.show_message(widgets.for_page(error))
             return
         if wanted:
             await self.restore(wanted)
@@ -396,3 +399,135 @@ class Tab(context.PageContext):
         self.run_panel.pause()
         self.scene_3d.push.stop()
         self.photo.stop()
+
+
+SETTLED = (
+    3  # number of timer calls without a change after which the next change is a new step
+)
+WRITE_S = 0.4  # interval of the timer; browsers refuse more than about 200 entries in 30 s
+HISTORY_JS = """
+window.skysimHistory = {
+  index: () => (history.state && history.state.skysim) || 0,
+  write(query, push, home) {
+    const at = this.index() + (push ? 1 : 0);
+    history[push ? "pushState" : "replaceState"]({ skysim: at }, "", query);
+    try { localStorage.setItem("skysim.view", JSON.stringify({ home, query })); } catch { /* storage is off */ }
+  },
+  read(home) {
+    if (/[?&]scene=/.test(location.search)) return location.search;
+    try {
+      const kept = JSON.parse(localStorage.getItem("skysim.view") || "{}");
+      return kept.home === home ? kept.query : "";
+    } catch { return ""; }
+  },
+  undo() { if (this.index() > 0) history.back(); },
+  redo() { history.forward(); },
+};
+window.addEventListener("popstate", () => emitEvent("view", location.search));
+document.addEventListener("keydown", event => {
+  const typing = event.target.closest && event.target.closest("input, textarea, [contenteditable]");
+  if (typing || !(event.ctrlKey || event.metaKey)) return;
+  const key = event.key.toLowerCase(), redo = key === "y" || (key === "z" && event.shiftKey);
+  if (key !== "z" && key !== "y") return;
+  event.preventDefault();
+  skysimHistory[redo ? "redo" : "undo"]();
+}, true);
+"""
+
+
+class History:
+    """Writes a page's view to the browser, and shows the view of an address.
+
+    Attributes
+    ----------
+    home
+        The server's scene; a stored view is used only by a server of the same scene
+    show_query
+        Function that shows the view of an address
+    is_settling
+        Function that returns whether the page does not yet show its view
+    written
+        View in the address
+    pending
+        Newest query that was requested while another one is being shown
+    moving
+        Whether the last change was only of attitude or time
+    unchanged
+        Number of timer calls since the last change
+    """
+
+    written: context.PageView | None = None
+    showing = False
+    moving = False
+    unchanged = 0
+    pending: str | None = None
+
+    def __init__(
+        self,
+        page: context.PageContext,
+        show_query: Callable[[str], Awaitable[None]],
+        is_settling: Callable[[], bool],
+    ) -> None:
+        self.page = page
+        self.home = page.state.scene
+        self.show_query = show_query
+        self.is_settling = is_settling
+        ui.add_body_html(f"<script>{HISTORY_JS}</script>")
+        ui.on("view", self.asked)
+        ui.timer(WRITE_S, self.write)
+
+    async def read(self) -> str:
+        """The query of the page's address; if it has none, that of the stored view."""
+        return str(
+            await ui.run_javascript(
+                f"skysimHistory.read({json.dumps(self.home)})", timeout=10
+            )
+            or ""
+        )
+
+    def write(self) -> None:
+        """Timer: write a changed view. A continued movement replaces the address; other changes add a step."""
+        view = self.page.state
+        if view is self.written or self.showing or self.is_settling():
+            self.unchanged += 1
+            return
+        before = self.written
+        self.written = view
+        moves = before is not None and view.same_step(before)
+        goes_on = moves and self.moving and self.unchanged < SETTLED
+        push = before is not None and before != view and not goes_on
+        self.moving = moves
+        self.unchanged = 0
+        arguments = ", ".join(json.dumps(value) for value in (view.query(), push, self.home))
+        ui.run_javascript(f"skysimHistory.write({arguments})")
+
+    def end_step(self) -> None:
+        """Make the next change of attitude a step of its own, because another action makes it."""
+        self.write()
+        self.moving = False
+
+    def undo(self) -> None:
+        ui.run_javascript("skysimHistory.undo()")
+
+    def redo(self) -> None:
+        ui.run_javascript("skysimHistory.redo()")
+
+    def adopt(self) -> None:
+        """Take the page's view as the one that is already in the address."""
+        self.written = self.page.state
+        self.moving = False
+
+    async def asked(self, event: Any) -> None:
+        """Show the view after the browser has gone to another address of this page; if to several, the newest one."""
+        self.pending = str(event.args)
+        if self.showing:
+            return
+        self.showing = True
+        try:
+            while self.pending is not None:
+                query = self.pending
+                self.pending = None
+                await self.show_query(query)
+                self.adopt()
+        finally:
+            self.showing = False

@@ -363,7 +363,7 @@ def loop_overrides(name: str, overrides: OverrideTexts, feedback: str) -> dict[s
 
 def save(folder: Path, name: str, base: str, overrides: OverrideTexts, title: str) -> Path:
     """Save a new scene file that consists of a base and overrides. Raises InputError, also if the file exists."""
-    from skysim.apps.gui.worker.image_export import base_reference, scene_yaml
+    from skysim.apps.gui.worker.photo import base_reference, scene_yaml
     from skysim.core import files
 
     if not re.fullmatch(r"[A-Za-z0-9][\w-]{0,60}", name):

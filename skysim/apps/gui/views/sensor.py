@@ -24,7 +24,7 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import live, overlay, widgets
+from skysim.apps.gui.views import overlay, widgets
 from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
 from skysim.core.types import Floats, Record
@@ -79,7 +79,7 @@ class SensorView:
     hover_px: tuple[float, float] | None = None
     sent_number = 0
 
-    def __init__(self, id: str, contents: live.Contents) -> None:
+    def __init__(self, id: str, contents: widgets.Contents) -> None:
         self.id = id
         self.contents = contents
         self.shown = {"truth", "identified", "false"}
@@ -90,7 +90,7 @@ class SensorView:
         with widgets.div("lab-sensor"):
             self.build_controls()
             with Canvas().mark("sensor") as self.canvas:
-                self.hover = live.LiveText(contents).classes("mono").mark("hover")
+                self.hover = widgets.LiveText(contents).classes("mono").mark("hover")
             with self.canvas.add_slot("wait"), widgets.div("lab-wait") as self.wait:
                 # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
                 self.waited = widgets.div("lab-waited mono")

@@ -1,23 +1,56 @@
-"""A scene's flight: its motion and all its frames, computed piece by piece and kept for playback."""
+"""A scene's flight: its motion and all its frames, computed piece by piece and kept for playback.
+
+A survey of the dome in the page flies such a flight: attitudes to hold, frames flown at them, and results.
+"""
+
+from __future__ import annotations
 
 import math
 import pickle
 import tempfile
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from estimator.calibration.survey_plan import SurveyAccuracy
+from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Report
-from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, FrameView, Residual
+from skysim.apps.gui.messages import (
+    Curves,
+    FlightRow,
+    FlightStep,
+    FrameView,
+    PlanStep,
+    Residual,
+    SurveyFound,
+    SurveyPlan,
+)
 from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, Mount, Telemetry
+from skysim.core.errors import InputError
+from skysim.core.types import Bools, Floats, Frame, Mount, Telemetry
+from skysim.dynamics import guidance
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_findings,
+    survey_frames,
+    survey_procedure,
+    survey_report,
+)
 from skysim.results import telemetry_report
+from skysim.results.telemetry_report import euler_deg
+from skysim.scene.scene import Scene
+from skysim.scene.sections.motion import HoldConfig, SlewConfig
 from skysim.simulation.flight import Flight, Shot
+from skysim.simulation.lab import Lab
+from skysim.tracking import dome_map_file, onboard_model
+from skysim.tracking import factory as tracker_settings
 
 MAX_POINTS = 500  # approximate maximum number of points of a curve on the page
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
@@ -191,3 +224,219 @@ def curves(log: Telemetry) -> Curves:
 def angle_arcsec(first: Rotation, second: Rotation) -> float:
     """Angle of the rotation from one attitude to another."""
     return float((first.inv() * second).magnitude()) / ARCSEC_RAD
+
+
+SURVEY_TILT_DEG = 25.0  # greatest tilt of a survey, if the vehicle's stop allows it
+MAX_STOPS = 200
+REST_PX = 1.0  # maximum motion of the image during an exposure for a vehicle at rest
+UNCERTAINTY = survey_frames.survey_uncertainty()  # as `skysim survey` assumes by default
+
+
+@dataclass
+class Survey:
+    """A survey of a scene's dome, with the uncertainties that `skysim survey` assumes.
+
+    Attributes
+    ----------
+    lab, before
+        Lab with the errors of the onboard model before the survey, and this model
+    noise_px
+        Standard deviation of a centroid's coordinates, by which attitudes are chosen
+    taken
+        Frames that were flown
+    run
+        Last adjustment that succeeded
+    """
+
+    scene: Scene
+    lab: Lab
+    before: survey_frames.CalibrationPrior
+    noise_px: float
+    taken: list[TakenFrame] = field(default_factory=list)
+    run: survey_findings.SurveyRun | None = None
+
+    def is_of(self, scene: Scene) -> bool:
+        """Whether a scene is the surveyed one, apart from its sections `motion` and `exposure`."""
+        return self.scene.with_values(motion=scene.motion, exposure=scene.exposure) == scene
+
+    def adjust(self, flight: Flight, views: Sequence[FrameView], count: int) -> SurveyFound:
+        """Adjust the dome to all frames so far and those of a flight, and plan `count` further attitudes.
+
+        Parameters
+        ----------
+        views
+            The frames of the flight so far, in order
+
+        Raises
+        ------
+        InputError
+            If the flight has no further frames; the survey then remains unchanged.
+        """
+        allow(count)
+        new, missed = self.new_frames(flight, views)
+        taken = [*self.taken, *new]
+        # Frames with the IMU's attitudes.
+        measured = survey_frames.imu_attitudes(
+            self.scene,
+            Rotation.concatenate([frame.lab_from_body for frame in taken]),
+            UNCERTAINTY.imu_sigma_rad,
+        )
+        frames = [
+            survey_frames.SurveyFrame(frame.lights, at, frame.row)
+            for frame, at in zip(taken, measured, strict=True)
+        ]
+        try:
+            run = adjust.run_survey(frames, self.before)
+            refusal = ""
+            so_far = survey_findings.coverage(run)
+        except InputError as error:
+            run = None
+            refusal = str(error)
+            so_far = survey_findings.coverage_before(frames, self.before, self.noise_px)
+        statistics = survey_findings.coverage_statistics(so_far)
+        del statistics["by_led"]
+        statistics |= {"frames": len(taken), "missed": missed, "refusal": refusal}
+        faults: list[str] = []
+        if run:
+            statistics |= survey_report.truth_statistics(run, self.before, self.lab)
+            statistics["connected"] = int(run.survey.tied.sum())
+            statistics["sigma_mm"] = 1e3 * run.accuracy.led_rms_m
+            faults += survey_findings.fault_lines(survey_findings.find_faults(run))
+        # Attitudes to hold next.
+        further = survey_findings.next_stops(
+            self.scene, so_far, self.before.margin_px, count, tilt_deg(self.scene)
+        )
+        step = plan_step(len(taken) + len(further.shown), further.accuracy)
+        plan = survey_plan(further.lab_from_body, further.shown, (step,))
+        self.taken = taken
+        self.run = run or self.run
+        return SurveyFound(statistics, faults, so_far.model.leds.id, known_share(run), plan)
+
+    def new_frames(
+        self, flight: Flight, views: Sequence[FrameView]
+    ) -> tuple[list[TakenFrame], int]:
+        """The frames of a flight at which the vehicle rests, one per hold, and the number of holds without one.
+
+        Raises
+        ------
+        InputError
+            If there are none, or the survey already has them.
+        """
+        rows, holds = frames_at_rest(flight, views)
+        if not rows:
+            raise InputError(
+                "survey",
+                f"the vehicle rests at none of the flight's {holds} holds",
+                "a flight of the survey's attitudes with a vehicle that holds them, such as motion.control: prescribed",
+            )
+        known = {frame.row for frame in self.taken if frame.flown == flight.lab.scene}
+        if known >= set(rows):
+            raise InputError(
+                "survey", "it has the frames of this flight", "a flight of the next attitudes"
+            )
+        settings = tracker_settings.assumed_settings(self.lab.scene)
+        camera = onboard_model.assumed_camera(self.lab.scene)
+        new = []
+        for row in (row for row in rows if row not in known):
+            frame, _ = flight.render(row)
+            lab_from_body = quaternion.to_rotation(views[row].body_wxyz)
+            lights = survey_frames.detect_lights(settings, camera, frame.image_dn)
+            new.append(TakenFrame(flight.lab.scene, row, lab_from_body, lights))
+        return new, holds - len(rows)
+
+    def map_file(self) -> bytes:
+        """The measured LEDs, lever arm and lens as the file for `tracker.map`. Raises InputError if there are none."""
+        if self.run is None:
+            raise InputError(
+                "", "the survey has measured no LED yet: fly its attitudes, then adjust"
+            )
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "leds.ecsv"
+            dome_map_file.write_dome_map(path, adjust.dome_map(self.run))
+            return path.read_bytes()
+
+
+class TakenFrame(NamedTuple):
+    """A frame of a survey: the scene that was flown, its number in it, the true attitude, and its detections."""
+
+    flown: Scene
+    row: int
+    lab_from_body: Rotation
+    lights: Centroids
+
+
+def begin(scene: Scene, frames: int) -> tuple[Survey, SurveyPlan]:
+    """A new survey of a scene's dome and its first attitudes. Raises InputError."""
+    allow(frames)
+    lab, before, plan = survey_procedure.plan_survey(
+        scene, UNCERTAINTY, frames, tilt_deg(scene)
+    )
+    steps = tuple(plan_step(*step) for step in plan.steps())
+    survey = Survey(scene, lab, before, plan.model.sigma_px)
+    return survey, survey_plan(plan.lab_from_body, plan.shown, steps)
+
+
+def allow(frames: int) -> None:
+    """Raise InputError for a number of frames that is not allowed."""
+    if not 2 <= frames <= MAX_STOPS:
+        raise InputError("frames", frames, f"2 to {MAX_STOPS}")
+
+
+def tilt_deg(scene: Scene) -> float:
+    """Greatest tilt of a survey's attitudes."""
+    return min(SURVEY_TILT_DEG, scene.vehicle.tilt_stop_deg)
+
+
+def survey_plan(
+    lab_from_body: Rotation, shown: Bools, steps: tuple[PlanStep, ...]
+) -> SurveyPlan:
+    """Return a plan in the form of the page.
+
+    Parameters
+    ----------
+    shown
+        (F, N) whether an attitude shows an LED
+    """
+    angles = euler_deg(lab_from_body).tolist()
+    return SurveyPlan(angles, shown.sum(axis=1).tolist(), shown.shape[1], steps)
+
+
+def plan_step(count: int, accuracy: SurveyAccuracy) -> PlanStep:
+    """Number of frames; predicted after them, the number of LEDs measured and their rms error in mm."""
+    statistics = survey_findings.accuracy_statistics(accuracy)
+    return count, int(statistics["measured"] or 0), statistics["led_mm"]
+
+
+def known_share(run: survey_findings.SurveyRun | None) -> Floats:
+    """(N,) reduction of each LED's uncertainty by a survey, from 0 (not measured) to 1; (0,) without a survey."""
+    if run is None:
+        return np.zeros(0)
+    share = 1 - run.accuracy.led_sigma_m / UNCERTAINTY.led_sigma_m
+    return np.where(run.accuracy.measured, np.clip(share, 0.0, 1.0), 0.0)
+
+
+def frames_at_rest(flight: Flight, views: Sequence[FrameView]) -> tuple[list[int], int]:
+    """Return the row of the last frame at rest in each hold of a flight, and the number of holds.
+
+    A frame is at rest if the image moves by less than REST_PX during its exposure. The true rate decides, since a
+    controller may not reach the attitude or may not hold it. A hold without a frame at rest has no row.
+    """
+    scene = flight.lab.scene
+    motion = scene.motion
+    if not flight.is_over or not all(
+        isinstance(one, SlewConfig | HoldConfig) for one in motion.maneuver
+    ):
+        return [], 0
+    reference = guidance.plan(motion)
+    by_hold: dict[int, int] = {}
+    holds = {leg for leg, one in enumerate(motion.maneuver) if isinstance(one, HoldConfig)}
+    for row, view in enumerate(views):
+        assert view.result is not None  # every frame of a flight is solved
+        middle_s = view.result.row.t_s
+        half_s = view.exposure_s / 2
+        leg = int(np.searchsorted(reference.start_s, middle_s - half_s, side="right")) - 1
+        if leg in holds and middle_s + half_s <= reference.start_s[leg + 1]:
+            rate_rad_s = np.linalg.norm(flight.trajectory().rate_at(middle_s))
+            if rate_rad_s * view.exposure_s * scene.camera.focal_px < REST_PX:
+                by_hold[leg] = row
+    return list(by_hold.values()), len(holds)

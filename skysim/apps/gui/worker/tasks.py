@@ -21,11 +21,9 @@ from skysim.apps.gui.messages import (
 )
 from skysim.apps.gui.worker import (
     geometry,
-    image_export,
     photo,
     pixels,
     playback,
-    survey_flight,
 )
 from skysim.apps.gui.worker.workbench import Workbench, ambiguity
 from skysim.core import images
@@ -65,7 +63,7 @@ class Worker:
     number: int = 0
     flight: playback.Playback | None = None
     pushed: geometry.Push | None = None
-    surveyed: survey_flight.Survey | None = None
+    surveyed: playback.Survey | None = None
     other: photo.PhotoPixels | None = None
     scene: str = ""
     overrides: dict[str, str] = field(default_factory=dict)
@@ -99,7 +97,7 @@ class Worker:
         )
 
     @property
-    def survey_of_scene(self) -> survey_flight.Survey:
+    def survey_of_scene(self) -> playback.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
         if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
             raise InputError("", "no survey of this scene: plan one")
@@ -195,7 +193,7 @@ class Worker:
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
-        self.surveyed, plan = survey_flight.begin(self.workbench.scene, frames)
+        self.surveyed, plan = playback.begin(self.workbench.scene, frames)
         return plan
 
     def adjust_survey(self, frames: int) -> SurveyFound:
@@ -235,14 +233,14 @@ class Worker:
     def export(self) -> dict[str, bytes]:
         """The files of the image on the page."""
         if self.other:
-            return image_export.photo_files(*self.other)
+            return photo.photo_files(*self.other)
         bench = self.workbench
         overrides = self.overrides | bench.scene_at_rest()
         if self.flight:
             self.flight.render()
             if self.flight.is_shown:
                 overrides = self.overrides
-        return image_export.frame_files(bench, self.scene, overrides)
+        return photo.frame_files(bench, self.scene, overrides)
 
     def solve_file(
         self, name: str, data: bytes, fov_deg: float | None, stages: photo.Stages = ()

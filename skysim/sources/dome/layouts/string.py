@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.tolerance import scaled_errors
 from skysim.core.types import Floats, Ints, Sources, normalized
+from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.sources.dome.layouts.placing import PlacedLeds, dimmed, project_from_bearing
 from skysim.sources.dome.surface import Surface, directions, perpendicular
