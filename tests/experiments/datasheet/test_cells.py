@@ -359,7 +359,7 @@ def test_a_refusal_names_fields_of_which_enough_would_be_solved(
 def test_a_state_s_temperatures_are_those_of_its_history():
     """A table's from its first to its last hour, a steady one's alone, and equal parts of a day."""
     base = {"thermal.mount_arcsec_k": "[1, 0, 0]"}
-    table = "{kind: table, hours: [2, 6], temperature_c: [10, 30]}"
+    table = "{kind: table, hours: [2, 3, 6], temperature_c: [10, 15, 30]}"
     scene = load("shefex2", base | {"thermal.temperature": table})
     assert states_c(scene, 5) == pytest.approx([10, 15, 20, 25, 30])
     steady = "{kind: steady, temperature_c: 12}"
