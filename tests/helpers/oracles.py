@@ -39,7 +39,6 @@ from skysim.simulation.exposure import render_at_rest
 from skysim.simulation.lab import build_lab
 from skysim.tracking import factory, onboard_model
 from skysim.tracking import tetra3rs as tetra3rs_tracker
-from skysim.tracking.tracker_interface import Stars
 
 # Epochs of the catalogs: Tycho-2 in the index files, and Gaia; both are used without proper motions.
 EPOCHS = {"astrometry.net": "2000-01-01T12:00:00", "tetra3rs": "2016-01-01T12:00:00"}
@@ -357,13 +356,9 @@ def tetra3rs(name: str) -> Solve | None:
         return None
     scene = load(name, "tetra3rs", 1)
     camera = onboard_model.assumed_camera(scene)
-    settings = factory.assumed_settings(scene)
-    nothing = np.zeros(0)
-    tracker = tetra3rs_tracker.Tetra3rs(
-        factory.build_setup(
-            scene, camera, settings, Stars(nothing.astype(int), nothing, nothing)
-        )
-    )
+    lab = build_lab(scene)
+    setup = factory.setup_of(scene, lab.camera.mount, lab.camera.sources)
+    tracker = tetra3rs_tracker.Tetra3rs(setup)
     pixels = lattice(camera.width_px, camera.height_px) - tracker.image_center_px
 
     def solve(path: Path, frame: Frame) -> Found | None:
