@@ -237,7 +237,11 @@ def read(name_or_path: str | Path) -> Catalog:
 
 def read_meta_and_lines(path: Path) -> tuple[Record, list[str]]:
     """The header's meta, and the lines below the header, the column names first. Raises InputError."""
-    lines = [line for line in read_limited(path, MAX_BYTES).splitlines() if line]
+    try:
+        text = read_limited(path, MAX_BYTES)
+    except InputError as error:
+        raise catalog_error(path, error.problem) from error
+    lines = [line for line in text.splitlines() if line]
     # Comments end where the column names begin.
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     # The header must state what `read` needs.

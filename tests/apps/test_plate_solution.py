@@ -140,9 +140,7 @@ def test_a_list_of_lights_gives_the_attitude_of_its_picture(
     ):
         skysim.solve(lights)
     lights.write_text("x,y\n1,2\n")
-    with pytest.raises(
-        InputError, match=r"lights\.csv: cannot be read: .*x_px.*; allowed: columns x_px"
-    ):
+    with pytest.raises(InputError, match=r"lights\.csv: no lights; allowed: columns x_px"):
         skysim.solve(lights, camera="shefex2")
 
 

@@ -223,7 +223,7 @@ main()
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
-    "module", ["typer", "estimator.core.errors", "skysim.apps.cli.commands.survey"]
+    "module", ["typer", "estimator.core.errors", "skysim.apps.cli.commands.solve"]
 )
 def test_a_signal_during_the_imports_of_the_command_is_one_line(
     number: signal.Signals, module: str

@@ -175,7 +175,7 @@ def test_other_encodings_archives_and_pipes_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "v.xml"
     pipe = tmp_path / "pipe.xml"
     path.write_bytes(whole(OUT).encode("utf-16"))
-    with pytest.raises(InputError, match="not a MuJoCo model: 'utf-8' codec"):
+    with pytest.raises(InputError, match="not a MuJoCo model: not text in UTF-8"):
         mjcf.load(path)
     path.write_text(whole('<asset><model name="c" file="c.mjz"/></asset>'))
     (tmp_path / "c.mjz").write_bytes(b"PK\x03\x04")

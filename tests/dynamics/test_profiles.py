@@ -917,7 +917,7 @@ def test_an_stk_file_without_an_epoch_counts_from_the_maneuver(tmp_path: Path) -
             stk(MOTION, "AttitudeTimeYPRAngles"),
             "line 9: unknown data 'AttitudeTimeYPRAngles'; allowed: AttitudeTimeQ",
         ),
-        (stk(MOTION, more=" 1"), "line 10: 6 numbers; allowed: 5"),
+        (stk(MOTION, more=" 1"), "line 10: 6 values; allowed: 5"),
         (
             stk(MOTION).replace("BEGIN Attitude", "BEGIN Ephemeris"),
             "line 3: 'BEGIN Ephemeris'; allowed: BEGIN Attitude",

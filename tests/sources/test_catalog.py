@@ -230,13 +230,13 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, how: str) -> None
     message = str(refusal.value)
     assert "\n" not in message
     assert str(path) in message
-    names_line = how in ("cut in a line", "a word for a number")
+    names_line = how == "a word for a number"
     assert (", line " if names_line else "built by skysim") in message
 
 
 def test_a_missing_catalog_is_named() -> None:
     with pytest.raises(
-        InputError, match=r"hipparcos_hp99\.ecsv: not found; allowed: a star catalog"
+        InputError, match=r"hipparcos_hp99\.ecsv: cannot be read: .*; allowed: a star catalog"
     ):
         catalog.read("hipparcos_hp99")
 

@@ -447,7 +447,10 @@ def test_a_user_s_curve_is_read_again_when_its_file_changes(tmp_path: Path) -> N
 def test_a_file_that_is_not_a_curve_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "bad.csv"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"^.*bad\.csv: not a response curve.*$"):
+    with pytest.raises(
+        InputError,
+        match=r"^.*bad\.csv(: not a response curve|: fewer than two rows|, line 2: ).*$",
+    ):
         Band.from_efficiency(str(path))
 
 
@@ -588,9 +591,7 @@ def test_a_measured_spectrum_matches_its_colored_or_white_led(tmp_path: Path) ->
 def test_a_spectrum_with_unbounded_power_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "bad.csv"
     path.write_text("wavelength_nm,power\n400,1\n500,inf\n")
-    with pytest.raises(
-        InputError, match=r"not a response curve; allowed: .* within 0 and inf"
-    ):
+    with pytest.raises(InputError, match=r"line 3: 'inf' is not a finite number"):
         led_strength_e_s_sr(0.3, str(path), ALL)
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import tempfile
 from dataclasses import FrozenInstanceError
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +22,7 @@ from estimator.attitude import dome_map
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.catalog.catalog import StarCatalog
-from estimator.core import checks
+from estimator.core import checks, errors
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.core.vectors import rotation_of
@@ -422,3 +424,25 @@ def test_a_rotation_without_scipy_s_checks_is_the_same(rng: np.random.Generator)
     place = rng.standard_normal((3, 3))
     np.testing.assert_array_equal(made.apply(place), known.apply(place))
     np.testing.assert_array_equal((made * known.inv()).as_quat()[:3], np.zeros(3))
+
+
+@law(errors.file_bytes, errors.reason)
+@given(content=some.binary(max_size=30))
+def test_a_file_is_read_whole_and_text_in_another_encoding_is_named_by_its_byte(
+    content: bytes,
+) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "file"
+        path.write_bytes(content)
+        assert errors.file_bytes(path) == content
+        with pytest.raises(OSError, match="no such file"):
+            errors.file_bytes(folder)
+    try:
+        content.decode()
+    except UnicodeDecodeError as error:
+        place = int(errors.reason(error).rpartition(" ")[2])
+        # All before it is text, and with it not.
+        content[: place - 1].decode()
+        assert content[: place - 1].decode().encode() + content[place - 1 :] == content
+    assert errors.reason(OSError(28, "No space left on device")) == "No space left on device"
+    assert errors.reason(ValueError("a word")) == "a word"

@@ -345,7 +345,7 @@ def test_uninformative_frames_are_refused_in_one_line(
         ("file\na.png\n", "no exposures; allowed: columns file, exposure_s"),
         ("file,exposure_s\na.png,1,2\n", "line 2: 3 values; allowed: 2"),
         ("file,exposure_s\na.png,soon\n", "'soon' is not a number"),
-        ("file,exposure_s\na.png,1\na.png,2\n", "'a.png' occurs twice"),
+        ("file,exposure_s\na.png,1\na.png,2\n", "'a.png' is in line 2 too"),
         ("file,exposure_s\na.png,-1\n", "an exposure below 0"),
     ],
 )

@@ -64,6 +64,7 @@ def test_a_cause_is_taken_away_and_everything_else_stays() -> None:
         "no coma": lambda one: one.camera.psf.coma_px,
         "even pixels": lambda one: one.camera.detector.intrapixel,
         "straight edges": lambda one: one.camera.detector.edge_px,
+        "no brighter-fatter charge": lambda one: one.camera.detector.brighter_fatter_per_e,
     }
 
     def greatest(value: Any) -> float:

@@ -440,7 +440,7 @@ def test_solved_attitudes_are_written_with_covariances_and_read_as_an_imu_s(
         (HEAD + "a.fits,1,2\n", "line 2: 3 values; allowed: 4"),
         (HEAD + "a.fits,1,2,x\n", "line 2: 'x' is not a number"),
         (HEAD + "a.fits,1,2,nan\n", "line 2: 'nan' is not a finite number"),
-        (HEAD + "a.fits,1,2,3\na.fits,1,2,3\n", "'a.fits' occurs twice; allowed: once"),
+        (HEAD + "a.fits,1,2,3\na.fits,1,2,3\n", "'a.fits' is in line 2 too; allowed: once"),
     ],
 )
 def test_faulty_attitudes_are_refused_in_one_line(

@@ -125,8 +125,8 @@ class Workbench:
 
     def scene_at_rest(self) -> dict[str, str]:
         """Overrides for the scene in which the vehicle rests at the present attitude."""
-        if self.lab_from_body == self.lab.start:
-            return {}
+        if self.lab_from_body == self.lab.start or self.scene.vehicle.mount == "two_axis":
+            return {}  # a mount of two axes has no other attitudes than those of its profiles
         camera = self.lab.camera
         angles = scoring.angles_deg(
             camera.mount.cam_from_body * self.lab_from_body.inv(), camera
