@@ -38,7 +38,7 @@ from skysim.apps.live.packets import (
     plain,
     solution_packet,
 )
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, repeat_lost_interrupt
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
 from skysim.simulation.flight import Flight, Shot
@@ -156,6 +156,7 @@ class Live:
         try:
             self.pace.start(0.0)
             while not self.flight.is_over and not self.is_abandoned:
+                repeat_lost_interrupt()
                 self.advance()
             self.send_frames(late=True)
         finally:
@@ -337,6 +338,7 @@ class PosedLive(Live):
         self.warm_up()
         self.pace.start(0.0)
         while not self.flight.schedules[0].is_over and not self.is_abandoned:
+            repeat_lost_interrupt()
             for command, reply in self.inbox.take():
                 try:
                     if set(command) != {"pose"}:
