@@ -5,7 +5,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, reason
 
 HOST = "127.0.0.1"  # reached by this machine alone
 LOOPBACK = (HOST, "localhost", "::1", "[::1]")
@@ -28,7 +28,7 @@ def names_address(option: str, host: str, port: int) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        problem = f"cannot listen on {host}:{port}: {error.strerror or error}"
+        problem = f"cannot listen on {host}:{port}: {reason(error)}"
         raise InputError(f"{option} {port}", problem) from None
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, printable, reason
 from skysim.core.plugins import (
     FOLDER,
     MAX_STATUS_CHARS,
@@ -476,7 +476,7 @@ class TrackerProgram(Program):
                 WRITERS[self.image_format](path, picture)
             except OSError as error:
                 raise self.fail(
-                    f"the program's folder takes no frame: {error.strerror or error}", 0.0
+                    f"the program's folder takes no frame: {reason(error)}", 0.0
                 ) from None
             return [(json.dumps(header | {"file": str(path)}) + "\n").encode()]
         dtype = "<u2" if picture.image_dn.dtype == np.uint16 else "<f8"

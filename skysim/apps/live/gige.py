@@ -32,7 +32,7 @@ from typing import Any
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet, Sink
 from skysim.core import __version__
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, reason
 from skysim.core.paths import DATA
 
 # Control.
@@ -318,7 +318,7 @@ class GigeCamera(Sink, ControlChannel):
             self.socket.bind((host, port))
         except OSError as error:
             self.socket.close()
-            problem = f"cannot serve on {host}:{port}: {error.strerror or error}"
+            problem = f"cannot serve on {host}:{port}: {reason(error)}"
             raise InputError("--gige", problem, "an IPv4 address that is free") from None
         self.host, self.port = self.socket.getsockname()
         self.is_local = self.host.startswith("127.")

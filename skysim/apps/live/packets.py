@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
 from skysim.core import files
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, printable, reason
 from skysim.core.types import Record
 from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
@@ -322,8 +322,8 @@ class Sink:
         except BrokenPipeError:
             return READER_GONE
         except OSError as error:
-            reason = error.strerror or str(error)
-            return f"{error.filename}: {reason}" if error.filename else reason
+            file = f"{error.filename}: " if error.filename else ""
+            return file + reason(error)
         # A dead thread without `fault` would block a patient offer() for ever.
         except Exception as error:
             return printable(f"{type(error).__name__}: {error}")

@@ -23,7 +23,7 @@ from skysim.apps.access import HOST
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet, Sink
 from skysim.core import files
-from skysim.core.errors import InputError, printable
+from skysim.core.errors import InputError, printable, reason
 from skysim.core.paths import DATA
 from skysim.tracking.onboard_model import assumed_camera, assumed_lever, onboard_dome
 
@@ -221,7 +221,7 @@ class McapSink(Sink):
             self.writer.start(profile="ros2")
             self.flush()
         except OSError as error:
-            raise InputError(f"--mcap {path}", error.strerror, "a new file") from None
+            raise InputError(f"--mcap {path}", reason(error), "a new file") from None
         self.numbers = {
             topic: self.writer.register_channel(
                 topic.name,
@@ -260,7 +260,7 @@ class McapSink(Sink):
                 self.writer.finish()
                 self.file.close()
         except OSError as error:
-            self.fault = f"{self.path}: {error.strerror}"
+            self.fault = f"{self.path}: {reason(error)}"
         if self.fault:
             self.sent -= self.chunk
             self.dropped += self.chunk
