@@ -50,6 +50,8 @@ class PlanPanel:
         Panel that flies the survey
     taken
         Number of frames of the survey that have been adjusted
+    progress
+        Text on the flight that is computed
     colored
         LEDs of the survey, and how well each is known
     legends
@@ -238,6 +240,8 @@ class PlanPanel:
         with self.stops:
             for line in lines:
                 ui.label(line).style("overflow-wrap: anywhere")
+            self.progress = ui.label().bind_text_from(self.run_panel.summary, "text")
+            self.progress.set_visibility(False)
             self.legends["survey"] = ui.label(COLORED)
             self.legends["survey"].set_visibility(False)
             with widgets.div("lab-stops mono"):
@@ -268,8 +272,7 @@ class PlanPanel:
                 survey_flight, *self.page.state.opened, self.plan.angles_deg
             )
             if overrides and self.page.is_open and await self.page.open(scene, overrides):
-                with self.stops:
-                    ui.label().bind_text_from(self.run_panel.summary, "text")
+                self.progress.set_visibility(True)
                 await self.run_panel.simulate()
 
     async def download_map(self) -> None:

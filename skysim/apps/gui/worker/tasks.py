@@ -235,11 +235,11 @@ class Worker:
         if self.other:
             return photo.photo_files(*self.other)
         bench = self.workbench
-        overrides = self.overrides | bench.scene_at_rest()
+        overrides = self.overrides
         if self.flight:
             self.flight.render()
-            if self.flight.is_shown:
-                overrides = self.overrides
+        if self.flight is None or not self.flight.is_shown:
+            overrides = overrides | bench.scene_at_rest()
         return photo.frame_files(bench, self.scene, overrides)
 
     def solve_file(
