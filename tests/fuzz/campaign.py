@@ -869,7 +869,7 @@ def findings(name: str, case: Case, answer: Answer) -> Iterator[str]:
     works = re.search(r": \d+ (trials|frames)$", answer.err, re.MULTILINE)
     asked = "frames" in case.mutant.what or "1_000" in case.words
     if (works or asked) and (answer.timed_out or answer.cpu_s > CPU_S):
-        return  # a study that somebody has asked for, and which shows how far it is
+        return  # a study runs, and shows its progress
     if answer.timed_out:
         yield f"time-out: {answer.cpu_s:.0f} s of the processor"
         return

@@ -413,7 +413,7 @@ def test_the_study_of_a_datasheet_has_its_cells_fields_and_overrides(tmp_path):
 
 
 def test_results_are_read_by_cell_and_field():
-    """Trial n is field n modulo the fields of cell n over the fields; the first failure is told with its cell."""
+    """Trial n is field n modulo the fields of cell n over the fields; the first failure is named with its cell."""
     points = [SimpleNamespace(levels={"cell": f"cell {n}"}) for n in range(3)]
     plan = SimpleNamespace(points=points, study=SimpleNamespace(replicates=4))
     kept = SimpleNamespace(failures=list, columns=lambda: {"x": np.arange(12)})
