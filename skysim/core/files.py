@@ -219,7 +219,9 @@ def read_table(path: Path) -> Any:
     # With another row alone, the header is read.
     other = head + (count == head + 1)
     if fails([*lines[:head], *lines[other : other + 1]]):
-        raise InputError(path, f"not an ECSV table: {shortened(table, 120)}")
+        # A lookup that fails says nothing to a user: there are no such lines.
+        problem = "no lines" if isinstance(table, LookupError) else shortened(table, 120)
+        raise InputError(path, f"not an ECSV table: {problem}")
     raise Where(path, lines[count - 1][0]).error("no row of the table")
 
 

@@ -141,12 +141,10 @@ def seconds_since(
 
 
 def cells_of(lines: Iterable[Line]) -> list[Words]:
-    """The numbered lines of a table, each split at its commas, or else at its blanks; # begins a comment."""
-    return [
-        (n, [cell.strip() for cell in line.split("," if "," in line else None)])
-        for n, line in lines
-        if not line.startswith("#")
-    ]
+    """The numbered lines of a table, split at commas if its first has one, or else at blanks; # begins a comment."""
+    rows = [(n, line) for n, line in lines if not line.startswith("#")]
+    comma = "," if rows and "," in rows[0][1] else None
+    return [(n, [cell.strip() for cell in line.split(comma)]) for n, line in rows]
 
 
 def read_named_rows(

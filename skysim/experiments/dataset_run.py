@@ -19,7 +19,13 @@ from skysim.core import __version__
 from skysim.core.errors import OVERRIDES, InputError, check_name
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Record, frozen
-from skysim.core.yaml_reader import OverrideTexts, check_version, parse_yaml, read_yaml
+from skysim.core.yaml_reader import (
+    OverrideTexts,
+    check_version,
+    excerpt,
+    parse_yaml,
+    read_yaml,
+)
 from skysim.experiments.dataset_shards import (
     EXTRA,
     LabelledFrame,
@@ -195,7 +201,7 @@ def study_plan(
         check_name(vary, "key", key, KEYS)
     trial = tree.get("trial") or {"kind": "frames"}
     if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
-        raise InputError(vary, "trial.kind: a dataset has frames", "frames")
+        raise InputError(vary, f"trial.kind: a dataset has frames, not {excerpt(trial)}", "frames")
     settings = tree.get("set") or {}
     if not isinstance(settings, dict):
         raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")

@@ -23,6 +23,7 @@ from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_
 from skysim.core.errors import InputError, Where
 from skysim.core.text import (
     TextSegment,
+    check_numbers,
     excerpt,
     one_of,
     read_lines,
@@ -37,8 +38,8 @@ from skysim.sources.ephemeris import GcrsState
 MAX_SATELLITES = 100_000  # in a file
 MAX_AGE_DAYS = 365  # of the elements that are nearest in time
 REQUIRED = (
-    "NORAD_CAT_ID",
     "EPOCH",
+    "NORAD_CAT_ID",
     "MEAN_MOTION",
     "ECCENTRICITY",
     "INCLINATION",
@@ -58,6 +59,7 @@ OPTIONAL = {
     "MEAN_MOTION_DDOT": "0",
     "OBJECT_NAME": "",
 }
+NUMBERS = (*REQUIRED[1:], *(key for key, value in OPTIONAL.items() if value == "0"))
 EPOCH = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?", re.ASCII)
 TLE_LENGTHS = 68, 69  # without and with the checksum
 
@@ -132,8 +134,9 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[MeanElements]:
                 )
         try:
             record = Satrec.twoline2rv(*pair)
-        except (ValueError, IndexError) as error:
-            raise Where(path, n).error(f"not a TLE: {excerpt(error)}") from None
+        except ValueError:
+            # Where sgp4 has no compiled code; that takes any text as numbers.
+            raise Where(path, n).error("not a TLE: its fields are not in their columns") from None
         yield usable(path, n, name, record)
 
 
@@ -177,13 +180,17 @@ def satellite(path: str, n: int, fields: Mapping[str, Any]) -> MeanElements:
     epoch = texts["EPOCH"].rstrip("Z")
     if not EPOCH.fullmatch(epoch):
         raise where.error(f"EPOCH {excerpt(epoch)}", "2012-06-22T21:00:00.123456")
+    # sgp4 reads epochs with a fraction of a second only.
+    texts = OPTIONAL | texts | {"EPOCH": epoch if "." in epoch else f"{epoch}.0"}
+    check_numbers(where, [texts[key] for key in NUMBERS])
     try:
-        # sgp4 reads epochs with a fraction of a second only.
-        full_epoch = epoch if "." in epoch else f"{epoch}.0"
-        omm.initialize(record, OPTIONAL | texts | {"EPOCH": full_epoch})
-    except (ValueError, OverflowError) as error:
-        raise where.error(excerpt(error)) from None
-    return usable(path, n, texts.get("OBJECT_NAME", ""), record)
+        omm.initialize(record, texts)
+    except (ValueError, OverflowError):
+        raise where.error(
+            "not elements of SGP4",
+            "a date of the calendar; whole numbers of the satellite, its set and its orbit",
+        ) from None
+    return usable(path, n, texts["OBJECT_NAME"], record)
 
 
 def usable(path: str, n: int, name: str, record: Any) -> MeanElements:

@@ -25,7 +25,7 @@ from skysim.core.constants import (
     PLANCK_J_S,
     SPEED_OF_LIGHT_M_S,
 )
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, Where
 from skysim.core.paths import DATA
 from skysim.core.text import cells_of, column_numbers, read_lines, to_numbers
 from skysim.core.types import Floats
@@ -198,14 +198,11 @@ def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
             path, "fewer than two rows", "two columns, wavelength_nm and response"
         )
     wavelength_nm, response = to_numbers(path, rows, 2).T
-    # What every curve must satisfy; NaN fails each test.
-    rising = (
-        np.all(np.diff(wavelength_nm, prepend=0.0) > 0) and wavelength_nm[-1] <= LONGEST_NM
-    )
-    within = np.all((response >= 0) & (response <= largest) & np.isfinite(response))
-    if not (rising and within and np.any(response)):
-        raise InputError(
-            path,
+    right = (np.diff(wavelength_nm, prepend=0.0) > 0) & (wavelength_nm <= LONGEST_NM)
+    right &= (response >= 0) & (response <= largest)
+    if not (right.all() and response.any()):
+        # The first wrong line; of a curve of zeros the first.
+        raise Where(path, rows[np.argmin(right)][0]).error(
             "not a response curve",
             f"ascending wavelength_nm to {LONGEST_NM:.0f}, response within 0 and {largest:g}, not always 0",
         )

@@ -145,12 +145,16 @@ def read_covariance(path: Path, table: Any) -> dict[str, Floats]:
         found = {}
     errors = len(found.get("common_camera", ()))
     shapes = ((len(table), 3, 3), (errors, len(table), 3), (errors, 11))
-    if tuple(array.shape for array in found.values()) != shapes or not all(
-        np.isfinite(array).all() for array in found.values()
+    if (
+        tuple(array.shape for array in found.values()) != shapes
+        or not np.isfinite(found["common_camera"]).all()
     ):
         raise InputError(
             path,
             "its covariance is incomplete",
             "own_m2 (3, 3) and common_m (M, 3) of each LED, common_camera (M, 11) in the header",
         )
+    finite = np.isfinite(found["own_m2"]).all((1, 2)) & np.isfinite(found["common_m"]).all((0, 2))
+    if not finite.all():
+        raise InputError(path, f"row {np.argmin(finite) + 1}: its covariance", "finite numbers")
     return found

@@ -576,7 +576,12 @@ def test_a_survey_s_file_is_a_list_of_leds(tmp_path: Path) -> None:
         "distortion_sigma": (0.0,) * 5,
     }
     found = np.array([7, 3, 11, 4, 9])
-    surveyed = DomeMap(found, place_m, np.full(5, 1e-4), np.zeros(3), 1e-4, **lens)
+    errors: dict[str, Any] = {
+        "own_m2": np.tile(1e-8 * np.eye(3), (5, 1, 1)),
+        "common_m": np.full((2, 5, 3), -1e-5),
+        "common_camera": np.zeros((2, 11)),
+    }
+    surveyed = DomeMap(found, place_m, np.full(5, 1e-4), np.zeros(3), 1e-4, **lens, **errors)
     write_dome_map(tmp_path / "leds.ecsv", surveyed)
     read = lit({"kind": "listed", "file": str(tmp_path / "leds.ecsv")}, SPHERE)
     np.testing.assert_array_equal(read.id, found)
@@ -972,7 +977,7 @@ def test_a_file_of_too_many_leds_is_refused_before_its_rows_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "leds.csv"
-    monkeypatch.setattr(listed, "to_numbers", None)
+    monkeypatch.setattr(listed, "column_numbers", None)
     path.write_text("azimuth_deg,tilt_deg\n" + "0,1\n" * 100_001)
     with pytest.raises(InputError, match=r"leds\.csv: 100001 LEDs; allowed: up to 100000$"):
         listed.read_csv(path)

@@ -13,6 +13,8 @@ from typing import Any
 import erfa
 import numpy as np
 import pytest
+import sgp4.api
+import sgp4.model
 from scipy import stats
 
 from skysim.core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
@@ -150,10 +152,12 @@ def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
             "line 1: the checksum of line 1 is 4; it should be 3",
         ),
         (VANGUARD.splitlines()[0], "is not line 2 of a TLE"),
-        ("[{}]", "message 1: NORAD_CAT_ID is missing"),
+        ("[{}]", "message 1: EPOCH is missing"),
         ("<ndm>", "not an OMM"),
         (json.dumps({**OMM, "EPOCH": "yesterday"}), "message 1: EPOCH 'yesterday'"),
-        (json.dumps({**OMM, "MEAN_MOTION": "fast"}), 'message 1: "could not convert'),
+        (json.dumps({**OMM, "EPOCH": "2012-02-30T00:00:00"}), "message 1: not elements of SGP4"),
+        (json.dumps({**OMM, "MEAN_MOTION": "fast"}), "message 1: 'fast' is not a number"),
+        (json.dumps({**OMM, "ELEMENT_SET_NO": "1.5"}), "message 1: not elements of SGP4"),
         (
             json.dumps({**OMM, "ECCENTRICITY": "1.5"}),
             "satellite 1: SGP4 refuses these elements",
@@ -167,6 +171,19 @@ def test_bad_elements_are_refused_in_one_line(
         orbit_elements.read_elements(written(tmp_path, text))
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_lines_that_sgp4_in_python_cannot_read_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without compiled code sgp4 raises an error of its own for fields that are not numbers."""
+    monkeypatch.setattr(sgp4.api, "Satrec", sgp4.model.Satrec)
+    first, second = VANGUARD.splitlines()
+    wrong = second.replace("34.2682", "3x.2682")
+    # Without the checksum, which would no longer fit.
+    path = written(tmp_path, f"{first}\n{wrong[:68]}\n")
+    with pytest.raises(InputError, match=r"line 1: not a TLE: its fields"):
+        orbit_elements.read_elements(path)
 
 
 def test_the_phase_law_is_that_of_a_lambert_sphere() -> None:

@@ -287,7 +287,7 @@ def datasheet(
             quick=quick,
             fields=fields,
             least=cells.MODEL_FIELDS if model else cells.MIN_FIELDS,
-            rates_deg_s=parse_rates(rates) if rates else [],
+            rates_deg_s=[] if rates is None else parse_rates(rates),
             workers=workers,
             watch=lambda trials: stack.enter_context(trial_progress(title, trials)),
         )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 
 from skysim.core.errors import InputError, Where
-from skysim.core.text import cells_of, read_lines, to_numbers
+from skysim.core.text import cells_of, column_numbers, read_lines
 from skysim.core.types import Floats, normalized
 from skysim.scene.sections.layouts import MAX_LEDS, ListedConfig, relative_levels
 from skysim.sources.dome.layouts.placing import (
@@ -28,12 +28,8 @@ SAME_PLACE = 1e-4  # distance of two LEDs of a file that are one, in m or rad
 PLACES = {tuple(f"{axis}_{unit}" for axis in "xyz"): scale for unit, scale in UNIT_M.items()}
 ANGLES = ("azimuth_deg", "tilt_deg")
 BRIGHTNESS = ("level", "magnitude")
-FURTHER = (
-    "id",
-    "tape",
-    "tape_m",
-    "sigma_m",
-)  # `id` numbers the LEDs, the others are not used
+# `id` numbers the LEDs; the others, of a display's tapes and of a survey's map, are not used.
+FURTHER = ("id", "tape", "tape_m", "sigma_m", "own_m2", "common_m")
 
 
 class LedFile(NamedTuple):
@@ -129,8 +125,9 @@ def read_csv(path: Path) -> LedFile:
     # Every column must be known and there once; one kind of place, and one of brightness at most.
     repeated = len(brightness) > 1 or len({*names}) < len(names)
     if chosen is None or repeated or {*names} - known or len(rows) < 2:
+        header = str(Where(path, rows[0][0])) if rows else path
         raise InputError(
-            path,
+            header,
             "not a list of LEDs",
             f"columns x_m, y_m, z_m or {', '.join(ANGLES)}, or x_mm and so on; optionally {' or '.join(BRIGHTNESS)},"
             f" {', '.join(FURTHER)}; one LED per line",
@@ -138,7 +135,8 @@ def read_csv(path: Path) -> LedFile:
     # One line is the header.
     if len(rows) > MAX_LEDS + 1:
         raise InputError(path, f"{len(rows) - 1} LEDs", f"up to {MAX_LEDS}")
-    column = dict(zip(names, to_numbers(path, rows[1:], len(names)).T, strict=True))
+    used = [name for name in names if name not in FURTHER[1:]]
+    column = dict(zip(used, column_numbers(path, rows, used).T, strict=True))
     places = [str(Where(path, n)) for n, _ in rows[1:]]
     level = column.get("level")
     if "magnitude" in column:
