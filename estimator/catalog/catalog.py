@@ -370,8 +370,10 @@ def columns(
             ndmin=2,
             converters=converters,
         )
-        if not (np.abs(table[:, : len(names)]) <= 1e15).all():
-            raise ValueError("some numbers are not finite up to 1e15")
+        finite = (np.abs(table[:, : len(names)]) <= 1e15).all(axis=1)
+        if not finite.all():
+            row = np.argmin(finite) + 1
+            raise ValueError(f"the numbers of row {row} are not finite up to 1e15")
     except (OSError, TypeError, ValueError, IndexError) as error:
         raise ImageError(
             f"{path}: not a star catalog ({reason(error)}); allowed: ECSV with {', '.join((*names, *optional))}"

@@ -103,10 +103,12 @@ def read_fits_images(path: Path) -> list["ViewedImage"]:
                 ]
     except InputError:
         raise
+    except (OSError, UserWarning) as error:
+        raise InputError(path, f"not a complete FITS file: {reason(error)}") from None
     except (
         Exception
-    ) as error:  # a damaged header makes astropy raise exceptions of many types, KeyError too
-        raise InputError(path, f"not a complete FITS file: {reason(error)}") from None
+    ):  # a damaged header makes astropy raise many types, with words for its authors
+        raise InputError(path, "not a complete FITS file") from None
     raise InputError(path, "a FITS file without an image")
 
 
@@ -127,9 +129,9 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
             plain = Path(temporary.name)
         file = stack.enter_context(plain.open("rb"))
         stack.enter_context(warnings.catch_warnings())
-        warnings.simplefilter(
-            "error", AstropyWarning
-        )  # "file may have been truncated" is one
+        # "File may have been truncated" is one; NumPy's are of numbers beyond those of an image.
+        for category in (AstropyWarning, RuntimeWarning):
+            warnings.simplefilter("error", category)
         if file.read(len(MAGIC)) != MAGIC:
             allowed = "one that begins with SIMPLE" + ("" if packed else ", not compressed")
             raise InputError(path, "not a complete FITS file", allowed)
@@ -357,8 +359,8 @@ def read_npy(path: Path) -> NDArray:
     """The array of an NPY file, mapped until its size is checked, since it may declare any. Raises InputError."""
     try:
         stored = np.lib.format.open_memmap(path, mode="r")
-    except Exception as error:  # of many types, for a damaged header
-        raise InputError(path, f"not a complete NPY file: {reason(error)}") from None
+    except Exception:  # of many types, for a damaged header
+        raise InputError(path, "not a complete NPY file") from None
     check_pixels(path, *stored.shape, each_bytes=stored.itemsize)
     kind = stored.dtype.newbyteorder("=")
     # Half precision ends at 65504.

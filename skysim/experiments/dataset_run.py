@@ -25,6 +25,7 @@ from skysim.core.yaml_reader import (
     excerpt,
     parse_yaml,
     read_yaml,
+    where_of,
 )
 from skysim.experiments.dataset_shards import (
     EXTRA,
@@ -201,7 +202,10 @@ def study_plan(
         check_name(vary, "key", key, KEYS)
     trial = tree.get("trial") or {"kind": "frames"}
     if not isinstance(trial, dict) or trial.get("kind", "frames") != "frames":
-        raise InputError(vary, f"trial.kind: a dataset has frames, not {excerpt(trial)}", "frames")
+        refusal = InputError(
+            "trial.kind", f"a dataset has frames, not {excerpt(trial)}", "frames"
+        )
+        raise refusal.at(where_of(["trial"], [(vary or Path(OVERRIDES.file), text)], {}))
     settings = tree.get("set") or {}
     if not isinstance(settings, dict):
         raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")

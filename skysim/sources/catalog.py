@@ -214,7 +214,8 @@ def read(name_or_path: str | Path) -> Catalog:
         )
     except ValueError:
         table = np.full((1, 1), np.nan)
-    if not (np.abs(table) <= LARGEST).all():
+    cells = {line.count(",") for line in lines}
+    if len(cells) > 1 or not (np.abs(table) <= LARGEST).all():
         # Slower, but names the line.
         table = column_numbers(path, cells_of(read_lines(path)), names)
     hip, ra, dec, pm_ra, pm_dec, parallax, v_mag, b_v, v_i, *scatter = np.ascontiguousarray(

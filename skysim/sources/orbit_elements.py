@@ -136,7 +136,9 @@ def read_tle(path: str, lines: list[tuple[int, str]]) -> Iterator[MeanElements]:
             record = Satrec.twoline2rv(*pair)
         except ValueError:
             # Where sgp4 has no compiled code; that takes any text as numbers.
-            raise Where(path, n).error("not a TLE: its fields are not in their columns") from None
+            raise Where(path, n).error(
+                "not a TLE: its fields are not in their columns"
+            ) from None
         yield usable(path, n, name, record)
 
 

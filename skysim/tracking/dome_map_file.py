@@ -154,7 +154,11 @@ def read_covariance(path: Path, table: Any) -> dict[str, Floats]:
             "its covariance is incomplete",
             "own_m2 (3, 3) and common_m (M, 3) of each LED, common_camera (M, 11) in the header",
         )
-    finite = np.isfinite(found["own_m2"]).all((1, 2)) & np.isfinite(found["common_m"]).all((0, 2))
+    finite = np.isfinite(found["own_m2"]).all((1, 2)) & np.isfinite(found["common_m"]).all(
+        (0, 2)
+    )
     if not finite.all():
-        raise InputError(path, f"row {np.argmin(finite) + 1}: its covariance", "finite numbers")
+        raise InputError(
+            path, f"row {np.argmin(finite) + 1}: its covariance", "finite numbers"
+        )
     return found

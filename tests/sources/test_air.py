@@ -26,7 +26,7 @@ from skysim.sources import catalog, stars
 from skysim.sources.air import Air, horizon_rad, mean_wavelength_m
 from skysim.sources.bodies import BODIES, bodies_from
 from skysim.sources.ephemeris import observe_from
-from skysim.sources.photometry import Band, temperature_k
+from skysim.sources.photometry import SUN, Band, temperature_k
 from skysim.sources.refraction import (
     Atmosphere,
     Refraction,
@@ -272,6 +272,28 @@ def test_bodies_are_refracted_like_stars() -> None:
         assert abs(seen.place.toward_sun @ seen.place.direction) < 1e-12
         assert seen.id == BODIES[body.name].id
         assert seen.flux_e_s_m2 < body.flux_e_s_m2
+
+
+def test_bodies_are_dispersed_as_a_star_of_the_sun_s_color() -> None:
+    time = datetime.datetime(2012, 6, 24, 20, 0)
+    stars = catalog.read_for("x", "hipparcos_hp6.5").to_limit(3.0)
+    # The last star by its number is red, the first has the Sun's colors.
+    order = np.argsort(stars.hip)
+    b_v = stars.b_v.copy()
+    v_i = stars.v_i.copy()
+    b_v[order[[0, -1]]] = SUN[0], 1.6
+    v_i[order[[0, -1]]] = SUN[1], 2.0
+    colored = replace(stars, b_v=b_v, v_i=v_i)
+    air = Air.from_config(AirConfig(dispersion=True), site_of(SITES[0]), colored, BAND)
+    sky = air.at(time)
+    solar, red = air.dispersion[air.rows(np.sort(stars.hip)[[0, -1]])]
+    assert abs(solar / red - 1) > 1e-4
+    for body in bodies_from(_bodies(), observe_from(time, air.site), BAND):
+        seen = sky.body_seen(body).place.direction
+        expected = air.refraction.apparent(
+            body.place.direction[None], sky.zenith, np.array([solar])
+        )[0]
+        assert np.linalg.norm(seen - expected) < 1e-12
 
 
 def _bodies() -> Any:

@@ -155,7 +155,10 @@ def test_omm_and_tle_give_the_same_states(kind: str, tmp_path: Path) -> None:
         ("[{}]", "message 1: EPOCH is missing"),
         ("<ndm>", "not an OMM"),
         (json.dumps({**OMM, "EPOCH": "yesterday"}), "message 1: EPOCH 'yesterday'"),
-        (json.dumps({**OMM, "EPOCH": "2012-02-30T00:00:00"}), "message 1: not elements of SGP4"),
+        (
+            json.dumps({**OMM, "EPOCH": "2012-02-30T00:00:00"}),
+            "message 1: not elements of SGP4",
+        ),
         (json.dumps({**OMM, "MEAN_MOTION": "fast"}), "message 1: 'fast' is not a number"),
         (json.dumps({**OMM, "ELEMENT_SET_NO": "1.5"}), "message 1: not elements of SGP4"),
         (

@@ -27,7 +27,7 @@ from skysim.experiments.study import unused_options
 from skysim.experiments.study.factors import (
     Distribution,
     Levels,
-    Value,
+    Option,
     each_level,
     points,
 )
@@ -127,6 +127,8 @@ def plan_of(
     except InputError as error:  # about a key of the study: add file and line
         if error.where in (None, OVERRIDES):
             within = [key for key in study.set if f"{error.key}.".startswith(f"{key}.")]
+            if error.key == InputError(study.scene, "").key:
+                error = error.within("scene")
             keys = ["set", *within] if within else error.key.split(".")
             error = error.at(where_of(keys, [(path, text)], {}))
         raise error from None
@@ -202,7 +204,7 @@ def check(plan: Plan, to_run: bool) -> None:
                 problem = f"light of kind {scene.light.kind} has no parts"
                 raise InputError("optimize.cost.parts", problem, "dome")
         except InputError as error:
-            raise at_factor(study, name, level, error) from None
+            raise at_factor(study, name, (level, own), error) from None
         points.append(unused_options.CheckedPoint(name, level, own, settings, scene, trial))
     check_measured(study, points)
     unused_options.check(plan, points)
@@ -326,26 +328,23 @@ def fixed_seeds(study: Study, scene: Scene) -> list[str]:
     return [seed for seed in dome_seeds(scene) if seed not in varied]
 
 
-def at_factor(study: Study, name: str, level: Value, error: InputError) -> InputError:
-    """An error of a level, with the factor that sets the key at fault and its value; one of `hardware` is unchanged.
+def at_factor(study: Study, name: str, option: Option, error: InputError) -> InputError:
+    """An error of a factor's option, with the factor that sets the key at fault and its value; others at their middle.
 
-    So is an error of a key that no factor sets, nor a section of it or a key in it.
+    One of `hardware` is unchanged; so is an error of a key that no factor sets, nor a section of it or a key in it.
     """
     if error.key == "hardware":
         return error
-    owners = [
-        other
+    options = {name: option} | {
+        other: factor.value_at(0.5)
         for other, factor in study.factors.items()
-        if any(
-            f"{key}.".startswith(f"{error.key}.") or f"{error.key}.".startswith(f"{key}.")
-            for key in factor.value_at(0.5)[1]
-        )
-    ]
-    if not owners:
-        return error
-    owner = name if name in owners else owners[0]
-    value = level if owner == name else study.factors[owner].value_at(0.5)[0]
-    return error.within(f"{value!r}").within(f"factors.{owner}")
+        if other != name
+    }
+    for owner, (value, settings) in options.items():
+        for key in settings:
+            if f"{key}.".startswith(f"{error.key}.") or f"{error.key}.".startswith(f"{key}."):
+                return error.within(f"{value!r}").within(f"factors.{owner}")
+    return error
 
 
 def check_measured(study: Study, points: Sequence[unused_options.CheckedPoint]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc
 from scipy.stats import chi2
 
+from estimator.calibration import mass_properties
 from estimator.calibration.mass_dynamics import (
     BearingRecord,
     EquationsOfMotion,
@@ -138,6 +141,27 @@ def test_wrong_tracker_covariance_is_found_from_the_misfit(factor: float) -> Non
     assert abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE
     assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
     np.testing.assert_allclose(estimate.sigma[NINE], right.sigma[NINE], rtol=0.3)
+
+
+@pytest.mark.parametrize("true_factor", [1e-4, 0.03, 1.0, 40.0, 1e5])
+def test_the_noise_is_found_in_two_fits(
+    true_factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A misfit (true / assumed)^(2/3), of attitudes that give part of the information, ends within the limits."""
+    tried: list[float] = []
+
+    def fit(records: list[float], *_: object) -> SimpleNamespace:
+        tried.extend(records)
+        return SimpleNamespace(misfit=(true_factor / records[0]) ** (2 / 3))
+
+    monkeypatch.setattr(mass_properties, "estimate_mass", fit)
+    one: Any = SimpleNamespace(with_noise=float)
+    lab: Any = None
+    estimate_with_noise([one], lab, lab)
+    limited = float(np.clip(true_factor, 1e-3, 1e3))
+    assert tried[0] == 1.0
+    assert len(tried) <= (1 if true_factor == 1 else 8 if limited != true_factor else 2)
+    assert tried[-1] == pytest.approx(limited, rel=1e-12)
 
 
 @pytest.mark.slow
