@@ -294,8 +294,10 @@ def _read(path: str | Path, *_state: int) -> StarCatalog:
     The last four are kept, because reading one takes 0.1 s.
     """
     table, epoch_yr = columns(path, COLUMNS)
-    if len(np.unique(table[0])) < len(table[0]):
-        raise ImageError(f"{path}: a star's number occurs twice; allowed: each once")
+    hip, count = np.unique(table[0], return_counts=True)
+    if count.max() > 1:
+        twice = hip[np.argmax(count)]
+        raise ImageError(f"{path}: star {twice:.0f} occurs {count.max()} times; allowed: once")
     return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 
 

@@ -65,7 +65,7 @@ RAW = re.compile(
     r"|ufunc|dtype\('|<class|at 0x[0-9a-f]+"
     r"|could not convert|codec can't|Traceback|list index out|KeyError|IndexError|OpenCV\(|np\.float"
 )
-NAMES_PLACE = r": missing|columns |LED \d|line \d|row \d|message \d|satellite \d|\.\d+"
+NAMES_PLACE = r": missing|columns |column names|(LED|star) \d|line \d|row \d|message \d|satellite \d|\.\d+"
 NO_RESULT = re.compile(  # but for a count of things of that name, as in "1 inf"
     r"(?<!\d )(?<![\w./-])(nan|inf|NaN|Infinity|NaT|None)(?![\w/-]| in )|\de\+?(1[6-9]|[2-9]\d|\d{3})\b"
 )
