@@ -269,6 +269,7 @@ class ConfigModel(BaseModel):
     """
 
     model_config = ConfigDict(
+        defer_build=True,  # of a section only when it is used alone
         extra="forbid",
         frozen=True,
         validate_by_alias=True,
