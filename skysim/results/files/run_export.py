@@ -68,28 +68,22 @@ def message(
     for before, after in itertools.pairwise(utc):
         if after <= before:
             raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
-    head = {
-        "CCSDS_AEM_VERS": "2.0",
-        "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
-        "ORIGINATOR": ORIGINATOR,
-    }
-    meta = {
-        "OBJECT_NAME": name.upper(),
-        "OBJECT_ID": "UNKNOWN",
-        "REF_FRAME_A": frames[0],
-        "REF_FRAME_B": frames[1],
-        "TIME_SYSTEM": "UTC",
-        "START_TIME": epoch(utc[0]),
-        "STOP_TIME": epoch(utc[-1]),
-        "ATTITUDE_TYPE": "QUATERNION",
-    }
     comments = [*notes, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
     rows = zip(utc, continuous_quaternions(a_from_b.as_quat()), strict=True)
     lines = [
-        *(f"{key} = {value}" for key, value in head.items()),
+        "CCSDS_AEM_VERS = 2.0",
+        f"CREATION_DATE = {epoch(datetime.datetime.now(datetime.UTC))}",
+        f"ORIGINATOR = {ORIGINATOR}",
         "META_START",
         *(f"COMMENT {text}" for text in comments),
-        *(f"{key} = {value}" for key, value in meta.items()),
+        f"OBJECT_NAME = {name.upper()}",
+        "OBJECT_ID = UNKNOWN",
+        f"REF_FRAME_A = {frames[0]}",
+        f"REF_FRAME_B = {frames[1]}",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {epoch(utc[0])}",
+        f"STOP_TIME = {epoch(utc[-1])}",
+        "ATTITUDE_TYPE = QUATERNION",
         "META_STOP",
         "DATA_START",
         *(
