@@ -206,7 +206,8 @@ def gore_count(dome: DomeDesign, widest_m: float = MAX_WIDTH_M) -> int:
 class Gore(NamedTuple):
     """A gore at full scale, its apex up and at the origin, seen from inside the dome; x to the right and y down, mm."""
 
-    outline_mm: Floats
+    half_mm: float  # half of its width
+    length_mm: float  # from the apex
     shapes: list[Shape]
 
 
@@ -221,8 +222,9 @@ def gore(dome: DomeDesign, number: int, count: int) -> Gore:
         1e3 * FROM_INSIDE * on_paper_m(dome.surface, some, meridian_rad)
         for some in (edge, rays[own])
     )
+    half_mm, length_mm = outline_mm.max(axis=0).tolist()
     x_mm, y_mm = outline_mm[0]
-    meridian_mm = np.array([[x_mm, y_mm], [x_mm, outline_mm[:, 1].max()]])
+    meridian_mm = np.array([[x_mm, y_mm], [x_mm, length_mm]])
     title = f"{number + 1}: {math.degrees(meridian_rad):.4g} deg"
     shapes: list[Shape] = [
         Polyline(outline_mm, closed=True),
@@ -230,7 +232,7 @@ def gore(dome: DomeDesign, number: int, count: int) -> Gore:
         SheetText(x_mm - 12, y_mm - 2, 4.0, title),
         *marks(dome.leds.id[own], leds_mm, 1e3 * dome.led_radius_m),
     ]
-    return Gore(outline_mm, shapes)
+    return Gore(half_mm, length_mm, shapes)
 
 
 def moved(shape: Shape, x_mm: float, y_mm: float) -> Shape:
@@ -248,11 +250,10 @@ def gores(dome: DomeDesign) -> Drawing:
     bottom_mm = 0.0
     for number in range(count):
         one = gore(dome, number, count)
-        half_mm = float(one.outline_mm[:, 0].max())
         top_mm = MARGIN_MM + CAPTION_MM
-        shapes += [moved(shape, left_mm + half_mm, top_mm) for shape in one.shapes]
-        left_mm += 2 * half_mm + GAP_MM
-        bottom_mm = max(bottom_mm, top_mm + float(one.outline_mm[:, 1].max()))
+        shapes += [moved(shape, left_mm + one.half_mm, top_mm) for shape in one.shapes]
+        left_mm += 2 * one.half_mm + GAP_MM
+        bottom_mm = max(bottom_mm, top_mm + one.length_mm)
     rule_mm = bottom_mm + CAPTION_MM
     caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top"
     shapes += scale_line(MARGIN_MM, rule_mm, caption)
@@ -391,8 +392,8 @@ def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
 
     A page is at least as wide as its title.
     """
-    half_mm = max(float(one.outline_mm[:, 0].max()) for one in gores)
-    length_mm = max(float(one.outline_mm[:, 1].max()) for one in gores)
+    half_mm = max(one.half_mm for one in gores)
+    length_mm = max(one.length_mm for one in gores)
     step_mm = 2 * half_mm + GAP_MM
     across = max(1, int((width_mm - 2 * MARGIN_MM + GAP_MM) // step_mm))
     page_mm = max(width_mm, 2 * (half_mm + MARGIN_MM), 1.5 * RULE_MM + 2 * MARGIN_MM)
@@ -415,7 +416,7 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
     half_mm = width_mm / 2 - MARGIN_MM
     shown_mm = height_mm - 2 * MARGIN_MM - HEAD_MM
     step_mm = shown_mm - OVERLAP_MM
-    length_mm = CAPTION_MM + float(one.outline_mm[:, 1].max())
+    length_mm = CAPTION_MM + one.length_mm
     count = max(1, math.ceil((length_mm - OVERLAP_MM) / step_mm))
     tops_mm = [-CAPTION_MM + sheet * step_mm for sheet in range(count)]
     shapes = list(one.shapes)
