@@ -145,7 +145,11 @@ def render(
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
             paths = [
-                str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
+                str(
+                    recorder.recorders[shot.camera.name].write(
+                        shot.frame, shot.truth, preview
+                    )
+                )
                 for shot in flight.shots(solves=False, progress=update)
             ]
     if json:
