@@ -97,45 +97,39 @@ def svg_element(shape: Shape) -> str:
             )
 
 
+# A DXF file is of groups of two lines, a code and a value.
+DXF_BEGIN = (
+    "0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n"
+    "9\n$INSUNITS\n70\n4\n"  # 4: millimeters
+    "0\nENDSEC\n0\nSECTION\n2\nENTITIES\n"
+)
+DXF_END = "0\nENDSEC\n0\nEOF\n"
+
+
 def to_dxf(drawing: Drawing) -> str:
     """The drawing with 1 drawing unit = 1 mm, the origin at its lower left corner, and a layer for each use."""
-    groups: list[tuple[int, object]] = [
-        (0, "SECTION"),
-        (2, "HEADER"),
-        (9, "$ACADVER"),
-        (1, "AC1009"),
-    ]
-    # 4: millimeters.
-    groups += [(9, "$INSUNITS"), (70, 4), (0, "ENDSEC"), (0, "SECTION"), (2, "ENTITIES")]
-    for shape in drawing.shapes:
-        groups += dxf_groups(shape, drawing.height_mm)
-    groups += [(0, "ENDSEC"), (0, "EOF")]
-    return "".join(
-        f"{code}\n{f'{value:.4f}' if isinstance(value, float) else value}\n"
-        for code, value in groups
-    )
+    elements = (dxf_element(shape, drawing.height_mm) for shape in drawing.shapes)
+    return "".join([DXF_BEGIN, *elements, DXF_END])
 
 
-def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
-    """The group codes and values of a shape; a dashed line is on a layer of its own."""
-    layer = (8, shape.layer)
+def dxf_element(shape: Shape, height_mm: float) -> str:
+    """The groups of a shape; a dashed line is on a layer of its own."""
     if isinstance(shape, Polyline):
-        layer = (8, "HELP" if shape.dashed else shape.layer)
-        yield from ((0, "POLYLINE"), layer, (66, 1), (70, int(shape.closed)))
-        for x, y in shape.xy_mm.tolist():
-            yield from ((0, "VERTEX"), layer, (10, x), (20, height_mm - y), (30, 0.0))
-        yield from ((0, "SEQEND"), layer)
-        return
-    yield 0, "CIRCLE" if isinstance(shape, Circle) else "TEXT"
-    yield layer
-    yield from ((10, float(shape.x_mm)), (20, float(height_mm - shape.y_mm)), (30, 0.0))
-    if isinstance(shape, Circle):
-        yield 40, float(shape.radius_mm)
-    else:
-        words = "".join(
-            one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words
+        layer = "HELP" if shape.dashed else shape.layer
+        vertices = "".join(
+            f"0\nVERTEX\n8\n{layer}\n{dxf_place(x, height_mm - y)}" for x, y in shape.xy_mm
         )
-        yield from ((40, float(shape.size_mm)), (1, words))
+        head = f"0\nPOLYLINE\n8\n{layer}\n66\n1\n70\n{shape.closed:d}\n"
+        return f"{head}{vertices}0\nSEQEND\n8\n{layer}\n"
+    place = f"8\n{shape.layer}\n{dxf_place(shape.x_mm, height_mm - shape.y_mm)}"
+    if isinstance(shape, Circle):
+        return f"0\nCIRCLE\n{place}40\n{shape.radius_mm:.4f}\n"
+    words = "".join(one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words)
+    return f"0\nTEXT\n{place}40\n{shape.size_mm:.4f}\n1\n{words}\n"
+
+
+def dxf_place(x_mm: float, y_mm: float) -> str:
+    return f"10\n{x_mm:.4f}\n20\n{y_mm:.4f}\n30\n0.0000\n"
 
 
 MAX_WIDTH_M = 0.25  # of a gore: at its edge the paper is 0.5 % too long under a dome of 1.2 m
