@@ -134,13 +134,13 @@ def render(
         Write an 8-bit image of each frame with the truth marked.
     """
     from skysim.results.run import FlightRecorder
-    from skysim.simulation.checks import dome_warnings
+    from skysim.simulation.checks.plan_check import camera_outside_warning
     from skysim.simulation.flight import open_flight
 
     loaded = load(scene, set_, seed, frames)
     folder = output_folder(out, loaded.name)
     with open_flight(loaded) as flight:
-        if warning := dome_warnings.camera_outside_warning(flight.lab):
+        if warning := camera_outside_warning(flight.lab):
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
