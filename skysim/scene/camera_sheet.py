@@ -325,13 +325,12 @@ QUESTIONS: dict[str, Question] = {
         "centroid noise of bright lights is uncertain",
     ),
 }
-REQUIRED = tuple(name for name, question in QUESTIONS.items() if question.consequence == "")
 
 # The camera file.
 
 # Curve of the quantum efficiency by shutter.
 CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}
-# Values with which an answer is checked before these two are given.
+# The two answers that are required, with values with which another is checked before they are given.
 PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}
 PLACEHOLDER_LENS = {
     "focal_length": "1 m",
@@ -382,7 +381,7 @@ def fill(answers: Answers) -> Sheet:
             raise InputError(f"answers.{name}", f"has no effect {skipped}")
         if skipped or name in values:
             continue
-        if name in REQUIRED:
+        if name in PLACEHOLDERS:
             raise InputError(f"answers.{name}", f"missing; {question.ask}: {question.where}")
         guess = question.assume(values)
         if guess is not None:
@@ -441,7 +440,7 @@ def check(sheet: Sheet, answers: Answers) -> None:
     except ValidationError as error:
         faults = []
         for one in error.errors():
-            fault = fault_of(one, CameraConfig)
+            fault = fault_of(one)
             section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
             faults.append(fault.under(section) if section else fault)
         # The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault.
