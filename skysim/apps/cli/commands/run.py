@@ -98,7 +98,7 @@ def print_results(
     json: bool,
 ) -> Record:
     """Print the results of the main camera and of the further heads; return the main camera's statistics."""
-    from skysim.results.report import Facts
+    from skysim.results.report import Facts, print_blocks
     from skysim.simulation.checks.facts import TRACKER_KNOWS
 
     (statistics, report), *others = finished
@@ -109,7 +109,7 @@ def print_results(
         terminal.print_json(result | {"heads": head_results} if heads else result)
         return statistics
     known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
-    terminal.print_blocks([Facts(known)])
+    print_blocks([Facts(known)])
     report.print()
     print(f"report: {statistics['report']}")
     for name, (head, head_report) in heads.items():
