@@ -368,24 +368,21 @@ class Page(NamedTuple):
 
 
 def pages(dome: DomeDesign, paper: str) -> Iterator[Page]:
-    """The pages of a dome's gores. Raises InputError for an unknown paper."""
+    """The pages of a dome's gores. Raises InputError for an unknown paper.
+
+    On a roll, as many gores side by side as its width has room for; without sheets or a roll, one on a page that is as
+    large as the gore. Such a page is at least as wide as its title.
+    """
     check_name("paper", "paper", paper, PAPERS)
     width_mm, height_mm = SHEETS_MM.get(paper, (math.inf, math.inf))
     count = gore_count(dome, 1e-3 * (width_mm - 2 * MARGIN_MM))
     gores = [gore(dome, number, count) for number in range(count)]
-    if paper not in SHEETS_MM:
-        yield from long_pages(dome.name, gores, ROLL_MM if paper == "roll" else 0.0)
+    if paper in SHEETS_MM:
+        for number, one in enumerate(gores, 1):
+            title = f"{dome.name}: gore {number} of {count}, seen from inside"
+            yield from sheet_pages(title, one, width_mm, height_mm)
         return
-    for number, one in enumerate(gores, 1):
-        title = f"{dome.name}: gore {number} of {count}, seen from inside"
-        yield from sheet_pages(title, one, width_mm, height_mm)
-
-
-def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
-    """As many gores side by side as a page of this width has room for; one on a page that is as large as the gore.
-
-    A page is at least as wide as its title.
-    """
+    width_mm = ROLL_MM if paper == "roll" else 0.0
     half_mm = max(one.half_mm for one in gores)
     length_mm = max(one.length_mm for one in gores)
     step_mm = 2 * half_mm + GAP_MM
@@ -393,7 +390,7 @@ def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
     page_mm = max(width_mm, 2 * (half_mm + MARGIN_MM), 1.5 * RULE_MM + 2 * MARGIN_MM)
     # The title of a gore is above its apex.
     height_mm = length_mm + 2 * MARGIN_MM + HEAD_MM + CAPTION_MM
-    for first in range(0, len(gores), across):
+    for first in range(0, count, across):
         some = gores[first : first + across]
         shapes = [
             moved(shape, n * step_mm, 0) for n, one in enumerate(some) for shape in one.shapes
@@ -401,7 +398,7 @@ def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
         which = (
             f"gores {first + 1} to {first + len(some)}" if width_mm else f"gore {first + 1}"
         )
-        title = f"{name}: {which} of {len(gores)}, seen from inside"
+        title = f"{dome.name}: {which} of {count}, seen from inside"
         yield Page(page_mm, height_mm, title, (-half_mm, -CAPTION_MM), shapes)
 
 
