@@ -80,8 +80,6 @@ def check(
 
     Parameters
     ----------
-    lab
-        Laboratory
     tilt_deg
         Greatest tilt under a dome; None for that of the scene's motion
     rate_body_rad_s
@@ -96,8 +94,7 @@ def check(
     """
     scene = lab.scene
     # The rest assumes that the camera is inside the dome.
-    outside = camera_outside_warning(lab)
-    if outside:
+    if outside := camera_outside_warning(lab):
         return Check([], [outside])
     # 1. Attitudes.
     check_reference(lab, lab.reference, lab.duration_s)
@@ -125,7 +122,13 @@ def check(
     if checked:
         facts.append(heads_fact(lab, [facts, *(head.facts for head in checked)]))
     for n, head in enumerate(checked):
-        findings += head_findings(n, head.findings, findings)
+        # Those that are not of the main camera too. Its mount points a head elsewhere, not the start of the motion.
+        lines = (
+            line.replace("motion.start:", "rotation_deg:", 1)
+            for line in head.findings
+            if line not in findings
+        )
+        findings += [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS)]
     return Check(facts, findings)
 
 
@@ -210,15 +213,6 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     )
     together = {"cross_arcsec": combined[0], "roll_arcsec": combined[1]}
     return Fact("heads", lines, {"heads": values, "together": together})
-
-
-def head_findings(n: int, own: Sequence[str], main: Sequence[str]) -> list[str]:
-    """The warnings of head n that are not those of the main camera, with the key of the head."""
-    # The mount of a head points it elsewhere, not the start of the motion.
-    lines = (
-        line.replace("motion.start:", "rotation_deg:", 1) for line in own if line not in main
-    )
-    return [f"heads.{n}.{line}" for line in lines if line.startswith(OWN_KEYS)]
 
 
 # Warnings about a dome: broken assumptions of its tracker, fields that look alike, and images in its wall.
