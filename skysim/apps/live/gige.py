@@ -283,11 +283,6 @@ class GigeCamera(Sink):
         self.stop()
         self.put(STREAM_PORT, 0)
 
-    def check_heartbeat(self, now_s: float) -> None:
-        """Take the control from an application that was not heard for the heartbeat's timeout."""
-        if self.controller and now_s - self.heard_s > 1e-3 * self.value(HEARTBEAT):
-            self.release()
-
     # Datagrams
 
     def answer(self, datagram: bytes, sender: Sender, now_s: float) -> bytes | None:
@@ -412,7 +407,10 @@ class GigeCamera(Sink):
                     for ready in select.select(sockets, (), (), POLL_S)[0]:
                         datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
                         self.reply(datagram, sender, ready is self.broadcasts)
-                    self.check_heartbeat(time.monotonic())
+                    # An application that was not heard for the heartbeat's timeout has gone.
+                    silent_s = time.monotonic() - self.heard_s
+                    if self.controller and silent_s > 1e-3 * self.value(HEARTBEAT):
+                        self.release()
 
     def reply(self, datagram: bytes, sender: Sender, is_broadcast: bool) -> None:
         """Answer a datagram, if it has an answer."""
