@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from skysim.apps.live.packets import Output
 
 
-PORTS = {"min": 0, "max": 65535}
+Port = Annotated[int | None, Option(min=0, max=65535)]
 
 
 def live(
     scene: SceneArg,
-    tcp: Annotated[int | None, Option(**PORTS)] = None,
-    http: Annotated[int | None, Option(**PORTS)] = None,
+    tcp: Port = None,
+    http: Port = None,
     gige: bool | None = None,
     folder: Path | None = None,
     display: str | None = None,
-    indi: Annotated[int | None, Option(**PORTS)] = None,
+    indi: Port = None,
     pipe: str | None = None,
     mcap: Path | None = None,
-    foxglove: Annotated[int | None, Option(**PORTS)] = None,
+    foxglove: Port = None,
     host: str = HOST,
     token: str = "",
     truth: bool = False,
