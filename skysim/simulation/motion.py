@@ -503,7 +503,7 @@ class Motion:
             true_rad = np.array([mounting_rad(camera, t_s) for camera in self.lab.cameras])
             true_rad[1:] -= true_rad[0]
             rows["mountings"] = {
-                camera.name: Mounting(*states_rad[:, n].swapaxes(0, 1), true_rad[n])
+                camera.name: Mounting(states_rad[:, n, 0], states_rad[:, n, 1], true_rad[n])
                 for n, camera in enumerate(self.lab.cameras)
             }
         for name in rows:
